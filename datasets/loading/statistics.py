@@ -59,6 +59,11 @@ class FeatureStats:
         mean, std = self._like(values, columns)
         return values * std + mean
 
+    @staticmethod
+    def unit(layout: MotionLayout) -> FeatureStats:
+        """Those that change nothing: mean 0, std 1."""
+        return FeatureStats(np.zeros(layout.dim, np.float32), np.ones(layout.dim, np.float32), layout)
+
     def save(self, path: Path) -> None:
         """Write a safetensors file, with the layout in its metadata, atomically."""
         layout = self.layout

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from motionloom.models.diffusion.dmd import Dmd, dmd_loss
 from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.diffusion.observed import Showing
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
@@ -24,9 +25,19 @@ class DiffusionModule(StageModule):
 
     net: MotionDiffusion
 
-    def __init__(self, net: MotionDiffusion, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
+    def __init__(
+        self,
+        net: MotionDiffusion,
+        optim: OptimConfig,
+        *,
+        seed: int,
+        max_steps: int,
+        showing: Showing | None = None,
+    ) -> None:
+        """`showing` is for networks with `observed` columns."""
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
         self.noiser = net.config.schedule.noiser()
+        self.showing = showing
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
@@ -43,10 +54,16 @@ class DiffusionModule(StageModule):
         hidden = self.net.config.condition_dropout if self.training else 0.0
         conditioned = torch.rand(len(motion), device=motion.device) >= hidden
         noisy = self.noiser.add_noise(motion, noise, step)
-        found = self.net(noisy, step, text, mask, conditioned)
+        seen = None if self.showing is None else self.showing(motion, length)
+        found = self.net(noisy, step, text, mask, conditioned, seen)
         target = motion if schedule.predicts == "sample" else noise
-        error = (found - target.to(found.dtype)).square()
-        return {"loss": mean_of_rows(error, mask, batch.get("present"))}
+        error = found - target.to(found.dtype)
+        loss = mean_of_rows(error.square(), mask, batch.get("present"))
+        weight = self.net.config.velocity_weight
+        if weight:
+            between = error.diff(dim=1).square()
+            loss = loss + weight * mean_of_rows(between, mask[:, 1:], batch.get("present"))
+        return {"loss": loss}
 
 
 class DmdModule(StageModule):

@@ -11,11 +11,14 @@ Legend: B batch, T frames, D motion features, E text width.
 from __future__ import annotations
 
 import math
+from typing import Self
 
+import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from motionloom.models.diffusion.observed import observed_width
 from motionloom.models.diffusion.schedule import ScheduleConfig
 from motionloom.models.layers.transformer import Norm, StackConfig, Transformer, sinusoid, waves
 
@@ -30,18 +33,41 @@ class DiffusionConfig(StackConfig):
     """`post` is MDM's; `pre` needs no warm-up [ours]."""
     condition_dropout: float = Field(default=0.1, ge=0, lt=1)
     """Share of samples trained without text; 0 turns guidance off."""
+    observed: float = Field(default=0.0, ge=0, le=1)
+    """Share of samples of which the network is shown a part, as columns beside the noise, so that it learns
+    to fill in the rest [ours]; 0 is MDM's, without these columns."""
+    quieted: bool = False
+    """Enter noisy frames as the best linear guess of the motion in them, which is next to nothing where they
+    are next to noise [ours]: small networks take long to learn that. False is MDM's."""
+    velocity_weight: float = Field(default=0.0, ge=0)
+    """Weight of the same error between frame-to-frame differences, which makes motion smoother; 0 is MDM's
+    for features."""
     schedule: ScheduleConfig = ScheduleConfig()
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.schedule.predicts != "sample" and (self.velocity_weight or self.quieted):
+            raise ValueError("velocity_weight and quieted are for schedule: {predicts: sample}")
+        return self
 
 
 class MotionDiffusion(nn.Module):
     """Denoiser of motions [B, T, D] normalised, given one text vector [B, E] each."""
+
+    share: Tensor
+    """Of a unit motion in what it is noised to, by time step [steps]; ones unless `quieted`."""
 
     def __init__(self, config: DiffusionConfig, motion_dim: int, text_dim: int) -> None:
         super().__init__()
         self.config = config
         self.motion_dim = motion_dim
         self.text_dim = text_dim
+        share = torch.ones(config.schedule.steps)
+        if config.quieted:
+            share = torch.from_numpy(np.cumprod(1 - config.schedule.beta_table()) ** 0.5).float()
+        self.register_buffer("share", share, persistent=False)
         self.enter = nn.Linear(motion_dim, config.dim)
+        self.seen = nn.Linear(observed_width(motion_dim), config.dim, bias=False) if config.observed else None
         self.text = nn.Linear(text_dim, config.dim)
         self.time = nn.Sequential(
             nn.Linear(config.dim, config.dim), nn.SiLU(), nn.Linear(config.dim, config.dim)
@@ -50,7 +76,15 @@ class MotionDiffusion(nn.Module):
         self.stack = Transformer(config, config.layers, norm=config.norm)
         self.leave = nn.Linear(config.dim, motion_dim)
 
-    def forward(self, noisy: Tensor, step: Tensor, text: Tensor, mask: Tensor, conditioned: Tensor) -> Tensor:
+    def forward(
+        self,
+        noisy: Tensor,
+        step: Tensor,
+        text: Tensor,
+        mask: Tensor,
+        conditioned: Tensor,
+        seen: Tensor | None = None,
+    ) -> Tensor:
         """The clean motion (or the noise) of `noisy`; zero where masked.
 
         Args:
@@ -59,10 +93,16 @@ class MotionDiffusion(nn.Module):
             text: [B, E].
             mask: bool [B, T], True = real frame.
             conditioned: bool [B], False hides the text.
+            seen: [B, T, 2 D + 6], what is known of the motion (`observed.py`); None is nothing. Networks
+                without such columns take no notice of it.
         """
         time = self.time(waves(step, self.config.dim).to(self.text.weight.dtype))
         condition = self.text(text * conditioned[:, None]) + time
+        if self.config.quieted:
+            noisy = noisy * self.share[step][:, None, None].to(noisy.dtype)
         frames = self.enter(noisy)
+        if self.seen is not None and seen is not None:
+            frames = frames + self.seen(seen.to(frames.dtype))
         x = torch.cat([condition[:, None].to(frames.dtype), frames], dim=1)
         x = self.dropout(x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype))
         visible = torch.cat([mask.new_ones(len(mask), 1), mask], dim=1)

@@ -34,6 +34,7 @@ class Scheduler(Protocol):
     """What is used of diffusers' schedulers."""
 
     timesteps: Tensor
+    alphas_cumprod: Tensor
     init_noise_sigma: float
 
     def scale_model_input(self, sample: Tensor, timestep: Tensor) -> Tensor: ...
@@ -114,15 +115,17 @@ class ScheduleConfig(Config):
         noise: list[torch.Generator],
         kind: Sampler,
         steps: int,
+        skip: int = 0,
     ) -> Tensor:
         """Motions [n, T, D] from standard normal x [n, T, D]; steps that draw do so from `noise`.
 
-        `predict` says what the network predicts of noisy motions [n, T, D] at a time step.
+        `predict` says what the network predicts of noisy motions [n, T, D] at a time step. With the first
+        `skip` steps left out, x is motion that is noised as far as the next of them wants.
         """
         scheduler = self.sampler(kind, steps)
-        x = x * scheduler.init_noise_sigma
+        x = x if skip else x * scheduler.init_noise_sigma
         extra = {} if kind == "dpm++" else {"generator": noise}
-        for step in scheduler.timesteps:
+        for step in scheduler.timesteps[skip:]:
             found = predict(scheduler.scale_model_input(x, step), step)
             stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, **extra).prev_sample
             x = stepped

@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Annotated, Literal, Self
+from typing import Annotated, Protocol, Self, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from motionloom.datasets.conditions import Conditions
+from motionloom.datasets.motion.figure_parts import FigurePart
 from motionloom.datasets.schema import Config
-
-EditPart = Literal[
-    "all", "upper", "lower", "left_arm", "right_arm", "left_hand", "right_hand", "hands", "face"
-]
-"""Groups of a figure's columns. `lower` are pelvis and legs, and with them where the figure goes; `upper` is
-all above the pelvis but the face; arms are without fingers; hands are the fingers."""
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.sampling import SamplingConfig
 
 FASTEST = 12.0
 """Metres a second; nobody runs faster."""
@@ -38,14 +39,16 @@ class Kept(Config):
     start: Seconds = Field(0.0, ge=0)
     end: Seconds | None = None
     """None: to the clip's end."""
-    parts: tuple[EditPart, ...] = Field(("all",), min_length=1)
-    but: tuple[EditPart, ...] = ()
+    parts: tuple[FigurePart, ...] = ("all",)
+    but: tuple[FigurePart, ...] = ()
     """What of these is free after all: `parts: [all], but: [right_hand]` makes the right hand anew."""
 
     @model_validator(mode="after")
     def _forward(self) -> Self:
         if self.end is not None and self.end <= self.start:
             raise ValueError(f"it ends at {self.end:g} s, before it starts ({self.start:g} s)")
+        if not self.parts:
+            raise ValueError("it names no parts; leave `parts` out for all of them")
         return self
 
 
@@ -107,7 +110,7 @@ class EditTask(Config):
     """None: with `words`, all outside of them, and all of the clip where the result is longer than it;
     else nothing."""
     path: tuple[PathPoint, ...] = ()
-    """Between its points the root takes the straight line at an even speed."""
+    """Between its points the root takes a smooth way that does not overshoot."""
     pins: tuple[Pin, ...] = ()
     words: tuple[Words, ...] = ()
     strength: float = Field(1.0, ge=0, le=100, allow_inf_nan=False)
@@ -143,3 +146,99 @@ def _in_order(name: str, times: Sequence[float]) -> None:
     for one, two in pairwise(times):
         if two <= one:
             raise ValueError(f"{name}: {two:g} s comes after {one:g} s; give them in order of time")
+
+
+@dataclass(frozen=True)
+class KnownWay:
+    """Where the root is in some of T frames, seen from frame `anchor`: there it stands at the origin, facing
+    +Z.
+    """
+
+    anchor: int
+    heading: NDArray[np.float64]
+    """Radians [T]."""
+    place: NDArray[np.float64]
+    """z and x in metres [T, 2]."""
+    heading_known: NDArray[np.bool_]
+    place_known: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FramePin:
+    """A joint that must be somewhere in one frame: metres, seen from the way's anchor."""
+
+    frame: int
+    joint: int
+    position: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Said:
+    """Words and the frames that they are about."""
+
+    conditions: Conditions
+    """Encoded, one row; empty without words."""
+    share: NDArray[np.float64]
+    """[T]; those of all words sum to 1 in each frame."""
+
+
+@dataclass(frozen=True)
+class EditRequest:
+    """A motion of T frames that is partly given, and what is asked of the rest."""
+
+    features: NDArray[np.float32]
+    """Columns of the generator's part [T, C], in their own units."""
+    pieces: NDArray[np.bool_]
+    """Which `figure_parts.PIECES` are given in each frame [T, P]."""
+    words: Sequence[Said]
+    seeds: Sequence[int]
+    """One for each motion to make."""
+    way: KnownWay | None = None
+    """None for a generator without the root."""
+    pins: Sequence[FramePin] = ()
+    strength: float = 1.0
+    likeness: float = 0.0
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+
+
+@runtime_checkable
+class EditingGenerator(MotionGenerator, Protocol):
+    """A generator that fills in what is not given."""
+
+    def edit(self, request: EditRequest) -> list[NDArray[np.float32]]:
+        """Motions [T, C] in their own units, one a seed; what is given in them is so to the bit, and the rest
+        near what is asked for.
+        """
+
+
+@dataclass(frozen=True)
+class EditReport:
+    """How near a motion is to its task; centimetres, and m/s²."""
+
+    kept_cm: float
+    """Furthest that a kept joint is from where it was: in the world where the legs are kept, else in the
+    figure. NaN where none is kept."""
+    path_cm: float
+    """Furthest that the root is from its path; NaN without one."""
+    pins_cm: dict[str, float]
+    """How far each pinned joint is from its place, by joint and seconds."""
+    seams: float
+    """Mean acceleration where kept and made meet; NaN where they do not."""
+    inside: float
+    """Mean acceleration of the clip itself."""
+    skating: float
+    """Share of the result's steps in which a foot slides, and that of the clip."""
+    clip_skating: float
+
+    def lines(self) -> list[str]:
+        """What there is to say, one line each."""
+        out = []
+        if not math.isnan(self.kept_cm):
+            out.append(f"kept joints: {self.kept_cm:.2f} cm at most from the clip")
+        if not math.isnan(self.path_cm):
+            out.append(f"path: {self.path_cm:.1f} cm at most off it")
+        out += [f"pin {name}: {miss:.1f} cm off" for name, miss in self.pins_cm.items()]
+        if not math.isnan(self.seams):
+            out.append(f"seams: {self.seams:.1f} m/s², the clip itself {self.inside:.1f} m/s²")
+        out.append(f"feet slide in {self.skating:.0%} of the steps, in the clip in {self.clip_skating:.0%}")
+        return out

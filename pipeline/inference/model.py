@@ -12,21 +12,30 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from huggingface_hub import ModelHubMixin, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
+from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
+from motionloom.pipeline.inference.edits.clips import read_clip, require_clip
+from motionloom.pipeline.inference.edits.edit import edited, require_editor
+from motionloom.pipeline.inference.edits.frames import EditFrames
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
-from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.requests import caption_list, remarks_of, weight_bytes
+from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
+from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
@@ -177,6 +186,38 @@ class MotionModel(
             sampling=SamplingConfig.of(sampling), streaming=streaming, notice=_warn,
         )  # fmt: skip
 
+    def edit(
+        self,
+        clip: Path | str | GeneratedMotion,
+        task: EditTask | Mapping[str, object],
+        *,
+        samples: int = 1,
+        seed: int = 0,
+        sampling: SamplingConfig | Mapping[str, object] | None = None,
+    ) -> list[EditedMotion]:
+        """A clip of which a part is made anew, `samples` times.
+
+        Args:
+            clip: A file (BVH, or the npz or GLB of a motion), or a generated motion.
+            task: What to keep and what to ask of the rest: an `EditTask`, or a mapping of its keys.
+            seed: Equal arguments give equal motions.
+            sampling: As of `generate`.
+
+        Only models whose body is made by diffusion edit. Each result says how near it is to its task
+        (`EditedMotion.report`).
+        """
+        require_editor(self.bundle.generator)
+        asked = EditTask.parse(task, "task")
+        if isinstance(clip, GeneratedMotion):
+            recorded = RecordedClip("the motion", clip.joints, clip.fps, clip.face, clip.caption)
+            require_clip(recorded)
+        else:
+            recorded = read_clip(Path(clip))
+        with threads_for(samples, weight_bytes(self.bundle.stages)):
+            return edit_clip(
+                self.bundle, recorded, asked, samples=samples, seed=seed, sampling=SamplingConfig.of(sampling)
+            )
+
     @property
     def fps(self) -> float:
         return self.bundle.layout.fps
@@ -225,3 +266,35 @@ class MotionModel(
 def _warn(unknown: Unknown | str) -> None:
     """Warn of a stream's caption or sound, at the loop that takes the chunks."""
     warnings.warn(str(unknown), stacklevel=6)
+
+
+def edit_clip(
+    bundle: Bundle, clip: RecordedClip, task: EditTask, *, samples: int, seed: int, sampling: SamplingConfig
+) -> list[EditedMotion]:
+    """As `MotionModel.edit`."""
+    require_seed(seed)
+    layout, sampling = bundle.layout, bundle.drawing(sampling)
+    asked = EditFrames.of(task, clip, layout)
+
+    def encoded(stage: Finished) -> tuple[MotionGenerator, Callable[[str], Conditions]]:
+        generator, encoder = bundle.of(stage), bundle.encoder(stage)
+        modalities = generator.modalities & {"text"}
+        return generator, lambda text: encoder.encode([Prompt(text)], [text], modalities, layout.fps)
+
+    face_stage = bundle.choose_face(sampling.face_model)
+    face = None if face_stage is None else encoded(face_stage)
+    results = edited(asked, *encoded(bundle.main), face, samples=samples, seed=seed, sampling=sampling)
+    shared: dict[str, Any] = {"layout": layout, "seed": seed}
+    own = asked.features[asked.inside]
+    original = GeneratedMotion(
+        Prompt(clip.caption), own[:, layout.part("bodyhand")], asked.to_world(asked.joints), asked.face,
+        kept=np.ones(len(own), dtype=np.bool_), layout=layout,
+    )  # fmt: skip
+    words = "; ".join(dict.fromkeys(text for text, _ in asked.shares() if text.strip()))
+    return [
+        EditedMotion(
+            Prompt(words, task.face), one.features, one.joints, one.face, kept=asked.whole,
+            original=original, report=one.report, remarks=asked.remarks, **shared,
+        )
+        for one in results
+    ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.render.score import Segment
 
@@ -35,6 +36,8 @@ class GeneratedMotion:
     """Seconds of the beats of its music, as the model heard them; None: not looked for."""
     seed: int | None = None
     """The seed that it was asked for with."""
+    kept: NDArray[np.bool_] | None = None
+    """Frames that are a clip's own [T], whose feet are left as they are; None: all were made."""
 
     @property
     def caption(self) -> str:
@@ -73,3 +76,15 @@ class GeneratedMotion:
     def _repr_html_(self) -> str:
         """The viewer, in a frame of its own that can reach neither the notebook nor the network."""
         return str(import_module(_OUTPUTS).frame_of(self))
+
+
+@dataclass(frozen=True)
+class EditedMotion(GeneratedMotion):
+    """A clip of which a part was made anew, in the clip's world, the floor at height 0."""
+
+    original: GeneratedMotion = field(kw_only=True)
+    """The clip, at the model's frame rate."""
+    report: EditReport = field(kw_only=True)
+    """How near it is to its task."""
+    remarks: tuple[str, ...] = ()
+    """What there is to know of how the clip was read."""

@@ -85,4 +85,6 @@ def shown(motion: GeneratedMotion | ShownMotion, options: FigureOptions | None =
     # Only the h3d family has contact columns; others are judged by height and speed.
     columns = motion.features if layout.family == "h3d" else None
     contacts = foot_contacts(figure.joints, layout.skeleton, layout.fps, options.feet, columns, layout)
+    if motion.kept is not None:
+        contacts &= ~motion.kept[:, None]
     return ShownMotion(motion, *plant_feet(figure, motion.joints, contacts, layout.fps, options.feet))

@@ -24,11 +24,16 @@ from motionloom.datasets.motion.canonical import ground, heading
 from motionloom.datasets.motion.layout import MotionLayout
 
 
-def encode_exact(joints: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float32]:
-    """Joints [..., T, N, 3] in metres -> features [..., T, D]; a `face` field is left at 0."""
+def encode_exact(
+    joints: NDArray[np.floating], layout: MotionLayout, angle: NDArray[np.float64] | None = None
+) -> NDArray[np.float32]:
+    """Joints [..., T, N, 3] in metres -> features [..., T, D]; a `face` field is left at 0.
+
+    `angle` [..., T] are headings in radians, where others than the joints' own smoothed ones are wanted.
+    """
     *lead, frames, _, _ = joints.shape
     out = np.zeros((*lead, frames, layout.dim), dtype=np.float32)
-    angle = heading(joints, layout.fps)
+    angle = heading(joints, layout.fps) if angle is None else angle
     unturn = np.exp(-1j * angle)[..., None]
     plane = ground(joints)
 
@@ -57,10 +62,7 @@ def decode_exact(features: NDArray[np.floating], layout: MotionLayout) -> NDArra
 
 
 def place(
-    features: NDArray[np.floating],
-    layout: MotionLayout,
-    turn: NDArray[np.floating],
-    root: NDArray[np.floating],
+    features: NDArray[np.floating], layout: MotionLayout, turn: NDArray[np.inexact], root: NDArray[np.inexact]
 ) -> NDArray[np.float64]:
     """Local positions put into the world: `turn` = exp(i heading) [..., T], `root` = z + i x [..., T],
     metres.

@@ -26,13 +26,7 @@ def torch_joints_of(features: Tensor, layout: MotionLayout) -> Tensor:
         features = features[..., torch.as_tensor(layout.part("bodyhand"), device=features.device)]
     if features.shape[-1] != body.dim:
         raise UserError(f"layout {layout.name} has {body.dim} columns of body and hands, not these")
-    published = layout.family == "h3d"
-    yaw = features[..., body.slice("root_yaw_velocity")][..., 0]
-    heading = _from_zero(yaw) * (-2 if published else 1)
-    # Of `h3d` a step is seen from the heading of the frame that it leads to.
-    steps = features[..., body.slice("root_xz_velocity")]
-    seen = torch.cat([heading[..., 1:], heading[..., -1:]], dim=-1) if published else heading
-    way_x, way_z = (_from_zero(part) for part in _turned(steps[..., 0], steps[..., 1], seen))
+    heading, way_x, way_z = torch_way(features, body)
     local = features[..., body.slice("positions")]
     local = local.reshape(*local.shape[:-1], -1, 3)
     x, z = _turned(local[..., 0], local[..., 2], heading[..., None])
@@ -40,6 +34,19 @@ def torch_joints_of(features: Tensor, layout: MotionLayout) -> Tensor:
     root = torch.stack([way_x[..., None], height, way_z[..., None]], dim=-1)
     others = torch.stack([x + way_x[..., None], local[..., 1], z + way_z[..., None]], dim=-1)
     return torch.cat([root, others], dim=-2)
+
+
+def torch_way(features: Tensor, layout: MotionLayout) -> tuple[Tensor, Tensor, Tensor]:
+    """The root's heading in radians, x and z in metres, [..., T] each, of columns [..., T, D] whose first are
+    the root's.
+    """
+    published = layout.family == "h3d"
+    heading = _from_zero(features[..., layout.slice("root_yaw_velocity")][..., 0]) * (-2 if published else 1)
+    # Of `h3d` a step is seen from the heading of the frame that it leads to.
+    steps = features[..., layout.slice("root_xz_velocity")]
+    seen = torch.cat([heading[..., 1:], heading[..., -1:]], dim=-1) if published else heading
+    x, z = (_from_zero(part) for part in _turned(steps[..., 0], steps[..., 1], seen))
+    return heading, x, z
 
 
 def present_joints(present: Tensor, layout: MotionLayout) -> Tensor:

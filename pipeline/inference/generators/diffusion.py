@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler
+from motionloom.pipeline.contract.editing import EditRequest
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.generators.filling import fill_in
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.store.networks import device_of
 
@@ -21,6 +25,8 @@ class DiffusionMotion(WholeMotion):
     """Denoising from a sentence embedding, of any part of the body (MDM; B.5.2)."""
 
     net: MotionDiffusion
+    window: int = 196
+    """Frames that are edited at once: the longest motion of its training."""
     who = "this diffusion model"
     method = "diffusion"
 
@@ -40,5 +46,16 @@ class DiffusionMotion(WholeMotion):
         return sample_motions(
             self.net, request.pooled_text(self.who).to(device_of(self.net)), frames, seeds=request.seeds,
             sampler=sampler, steps=steps,
-            guidance=sampling.face_guidance if self.part == "face" else sampling.cfg_scale,
+            guidance=self._guidance(sampling),
         )  # fmt: skip
+
+    def edit(self, request: EditRequest) -> list[NDArray[np.float32]]:
+        """`EditingGenerator`."""
+        sampler, steps = self.denoising(request.sampling)
+        return fill_in(
+            self.net, self.given["stats"], self.part, request, window=self.window, sampler=sampler,
+            steps=steps, guidance=self._guidance(request.sampling),
+        )  # fmt: skip
+
+    def _guidance(self, sampling: SamplingConfig) -> float:
+        return sampling.face_guidance if self.part == "face" else sampling.cfg_scale

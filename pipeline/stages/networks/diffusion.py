@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import Part
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.observed import Showing
 from motionloom.models.layers.transformer import name_in_torch
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
@@ -65,18 +67,35 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
 
     def release(self, net: MotionDiffusion) -> Release | None:
         """MDM's `trans_enc`."""
-        return None if net.config.norm == "pre" else Release(mdm_names(net), unread=("*.pe", "clip_model.*"))
+        return (
+            None
+            if net.config.norm == "pre" or net.config.observed
+            else Release(mdm_names(net), unread=("*.pe", "clip_model.*"))
+        )
 
     def module(
         self, config: DiffusionStageConfig, net: MotionDiffusion, inputs: CaptionInputs, seed: int
     ) -> DiffusionModule:
         from motionloom.models.diffusion.module import DiffusionModule
 
-        return DiffusionModule(net, config.optim, seed=seed, max_steps=config.train.steps)
+        showing = None
+        if net.config.observed:
+            columns = part_columns(inputs.data.layout, config.part)
+            # A dry run has no statistics.
+            stats = inputs.stats or FeatureStats.unit(inputs.data.layout)
+            showing = Showing.of(stats.layout, columns, stats.mean, stats.std, net.config.observed)
+        return DiffusionModule(net, config.optim, seed=seed, max_steps=config.train.steps, showing=showing)
 
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
         net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
-        return DiffusionMotion(given["stats"].layout, part, given, net)
+        return DiffusionMotion(given["stats"].layout, part, given, net, self._window(stage))
+
+    @staticmethod
+    def _window(stage: Finished) -> int:
+        """The longest motion that the network was trained on."""
+        config = stage.config
+        assert isinstance(config, DiffusionStageConfig)
+        return config.max_frames
 
 
 _AROUND = {

@@ -1,0 +1,140 @@
+"""Joints moved so that they are where they must be, by as little as needed and without a jump [ours].
+
+The root's way and heading are bent between the frames in which they are known; a joint that is pinned takes
+its limb along, and what the limb does not reach the rest of the body gives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.body.chain_solver import solve_poses
+from motionloom.datasets.motion.body.rigid import fit_rigid
+from motionloom.datasets.motion.canonical import ground
+from motionloom.datasets.motion.skeleton import Skeleton
+
+Number = TypeVar("Number", np.float64, np.complex128)
+
+_PINNED, _FREE, _BENDS = 1000.0, 1.0, 0.05
+"""Weights of joints: that must be somewhere, of the rest, and of knees and elbows, which may bend."""
+_ROUNDS = 3
+"""Of aiming past a pin by as much as it was missed."""
+
+Pinned = Mapping[tuple[int, int], Sequence[float]]
+"""Where joints must be, in metres, by frame and joint."""
+
+
+def eased(values: NDArray[Number], known: NDArray[np.bool_]) -> NDArray[Number]:
+    """Values [T], between known ones along a curve that leaves and arrives level; 0 where nothing is known.
+
+    Before the first and after the last known one they stay as these are.
+    """
+    at = np.flatnonzero(known)
+    out = np.zeros_like(values)
+    if not len(at):
+        return out
+    frames = np.arange(len(values))
+    after = np.clip(np.searchsorted(at, frames, side="right"), 1, max(len(at) - 1, 1))
+    first, last = at[after - 1], at[np.minimum(after, len(at) - 1)]
+    share = np.clip((frames - first) / np.maximum(last - first, 1), 0.0, 1.0)
+    share = share * share * (3 - 2 * share)
+    out[:] = values[first] * (1 - share) + values[last] * share
+    return out
+
+
+def landed(
+    joints: NDArray[np.float64],
+    heading: NDArray[np.float64],
+    place_change: NDArray[np.complex128],
+    heading_change: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Joints [T, N, 3] and headings [T] after each frame is turned about its root and moved along the floor.
+
+    Args:
+        place_change: Metres, z + i x, [T].
+        heading_change: Radians to the left [T].
+    """
+    plane = ground(joints)
+    root = plane[:, :1]
+    plane = root + (plane - root) * np.exp(1j * heading_change)[:, None] + place_change[:, None]
+    out = np.array(joints, dtype=np.float64)
+    out[..., 2], out[..., 0] = plane.real, plane.imag
+    return out, heading + heading_change
+
+
+def reached(
+    joints: NDArray[np.float64], skeleton: Skeleton, pinned: Pinned, fixed: NDArray[np.bool_], blend: int
+) -> NDArray[np.float64]:
+    """Joints [T, N, 3] of which the pinned ones are where they must be, as far as the bones reach.
+
+    Args:
+        fixed: Joints that may not move, bool [T, N].
+        blend: Frames before and after a pin in which the figure goes there and comes back; fewer where a
+            fixed frame is nearer.
+    """
+    if not pinned:
+        return joints
+    figure = fit_rigid(joints, skeleton)
+    missing = {key: np.asarray(place) - joints[key] for key, place in pinned.items()}
+    out = joints
+    for _ in range(_ROUNDS):
+        targets = figure.joints.copy()
+        weights = np.where(fixed, _PINNED, _FREE)
+        moved = np.zeros(len(joints), dtype=np.bool_)
+        pinned_joints = sorted({joint for _, joint in pinned})
+        still: NDArray[np.bool_] = np.all(fixed, axis=1)
+        changes = {joint: _track(joint, missing, still, blend) for joint in pinned_joints}
+        for joint in pinned_joints:
+            moved |= changes[joint].any(axis=1)
+            weights[:, skeleton.parents[joint]] = np.minimum(weights[:, skeleton.parents[joint]], _BENDS)
+        for joint, above in enumerate(_nearest_pinned(skeleton, pinned_joints)):
+            if above is not None:
+                targets[:, joint] += np.where(fixed[:, joint, None], 0.0, changes[above])
+        for joint in pinned_joints:
+            weights[:, joint] = _PINNED
+        weights[fixed] = _PINNED
+        rows = np.flatnonzero(moved)
+        turned, root = solve_poses(
+            targets[rows],
+            figure.skeleton.offsets,
+            skeleton.parents,
+            figure.rotations[rows],
+            figure.root[rows],
+            weights[rows],
+        )
+        posed = type(figure).posed(figure.skeleton, turned, root, targets[rows])
+        out = joints.copy()
+        out[rows] += np.where(fixed[rows][..., None], 0.0, posed.joints - figure.joints[rows])
+        for key, place in pinned.items():
+            missing[key] = missing[key] + np.asarray(place) - out[key]
+    return out
+
+
+def _nearest_pinned(skeleton: Skeleton, pinned: Sequence[int]) -> list[int | None]:
+    """For every joint itself or the nearest joint above it that is pinned."""
+    out: list[int | None] = []
+    for joint, parent in enumerate(skeleton.parents):
+        out.append(joint if joint in pinned else out[parent] if parent >= 0 else None)
+    return out
+
+
+def _track(
+    joint: int, missing: Mapping[tuple[int, int], NDArray[np.float64]], still: NDArray[np.bool_], blend: int
+) -> NDArray[np.float64]:
+    """By how much a joint is moved in every frame [T, 3]: at its pins all of it, nothing `blend` frames away
+    from them and where the figure must stand `still`.
+    """
+    knots = np.array([frame for frame, one in missing if one == joint])
+    frames = len(still)
+    values = np.zeros((frames, 3))
+    for frame in knots:
+        values[frame] = missing[frame, joint]
+    known = still.copy()
+    known[knots] = True
+    near = np.abs(np.arange(frames)[:, None] - knots).min(axis=1)
+    known |= near >= blend
+    return np.stack([eased(values[:, axis], known) for axis in range(3)], axis=-1)

@@ -1,0 +1,94 @@
+"""A clip in one file: BVH of any human skeleton, and the npz and GLB files that are written here."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
+from motionloom.datasets.convert.bvh.settle import added_frames, settled
+from motionloom.datasets.convert.common.features import require_human
+from motionloom.datasets.motion.bvh.motion import read_bvh
+from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS
+from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.inference.edits.recorded import LEAST_FRAMES, RecordedClip
+
+ENDINGS = (".bvh", ".npz", ".glb")
+
+
+def read_clip(path: Path) -> RecordedClip:
+    """The clip of a file. `UserError` for what is no clip of a person, or too short."""
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise UserError(f"{path}: a clip is a file that ends in {', '.join(ENDINGS)}")
+    if not path.is_file():
+        raise UserError(f"{path}: no such file")
+    if ending == ".bvh":
+        return require_clip(_of_bvh(path))
+    if ending == ".npz":
+        return require_clip(_of_npz(path))
+    from motionloom.pipeline.render.body.glb_reader import read_glb
+
+    joints, fps, name = read_glb(path)
+    return require_clip(RecordedClip(str(path), joints, fps, None, name))
+
+
+def require_clip(clip: RecordedClip) -> RecordedClip:
+    """The clip, if it is a person's and long enough."""
+    if len(clip.joints) < LEAST_FRAMES:
+        raise UserError(
+            f"{clip.name}: {len(clip.joints)} frames are no motion; give a clip of {LEAST_FRAMES} or more"
+        )
+    try:
+        require_human(clip.joints, clip.fps)
+    except UserError as error:
+        raise UserError(f"{clip.name}: {error}") from None
+    return clip
+
+
+def _of_bvh(path: Path) -> RecordedClip:
+    """Its joints by the names that they have; hands only where all fingers are found."""
+    motion = read_bvh(path)
+    guesses = [guess_joint_map(motion, Skeleton.named(name)) for name in ("smplx52", "smpl22")]
+    guess = next((one for one in guesses if one.certain), None)
+    if guess is None:
+        raise UserError(
+            f"{path}: not a skeleton that is known ({guesses[1].doubts()}); convert it with a joint map of "
+            f"its own: motionloom data convert bvh --joint-map"
+        )
+    joint_map = guess.joint_map(str(path))
+    unit, up, _ = settled(joint_map, [motion])
+    joints = joint_map.apply(motion, unit=unit, up=up)
+    return RecordedClip(str(path), joints[added_frames(joints) :], motion.fps)
+
+
+def _of_npz(path: Path) -> RecordedClip:
+    with NpzFile(path) as stored:
+        joints = stored.numbers("joints")
+        face = stored.numbers("face").astype(np.float32) if "face" in stored.names else None
+        facts = _facts(str(stored.array("metadata")), path) if "metadata" in stored.names else {}
+    if joints.ndim != 3 or joints.shape[1] not in (BODY_JOINTS, 52) or joints.shape[2] != 3:
+        raise UserError(f"{path}: joints of shape {list(joints.shape)}, wanted [T, 22 or 52, 3]")
+    if face is not None and face.shape != (len(joints), FACE_DIMS):
+        raise UserError(f"{path}: a face of shape {list(face.shape)}, wanted [{len(joints)}, {FACE_DIMS}]")
+    fps = facts.get("fps")
+    if not isinstance(fps, int | float) or not 0 < fps <= 1000:
+        raise UserError(
+            f"{path}: its metadata do not say the frames a second; save it with motionloom generate"
+        )
+    return RecordedClip(str(path), joints, float(fps), face, str(facts.get("caption", "")))
+
+
+def _facts(text: str, path: Path) -> Mapping[str, object]:
+    try:
+        facts = json.loads(text)
+    except (ValueError, RecursionError):
+        facts = None
+    if not isinstance(facts, dict):
+        raise UserError(f"{path}: its metadata are not JSON")
+    return facts

@@ -1,0 +1,199 @@
+"""Filling in: places with gradients, what a network is shown, what is kept, and what constraints do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from motionloom.datasets.conditions import Condition
+from motionloom.datasets.motion.features.codec import decode
+from motionloom.datasets.motion.figure_parts import LOWER, PIECES
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.editing import Filling, Given, Pins, Worded
+from motionloom.models.diffusion.module import DiffusionModule
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.observed import Places, Showing, known_columns, observed_columns
+from motionloom.models.diffusion.recovery import Recovery
+from motionloom.models.training.stage_module import OptimConfig
+
+LAYOUT = MotionLayout.named("body133")
+COLUMNS = LAYOUT.part("all")
+FRAMES = 24
+TINY = DiffusionConfig(dim=16, ff=16, layers=1, heads=2, dropout=0.0, observed=0.9)
+
+
+def recovery(layout: MotionLayout = LAYOUT) -> Recovery:
+    rng = np.random.default_rng(0)
+    mean, std = rng.normal(size=(2, layout.dim)).astype(np.float32) * 0.05
+    return Recovery(layout, layout.part("all"), mean, np.abs(std) + 0.02)
+
+
+@pytest.mark.parametrize("name", ["body133", "tomato623"])
+def test_joints_are_the_decoders_and_the_anchor_is_the_origin(name: str) -> None:
+    layout = MotionLayout.named(name)
+    found, motion = recovery(layout), torch.randn(2, 12, layout.dim)
+    own = motion * found._std + found._mean
+    joints = found.world(motion, torch.tensor([0, 0]))
+    np.testing.assert_allclose(joints, decode(own.numpy(), layout), atol=1e-5)
+    # Seen from another frame: the same figure, and that frame at the origin.
+    other = found.world(motion, torch.tensor([5, 7]))
+    heading, place = found.way(motion, torch.tensor([5, 7]))
+    assert not place[0, 5].any() and not place[1, 7].any() and not heading[1, 7].any()
+    apart = [(one[:, :, None] - one[:, :, :, None]).norm(dim=-1) for one in (joints[None], other[None])]
+    torch.testing.assert_close(*apart, atol=1e-4, rtol=1e-4)
+
+
+def test_columns_without_the_root_have_no_way() -> None:
+    layout = MotionLayout.named("wholebody363")
+    unit = np.ones(363, dtype=np.float32)
+    with pytest.raises(UserError, match="root"):
+        Recovery(layout, layout.part("hand"), unit, unit)
+    assert Showing.of(layout, layout.part("face"), unit, unit, 1.0).recovery is None
+
+
+def test_a_step_is_known_where_both_its_frames_and_the_root_are() -> None:
+    pieces = torch.zeros(1, 6, len(PIECES), dtype=torch.bool)
+    pieces[0, 1:4, PIECES.index("left_arm")] = True
+    pieces[0, 2:4, LOWER] = True
+    known = known_columns(pieces, LAYOUT, COLUMNS)[0]
+    wrist = LAYOUT.skeleton.index("left_wrist")
+    position = LAYOUT.slice("positions").start + 3 * (wrist - 1)
+    velocity = LAYOUT.slice("velocities").start + 3 * wrist
+    assert known[:, position].tolist() == [False, True, True, True, False, False]
+    assert known[:, velocity].tolist() == [False, False, True, False, False, False]
+    assert known[:, LAYOUT.slice("root_xz_velocity")].all(1).tolist() == [False, False, True] + [False] * 3
+    assert known[:, LAYOUT.slice("root_height")].all(1).tolist() == [False, False, True, True, False, False]
+
+
+def test_what_is_shown_is_the_truth() -> None:
+    torch.manual_seed(0)
+    motion, length = torch.randn(64, FRAMES, len(COLUMNS)), torch.full((64,), FRAMES)
+    length[::2] = 15
+    own = recovery()
+    seen = Showing(LAYOUT, COLUMNS, own, 0.75)(motion, length)
+    dim = len(COLUMNS)
+    known = seen[..., dim : 2 * dim].bool()
+    assert torch.equal(seen[..., :dim], motion * known)
+    assert not known[::2, 15:].any()
+    share = known.any(2).any(1).float().mean()
+    assert 0.4 < share < 0.95  # of three quarters some are shown places alone
+    places, stood, turned = seen[..., 2 * dim : 2 * dim + 4], seen[..., -2], seen[..., -1]
+    first = stood.argmax(1)
+    heading, place = own.way(motion, first)
+    torch.testing.assert_close(places[..., :2], place * stood[..., None])
+    torch.testing.assert_close(places[..., 2], heading.cos() * turned)
+    assert (stood.sum(1) >= turned.sum(1)).all() and (turned.sum(1) < stood.sum(1)).any()
+
+
+def test_training_shows_and_learns() -> None:
+    """Shown everything but the middle of waves, it fills in nearer than the straight line does."""
+    torch.manual_seed(0)
+    config = DiffusionConfig(dim=48, ff=96, layers=1, heads=4, dropout=0.0, observed=1.0, quieted=True)
+    net = MotionDiffusion(config, len(COLUMNS), 4)
+    times = torch.arange(FRAMES) / FRAMES
+
+    def waves(count: int) -> torch.Tensor:
+        phase = torch.rand(count, 1, 1) * 6.28
+        return (times[:, None] * 9.4 + phase + torch.linspace(0, 3, len(COLUMNS))).sin()
+
+    def shown(motion: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        known = torch.zeros_like(motion, dtype=torch.bool)
+        known[:, :8], known[:, 16:] = True, True
+        return known, observed_columns(motion, known, None)
+
+    class Ends(Showing):
+        def __call__(self, motion: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
+            return shown(motion)[1]
+
+    module = DiffusionModule(
+        net, OptimConfig(lr=3e-3, warmup_steps=0), seed=0, max_steps=200,
+        showing=Ends(LAYOUT, COLUMNS, None, 1.0),
+    )  # fmt: skip
+    optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
+    for _ in range(200):
+        motion = waves(16)
+        text = Condition(torch.zeros(16, 1, 4), torch.ones(16, 1, dtype=torch.bool), torch.zeros(16, 4))
+        batch = {"motion": motion, "length": torch.full((16,), FRAMES), "conditions": {"text": text}}
+        optimizer.zero_grad()
+        module.losses(batch)["loss"].backward()
+        optimizer.step()
+    [truth] = waves(1)
+    known = shown(truth[None])[0][0]
+    made = filled(net, Given(truth, known), steps=10)[0]
+    share = torch.linspace(0, 1, 10)[1:-1, None]
+    line = truth[7] * (1 - share) + truth[16] * share
+    miss, trivial = ((one - truth[8:16]).square().mean() for one in (made[8:16], line))
+    assert miss < 0.5 * trivial
+
+
+def filled(
+    net: MotionDiffusion, given: Given, steps: int = 6, words: list[Worded] | None = None, **options: float
+) -> torch.Tensor:
+    said = words or [Worded(torch.zeros(net.text_dim), False, torch.ones(len(given.motion)))]
+    window = int(options.pop("window", 200))
+    rooted = recovery() if given.places is not None else None
+    filling = Filling(net, given, said, rooted, window=window, overlap=window // 4, **options)
+    return filling([0, 1], "ddpm", steps)
+
+
+def task(pinned: bool = True) -> Given:
+    """A motion whose begin and end are kept, with a pin between them."""
+    torch.manual_seed(1)
+    motion = torch.randn(FRAMES, len(COLUMNS)) * 0.3
+    pieces = torch.ones(1, FRAMES, len(PIECES), dtype=torch.bool)
+    pieces[:, 8:16] = False
+    known = known_columns(pieces, LAYOUT, COLUMNS)[0]
+    anchor = torch.tensor([0])
+    heading, place = recovery().way(motion[None], anchor)
+    rooted = pieces[..., LOWER]
+    places = Places(anchor, heading, place + 0.5 * (torch.arange(FRAMES) >= 16)[:, None], rooted, rooted)
+    wrist = LAYOUT.skeleton.index("left_wrist")
+    pins = Pins(torch.tensor([12]), torch.tensor([wrist]), torch.tensor([[0.4, 1.2, 0.3]]))
+    return Given(motion, known, places, pins if pinned else None)
+
+
+@pytest.mark.parametrize("predicts", ["sample", "epsilon"])
+def test_what_is_kept_is_kept_and_misses_fall_with_strength(predicts: str) -> None:
+    torch.manual_seed(0)
+    config = TINY.model_copy(update={"schedule": TINY.schedule.model_copy(update={"predicts": predicts})})
+    net, given = MotionDiffusion(config, len(COLUMNS), 4), task()
+    assert given.places is not None and given.pins is not None
+    misses = []
+    for strength in (0.0, 1.0, 6.0):
+        made = filled(net, given, strength=strength)
+        assert torch.equal(made[:, given.known], given.motion[given.known].expand(2, -1))
+        anchor = given.places.anchor.expand(2)
+        landing = recovery().way(made, anchor)[1][:, -1] - given.places.place[:, -1]
+        joint = recovery().world(made, anchor)[:, 12, given.pins.joints] - given.pins.positions
+        misses.append(float(landing.norm(dim=-1).mean() + joint.norm(dim=-1).mean()))
+    assert misses[0] > misses[1] > misses[2]
+    assert misses[2] < 0.7 * misses[0]
+
+
+def test_likeness_stays_near_and_seeds_differ() -> None:
+    torch.manual_seed(0)
+    net, given = MotionDiffusion(TINY, len(COLUMNS), 4), task(pinned=False)
+    anew, near = (filled(net, given, strength=0.0, steps=10, likeness=one) for one in (0.0, 0.9))
+    assert not torch.equal(anew[0], anew[1])
+    away = [(made[0] - given.motion).norm() for made in (anew, near)]
+    assert away[1] < away[0]
+
+
+def test_windows_and_words_share_frames() -> None:
+    """Two stretches of words: only the frames of the second change with its words; windows overlap."""
+    torch.manual_seed(0)
+    net = MotionDiffusion(TINY, len(COLUMNS), 4)
+    net.text.weight.data *= 20
+    known = torch.zeros(FRAMES, len(COLUMNS), dtype=torch.bool)
+    given = Given(torch.zeros(FRAMES, len(COLUMNS)), known)
+    late = (torch.arange(FRAMES) >= 12).float()
+
+    def made(second: torch.Tensor) -> torch.Tensor:
+        words = [Worded(torch.ones(4), True, 1 - late), Worded(second, True, late)]
+        return filled(net, given, words=words, window=10, steps=2)[0]
+
+    one, other = made(torch.ones(4)), made(-torch.ones(4))
+    changed = (one - other).abs().amax(1)
+    assert changed[12:].min() > 10 * changed[:6].max()

@@ -1,0 +1,247 @@
+"""Edits of clips: what is kept to the bit, what is asked for met, and what cannot be done refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from toy_stages import MadeStage
+
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.motion.canonical import canonicalize, ground
+from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.text.encoder import EncodedText
+from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import Finished, StageCache
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.edits.clips import read_clip, require_clip
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
+from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
+from motionloom.pipeline.inference.model import edit_clip
+from motionloom.pipeline.inference.motion import EditedMotion
+
+Walk = Callable[..., NDArray[np.float64]]
+FEW = SamplingConfig(denoising_steps=3)
+ENDS = [{"end": 1.0}, {"start": 2.0}]
+
+
+class Encoder:
+    """Fixed random sentences of eight numbers."""
+
+    name, dim = "fixed", 8
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        rows = [np.random.default_rng(len(c)).standard_normal(8) for c in captions]
+        sentence = np.stack(rows).astype(np.float32)
+        return EncodedText(sentence, sentence[:, None], np.ones((len(captions), 1), dtype=np.bool_))
+
+
+def stage(made: Any) -> Finished:
+    return Finished("stage", MadeStage(made), None, Path(f"stage-{made.part}"), {})
+
+
+def editor(name: str = "wholebody363", face: bool = False) -> Bundle:
+    """An untrained model that edits: of all columns, or of the body with a model of the face beside it."""
+    torch.manual_seed(0)
+    layout = MotionLayout.named(name, fps=20.0)
+    # Statistics of somebody who stands: an untrained network then strays from that by centimetres.
+    rest = canonicalize(np.repeat(layout.skeleton.rest_joints[None], 9, axis=0))
+    stats = FeatureStats(encode(rest, layout)[0], np.full(layout.dim, 0.02, np.float32), layout)
+    given = {"stats": stats, "text": SimpleNamespace(encoder=Encoder(), spelt=lambda text: text)}
+    config = DiffusionConfig(dim=16, ff=16, layers=1, heads=2, observed=0.9)
+    made: list[Any] = []
+    for part in ("bodyhand", "face") if face else ("all",):
+        net = MotionDiffusion(config, len(layout.part(part)), 8)  # type: ignore[arg-type]
+        made.append(DiffusionMotion(layout, part, given, net.eval(), window=40))  # type: ignore[arg-type]
+    return Bundle([stage(one) for one in made], StageCache())
+
+
+def clip(walk: Walk, seconds: float = 3.0, fps: float = 20.0) -> RecordedClip:
+    """A walk that begins somewhere and faces somewhere, with a face."""
+    frames = round(seconds * fps)
+    joints = walk(frames=frames, fps=fps) + np.array([1.0, 0.2, -2.0])
+    face = np.random.default_rng(0).normal(size=(frames, 50)).astype(np.float32)
+    return RecordedClip("walk", joints, fps, face)
+
+
+def edit(model: Bundle, one: RecordedClip, **task: object) -> EditedMotion:
+    [made] = edit_clip(model, one, EditTask.parse(task, "task"), samples=1, seed=0, sampling=FEW)
+    return made
+
+
+@pytest.mark.parametrize("name", ["wholebody363", "body133", "tomato623"])
+def test_kept_frames_are_the_clips_to_the_bit(walk: Walk, name: str) -> None:
+    model, one = editor(name), clip(walk)
+    made = edit(model, one, keep=ENDS)
+    kept, original = made.kept, made.original
+    assert kept is not None and kept.sum() == len(kept) - 20 and not kept[20:40].any()
+    np.testing.assert_array_equal(made.joints[kept], original.joints[kept])
+    assert made.report.kept_cm == 0
+    assert np.abs(made.joints - original.joints)[~kept].max() > 0.01
+    # In the clip's own world, whose floor is at 0.
+    floor = one.joints[..., 1].min()
+    np.testing.assert_allclose(
+        original.joints[:, :22], one.joints[: len(kept), :22] - [0, floor, 0], atol=0.02
+    )
+    # The features decode to these joints, from the first frame on.
+    local = joints_of(made.features, made.layout)
+    moved = np.abs(ground(local)[:, :1] - ground(local)[:1, :1]) - np.abs(
+        ground(made.joints)[:, :1] - ground(made.joints)[:1, :1]
+    )
+    assert np.abs(moved).max() < 0.05
+    if name == "wholebody363":
+        np.testing.assert_array_equal(made.features[kept][:, 4:157], original.features[kept][:, 4:157])
+        assert made.face is not None and original.face is not None
+        np.testing.assert_array_equal(made.face[kept], original.face[kept])
+
+
+@pytest.mark.parametrize(
+    ("keep", "free"),
+    [
+        ({"parts": ["lower"]}, {"spine1", "head", "left_wrist", "right_thumb3"}),
+        ({"parts": ["all"], "but": ["right_hand"]}, {"right_index1", "right_thumb3"}),
+        (
+            {"parts": ["all"], "but": ["left_arm", "left_hand"]},
+            {"left_shoulder", "left_wrist", "left_pinky2"},
+        ),
+        ({"parts": ["all"], "but": ["face"]}, set()),
+    ],
+)
+def test_parts_are_kept_alone(walk: Walk, keep: dict[str, object], free: set[str]) -> None:
+    made = edit(editor(), clip(walk), keep=[keep])
+    names = made.layout.skeleton.joints
+    moved = np.abs(made.joints - made.original.joints).max(axis=(0, 2)) > 0
+    found = {name for name, one in zip(names, moved, strict=True) if one}
+    assert free <= found
+    assert not found & {"pelvis", "left_knee", "right_foot"}
+    assert made.report.kept_cm == 0
+    assert made.face is not None and made.original.face is not None
+    face_kept = keep["parts"] == ["all"] and keep.get("but") != ["face"]
+    assert np.array_equal(made.face, made.original.face) == face_kept
+
+
+def test_before_after_and_between(walk: Walk) -> None:
+    made = edit(editor(), clip(walk), lead=0.5, seconds=4.0)
+    assert len(made.joints) == 10 + 80
+    assert made.kept is not None and made.kept.tolist() == [False] * 10 + [True] * 60 + [False] * 20
+    np.testing.assert_array_equal(made.joints[10:70], made.original.joints)
+    longer = edit(editor(), clip(walk, 6.0), keep=[{"end": 2.5}, {"start": 3.0}])  # windows of 2 s
+    assert longer.report.kept_cm == 0
+
+
+def test_path_and_pins_are_met(walk: Walk) -> None:
+    model, one = editor(), clip(walk)
+    path = [{"at": 0, "x": 1, "z": -2}, {"at": 1.5, "x": 1.5, "z": -1}, {"at": 2.5, "x": 2.5, "z": -0.5}]
+    made = edit(model, one, path=path)
+    assert made.report.path_cm < 0.01
+    np.testing.assert_allclose(made.joints[30, 0, [0, 2]], [1.5, -1], atol=1e-4)
+    loose = edit(model, one, path=path, exact=False)
+    assert loose.report.path_cm > 1
+    start = one.joints[0]
+    assert abs(ground(made.joints[0, 0]) - ground(start[0])) < 1e-3
+
+    hand = one.joints[30, 20] + [0.05, -0.2, 0.1]  # the floor of the clip is 0.2 m up
+    pin = {"at": 1.5, "joint": "left_wrist", "position": hand.tolist()}
+    made = edit(model, one, keep=ENDS, pins=[pin])
+    [miss] = made.report.pins_cm.values()
+    assert miss < 0.5
+    assert made.report.kept_cm == 0
+
+
+def test_a_model_of_the_face_keeps_and_makes_the_face(walk: Walk) -> None:
+    made = edit(editor(face=True), clip(walk), keep=[{"parts": ["all"], "but": ["face"]}], face="a smile")
+    assert made.face is not None and made.original.face is not None
+    assert not np.isclose(made.face, made.original.face).any(axis=1).all()
+    assert made.report.kept_cm == 0
+
+
+def test_other_rates_bones_and_missing_hands_are_said(walk: Walk) -> None:
+    tall = clip(walk, fps=40.0)
+    tall = RecordedClip("tall", tall.joints[:, :22] * 1.2, 40.0)
+    made = edit(editor(), tall, keep=ENDS)
+    assert len(made.joints) == 60
+    for word in ("40 frames/s", "no hands", "no face", "bones differ"):
+        assert any(word in remark for remark in made.remarks)
+    body = made.joints[:, :22]
+    kept = np.r_[0:20, 40:60]
+    np.testing.assert_array_equal(body[kept], made.original.joints[kept, :22])
+    bones = np.linalg.norm(body[:, 4] - body[:, 1], axis=-1)  # a thigh
+    np.testing.assert_allclose(bones[20:40], bones[0], rtol=0.02)
+
+
+def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:
+    made = edit(editor(), clip(walk), keep=ENDS, caption="a person walks")
+    again = [read_clip(made.save(tmp_path / f"clip.{ending}")) for ending in ("npz", "bvh", "glb")]
+    for one in again:
+        assert one.fps == 20 and one.joints.shape == (60, 52, 3)
+        np.testing.assert_allclose(one.joints, again[0].joints, atol=1e-3)
+    assert again[0].caption == "a person walks"
+    # What a file shows is one rigid figure: kept frames are its own to a few millimetres.
+    assert np.abs(again[0].joints - made.joints)[made.kept].mean() < 0.005
+
+
+REFUSED: list[tuple[dict[str, object], str]] = [
+    ({"keep": [{}]}, "nothing to make"),
+    ({}, "nothing of the clip is kept"),
+    ({"keep": [{"start": 9.0}]}, "keep.0: it starts at 9 s and the clip lasts 3.00 s"),
+    ({"keep": ENDS, "pins": [{"at": 1.5, "joint": "tail", "position": [0, 1, 0]}]}, "no joint 'tail'"),
+    ({"keep": ENDS, "pins": [{"at": 0.5, "joint": "head", "position": [0, 1, 0]}]}, "head is kept at 0.5 s"),
+    ({"keep": ENDS, "pins": [{"at": 9, "joint": "head", "position": [0, 1, 0]}]}, "from 0 s to 2.95 s"),
+    ({"pins": [{"at": 1, "joint": "head", "position": [0, 9, 0]}]}, "9 m above the floor"),
+    ({"path": [{"at": 0, "x": 0, "z": 0}, {"at": 1, "x": 90, "z": 0}]}, "90 m/s"),
+    ({"path": [{"at": 1, "x": 0, "z": 0}, {"at": 1, "x": 1, "z": 0}]}, "in order of time"),
+    ({"keep": ENDS, "path": [{"at": 0.5, "x": 0, "z": 0}]}, "at 0.5 s the legs are kept"),
+    ({"keep": ENDS, "path": [{"at": 1.1, "x": 90, "z": 0}]}, "where the root is kept"),
+    ({"words": [{"start": 1, "end": 2, "text": " "}]}, "say what the person does"),
+    ({"keep": [{"parts": ["leg"]}]}, "keep.0.parts.0"),
+    ({"keeps": []}, "did you mean 'keep'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("task", "said"), REFUSED)
+def test_what_cannot_be_done_is_refused_in_one_sentence(
+    walk: Walk, task: dict[str, object], said: str
+) -> None:
+    with pytest.raises(UserError) as error:
+        edit(editor(), clip(walk), **task)
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="2 frames are no motion"):
+        require_clip(RecordedClip("short.bvh", walk(frames=2), 20.0))
+    with pytest.raises(UserError, match=r"walk: the figure measures .* is the length unit right"):
+        require_clip(RecordedClip("walk", walk(frames=9) * 100, 20.0))
+    dog = tmp_path / "dog.bvh"
+    dog.write_text(
+        "HIERARCHY\nROOT body\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\nEnd Site\n{\n"
+        "OFFSET 0 1 0\n}\n}\nMOTION\nFrames: 4\nFrame Time: 0.05\n" + "0 0 0\n" * 4
+    )
+    (tmp_path / "bad.glb").write_bytes(b"glTF no")
+    for name, words in (
+        ("dog.bvh", "not a skeleton that is known"),
+        ("bad.glb", "not a GLB file that motionloom wrote"),
+        ("none.npz", "no such file"),
+        ("clip.fbx", "ends in .bvh, .npz, .glb"),
+    ):
+        with pytest.raises(UserError, match=name) as error:
+            read_clip(tmp_path / name)
+        assert words in str(error.value)
+
+
+def test_models_that_do_not_denoise_say_which_to_take(walk: Walk) -> None:
+    layout = MotionLayout.named("body133")
+    other = SimpleNamespace(part="bodyhand", method="gpt", layout=layout, modalities={"text"}, prepared={})
+    with pytest.raises(UserError, match=r"\(gpt\).*`inbetween`"):
+        edit(Bundle([stage(other)], StageCache()), clip(walk), keep=ENDS)
