@@ -15,6 +15,7 @@ from torch import Tensor
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import PRESENT_ALL, UserError
+from motionloom.models.baselines.mld.network import MotionVae
 from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
@@ -154,6 +155,15 @@ class LoadedTma:
         """
         near = None if present is None else present.to(self.device)
         return self.net.encode_motion(motion.to(self.device), length.to(self.device), near)[0]
+
+
+@dataclass(frozen=True)
+class LoadedMotionVae:
+    """A trained auto-encoder of body and hands (MLD), which writes at most `max_frames`."""
+
+    net: MotionVae
+    layout: MotionLayout
+    max_frames: int
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,15 @@ from torch import Tensor
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
+from motionloom.models.baselines.mld.network import (
+    LatentDenoiser,
+    LatentDiffusionConfig,
+    MotionVae,
+    MotionVaeConfig,
+)
+from motionloom.models.baselines.motionclip.module import MotionClipModule
+from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipConfig
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.evaluator.module import EvaluatorModule
@@ -153,11 +162,35 @@ class UndrawnGpt(GptModule):
 
 def diffusion() -> tuple[StageModule, Batches]:
     net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2), 20, TEXT)
-    module = Undrawn(net, OPTIM, seed=0, max_steps=STEPS)
+    module = UndrawnDiffusion(net, OPTIM, seed=0, max_steps=STEPS)
     return module.eval(), lambda step: motion(step, 20) | captions(step)
 
 
-class Undrawn(DiffusionModule):
+BODY: dict[str, Any] = {
+    "layout": MotionLayout.named("body133"), "mean": np.zeros(133), "std": np.full(133, 0.05),
+}  # fmt: skip
+
+
+def motion_vae() -> tuple[StageModule, Batches]:
+    net = MotionVae(MotionVaeConfig(dim=16, ff=16, layers=3, heads=2), 133)
+    module = MotionVaeModule(net, OPTIM, seed=0, max_steps=STEPS, **BODY)
+    return module.eval(), lambda step: motion(step, 133)
+
+
+def latent_diffusion() -> tuple[StageModule, Batches]:
+    vae = MotionVae(MotionVaeConfig(dim=16, ff=16, layers=1, heads=2), 20).double()
+    net = LatentDenoiser(LatentDiffusionConfig(dim=16, ff=16, layers=1, heads=2), 1, TEXT)
+    module = UndrawnLatents(net, OPTIM, seed=0, max_steps=STEPS, vae=vae)
+    return module.eval(), lambda step: motion(step, 20) | captions(step)
+
+
+def motionclip() -> tuple[StageModule, Batches]:
+    net = MotionClip(MotionClipConfig(latent=TEXT, ff=16, layers=1, heads=2), 133)
+    module = MotionClipModule(net, OPTIM, seed=0, max_steps=STEPS, **BODY)
+    return module.eval(), lambda step: motion(step, 133) | captions(step)
+
+
+class Undrawn(StageModule):
     """Time steps and noise are those of the whole batch, of which each rank takes its part."""
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
@@ -182,6 +215,14 @@ class Undrawn(DiffusionModule):
             return super().losses(batch)
         finally:
             torch.randint, torch.randn_like = randint, randn_like
+
+
+class UndrawnDiffusion(Undrawn, DiffusionModule):
+    """MDM."""
+
+
+class UndrawnLatents(Undrawn, LatentDiffusionModule):
+    """MLD's second stage."""
 
 
 class Pairs(EvaluatorModule):
@@ -214,6 +255,9 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "gpt, compiled": gpt,
     "gpt, samples": gpt_samples,
     "diffusion": diffusion,
+    "motion_vae": motion_vae,
+    "latent_diffusion": latent_diffusion,
+    "motionclip": motionclip,
     "evaluator": evaluator,
 }
 

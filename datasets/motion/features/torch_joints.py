@@ -9,7 +9,7 @@ from torch import Tensor
 
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.kinematics import levels
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 
 
@@ -77,12 +77,20 @@ def _posed(motion: Tensor, layout: MotionLayout) -> Tensor:
 
     if not layout.has("pose") or motion.shape[-1] != layout.dim:
         raise UserError(f"layout {layout.name} is not posed with gradients; smpl75 is")
-    parents, rest = layout.skeleton.parents, _neutral("smpl22").rest_joints()
-    offsets = torch.as_tensor(layout.skeleton.bones(rest)).to(motion)
     turns = motion[..., layout.slice("pose")]
-    local = roma.rotvec_to_rotmat(turns.reshape(*turns.shape[:-1], -1, 3)[..., :BODY_JOINTS, :])
+    local = roma.rotvec_to_rotmat(turns.reshape(*turns.shape[:-1], -1, 3))
+    return torch_smpl_joints(local, motion[..., layout.slice("trans")])
+
+
+def torch_smpl_joints(local: Tensor, trans: Tensor) -> Tensor:
+    """Joints [..., T, 22, 3] of local rotations [..., T, 22 or more, 3, 3] and translations [..., T, 3] in
+    metres: the neutral skeleton, in the source's axes.
+    """
+    body = _neutral("smpl22")
+    parents, rest = body.skeleton.parents, body.rest_joints()
+    offsets = torch.as_tensor(body.skeleton.bones(rest)).to(local)
     world = {0: local[..., 0, :, :]}
-    joints = {0: torch.as_tensor(rest[0]).to(motion) + motion[..., layout.slice("trans")]}
+    joints = {0: torch.as_tensor(rest[0]).to(local) + trans}
     for child in (child for level in levels(parents) for child in level):
         above = parents[child]
         world[child] = world[above] @ local[..., child, :, :]

@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import nn
 from torch.utils.data import Dataset
 
-from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
+from motionloom.datasets.loading.condition_batches import Captioned, ConditionBatches, EvalBatches
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
@@ -52,24 +52,8 @@ class CaptionStage(TrainedStage[C, I, N]):
     """A stage that trains on one part of whole clips and what is said of it."""
 
     def batches(self, config: C, net: N, inputs: I, seed: int, log: Log) -> Batches:
-        data, stats, readers = inputs.data, inputs.stats, {"text": inputs.text.cache}
-        dataset = data.split("train", training=True)
-        clips: dict[str, Any] = {
-            "max_frames": config.max_frames,
-            "min_frames": config.min_frames,
-            "columns": part_columns(dataset.layout, config.part),
-            "captioned": "face" if config.part == "face" else "body",
-        }
-
-        def train(batch: int, rank: int, world: int) -> Dataset[object]:
-            return ConditionBatches(
-                dataset, stats, readers, batch_size=batch, seed=seed, rank=rank, world=world, **clips
-            )
-
-        def validation() -> Dataset[object]:
-            return EvalBatches(data.held_out(), stats, readers, batch_size=32, **clips)
-
-        return Batches(train, validation)
+        captioned: Captioned = "face" if config.part == "face" else "body"
+        return clip_batches(config, inputs.data, inputs.stats, seed, inputs.text, captioned)
 
     def example(self, config: C, net: N, inputs: I, batch: int) -> Example:
         frames, width = config.max_frames, inputs.text.dim
@@ -85,6 +69,35 @@ class CaptionStage(TrainedStage[C, I, N]):
 
     def exported(self, config: C) -> tuple[str, ...]:
         return ("stats", "text")
+
+
+def clip_batches(
+    config: CaptionStageConfig,
+    data: Data,
+    stats: FeatureStats,
+    seed: int,
+    text: TextSource | None = None,
+    captioned: Captioned | None = None,
+) -> Batches:
+    """Whole clips, those with captions or, without `text`, all."""
+    readers = {} if text is None else {"text": text.cache}
+    dataset = data.split("train", training=True)
+    clips: dict[str, Any] = {
+        "max_frames": config.max_frames,
+        "min_frames": config.min_frames,
+        "columns": part_columns(dataset.layout, config.part),
+        "captioned": captioned,
+    }
+
+    def train(batch: int, rank: int, world: int) -> Dataset[object]:
+        return ConditionBatches(
+            dataset, stats, readers, batch_size=batch, seed=seed, rank=rank, world=world, **clips
+        )
+
+    def validation() -> Dataset[object]:
+        return EvalBatches(data.held_out(), stats, readers, batch_size=32, **clips)
+
+    return Batches(train, validation)
 
 
 def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:

@@ -1,0 +1,94 @@
+"""The Lightning side of MotionCLIP.
+
+Joints stand in for the vertices of the published loss **[ours]**: they need no body model. Its second cosine,
+to CLIP's view of a rendered frame, is left out **[ours]**: an image needs a rendered body and an encoder of
+images that shares the text stage's space, and neither comes with this project.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from pydantic import Field
+from torch import Tensor
+
+from motionloom.datasets.motion.features.torch_joints import present_joints, torch_joints_of
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import Config
+from motionloom.models.baselines.motionclip.network import MotionClip
+from motionloom.models.layers.transformer import length_mask
+from motionloom.models.training.distributed import masked_mean
+from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
+
+
+class MotionClipLossConfig(Config):
+    """Weights; the defaults are the published ones, which are of 6-D rotations and metres. Normalised columns
+    have larger errors.
+    """
+
+    features: float = Field(default=100.0, ge=0)
+    joints: float = Field(default=100.0, ge=0)
+    velocities: float = Field(default=100.0, ge=0)
+    text: float = Field(default=1.0, ge=0)
+
+
+class MotionClipModule(StageModule):
+    """Trains a `MotionClip` on captioned `ConditionBatches`.
+
+    Args:
+        layout: Its body and hands are what is modelled.
+        mean, std: Statistics of those columns, which joints are recovered by.
+    """
+
+    net: MotionClip
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        net: MotionClip,
+        optim: OptimConfig,
+        *,
+        seed: int,
+        max_steps: int,
+        layout: MotionLayout,
+        mean: NDArray[np.floating],
+        std: NDArray[np.floating],
+        loss: MotionClipLossConfig | None = None,
+    ) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.layout, self.loss_config = layout, loss or MotionClipLossConfig()
+        for name, values in (("mean", mean), ("std", std)):
+            self.register_buffer(name, torch.as_tensor(values), persistent=False)
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
+        [B, D] (optional: all). Means of squared errors over real frames, and of 1 - cosine over clips.
+        """
+        net, config, present = self.net, self.loss_config, batch.get("present")
+        seen = net.coordinates(batch["motion"], present)
+        mask = length_mask(batch["length"], seen.shape[1])
+        z = net.encode(seen, mask)
+        error = net.decode(z, mask) - seen.float()
+        error = error * mask[..., None]
+        columns = None if net.sixd is not None else present
+        held = None if present is None else present_joints(present, self.layout).repeat_interleave(3, dim=1)
+        apart = self._joints(seen.float() + error) - self._joints(seen.float())
+        text = batch["conditions"]["text"].pooled
+        losses = {
+            "features": masked_mean(error.square(), mask, columns),
+            "joints": masked_mean(apart.flatten(2).square(), mask, held),
+            "velocities": masked_mean(error.diff(dim=1).square(), mask[:, 1:], columns),
+            "text": (1 - F.cosine_similarity(z, text.float(), dim=-1)).mean(),
+        }
+        loss = torch.stack([getattr(config, name) * value for name, value in losses.items()]).sum()
+        return {"loss": loss, **losses}
+
+    def _joints(self, seen: Tensor) -> Tensor:
+        """Joints [B, T, N, 3] in metres of coordinates [B, T, D]."""
+        with torch.autocast(seen.device.type, enabled=False):
+            if self.net.sixd is not None:
+                return self.net.sixd.joints(seen)
+            return torch_joints_of(seen * self.std + self.mean, self.layout)

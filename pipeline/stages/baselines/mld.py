@@ -1,0 +1,211 @@
+"""MLD's stages: an auto-encoder of motion, and diffusion of its latents from text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from pydantic import model_validator
+
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.schema import UserError
+from motionloom.models.baselines.mld.losses import MotionVaeLossConfig
+from motionloom.models.baselines.mld.network import (
+    LatentDenoiser,
+    LatentDiffusionConfig,
+    MotionVae,
+    MotionVaeConfig,
+)
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, Stage, register
+from motionloom.pipeline.inference.generators.mld import LatentMotion
+from motionloom.pipeline.stages.networks.captions import (
+    CaptionInputs,
+    CaptionStage,
+    CaptionStageConfig,
+    clip_batches,
+    part_columns,
+)
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.networks import LoadedMotionVae
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+
+if TYPE_CHECKING:
+    from motionloom.models.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
+
+_OPTIM = OptimConfig(weight_decay=0.01, betas=(0.9, 0.999))
+"""AdamW as published, at 1e-4."""
+
+
+class MotionVaeStageConfig(CaptionStageConfig):
+    """An auto-encoder of body and hands."""
+
+    net: MotionVaeConfig = MotionVaeConfig()
+    loss: MotionVaeLossConfig = MotionVaeLossConfig()
+    optim: OptimConfig = _OPTIM
+    train: TrainConfig = TrainConfig(steps=1_000_000, batch_size=128)
+    part: Literal["bodyhand"] = "bodyhand"
+    """What is modelled: joints are judged in metres, which a face has none of."""
+
+    @model_validator(mode="after")
+    def _has_positions(self) -> MotionVaeStageConfig:
+        needed = self.max_frames + 2 * self.net.latent_tokens
+        if needed > self.net.positions:
+            raise ValueError(
+                f"max_frames {self.max_frames} and {2 * self.net.latent_tokens} tokens need {needed} "
+                f"positions, and net.positions is {self.net.positions}; raise it, or lower max_frames"
+            )
+        return self
+
+
+class MotionVaeInputs(Inputs):
+    """What it takes; captions play no part."""
+
+    data: Data
+    stats: FeatureStats
+
+
+class MotionVaeStage(TrainedStage[MotionVaeStageConfig, MotionVaeInputs, MotionVae]):
+    """MLD's first stage, trained on whole clips."""
+
+    name = "motion_vae"
+    summary = "auto-encoder of motion (MLD)"
+    config = MotionVaeStageConfig
+    inputs = MotionVaeInputs
+    curves = tuple(Curve(name) for name in ("features", "joints", "kl"))
+
+    def facts(self, config: MotionVaeStageConfig, inputs: MotionVaeInputs) -> ModelFacts:
+        layout = inputs.data.layout
+        extra = {"motion_dim": len(part_columns(layout, config.part)), "max_frames": config.max_frames}
+        return ModelFacts(
+            kind=self.name, config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra
+        )
+
+    def network(self, facts: ModelFacts, inputs: MotionVaeInputs) -> MotionVae:
+        return MotionVae(MotionVaeConfig.parse(facts.config, facts.where), facts.fact("motion_dim", int))
+
+    def module(
+        self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs, seed: int
+    ) -> MotionVaeModule:
+        from motionloom.models.baselines.mld.module import MotionVaeModule
+
+        layout, stats = inputs.data.layout, inputs.stats
+        columns = part_columns(layout, config.part)
+        return MotionVaeModule(
+            net, config.optim, seed=seed, max_steps=config.train.steps, layout=layout,
+            mean=stats.mean[columns], std=stats.std[columns], loss=config.loss,
+        )  # fmt: skip
+
+    def batches(
+        self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs, seed: int, log: Log
+    ) -> Batches:
+        return clip_batches(config, inputs.data, inputs.stats, seed)
+
+    def example(
+        self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs, batch: int
+    ) -> Example:
+        frames = config.max_frames
+        return Example(
+            {"motion": torch.empty(batch, frames, net.motion_dim), "length": torch.full((batch,), frames)},
+            f"{net.config.latent_tokens} latents of {net.config.dim} a motion",
+        )
+
+    def loaded(self, net: MotionVae, facts: ModelFacts, inputs: MotionVaeInputs) -> LoadedMotionVae:
+        return LoadedMotionVae(net, facts.layout.layout(), facts.fact("max_frames", int))
+
+    def exported(self, config: MotionVaeStageConfig) -> tuple[str, ...]:
+        return ("stats",)
+
+
+class LatentDiffusionStageConfig(CaptionStageConfig):
+    """A denoiser of the latents of a `motion_vae`."""
+
+    net: LatentDiffusionConfig = LatentDiffusionConfig(schedule=LatentDiffusionConfig().schedule)
+    optim: OptimConfig = _OPTIM
+    train: TrainConfig = TrainConfig(steps=700_000, batch_size=64)
+    part: Literal["bodyhand"] = "bodyhand"
+
+
+class LatentDiffusionInputs(CaptionInputs):
+    """What it takes."""
+
+    motion_vae: LoadedMotionVae
+
+
+class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffusionInputs, LatentDenoiser]):
+    """MLD's second stage."""
+
+    name = "latent_diffusion"
+    summary = "diffusion of a motion's latents (MLD)"
+    config = LatentDiffusionStageConfig
+    inputs = LatentDiffusionInputs
+    curves = (Curve("loss"),)
+
+    def gives(self, config: LatentDiffusionStageConfig) -> frozenset[str]:
+        return super().gives(config) | {GENERATOR}
+
+    def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
+        """It is as wide as the latents, and reads no longer motion than the auto-encoder was trained on."""
+        vae = others.get(stage.inputs["motion_vae"])
+        if vae is None or not isinstance(vae.config, MotionVaeStageConfig):
+            return
+        for key, own, theirs in (
+            ("net.dim", stage.config.net.dim, vae.config.net.dim),
+            ("max_frames", stage.config.max_frames, vae.config.max_frames),
+        ):
+            if own != theirs:
+                raise UserError(
+                    f"stage '{stage.name}': {key} {own} must be that of '{vae.name}', {theirs}, whose "
+                    f"latents it denoises"
+                )
+
+    def facts(self, config: LatentDiffusionStageConfig, inputs: LatentDiffusionInputs) -> ModelFacts:
+        extra = {"latent_tokens": inputs.motion_vae.net.config.latent_tokens, "text_dim": inputs.text.dim}
+        layout = LayoutFacts.of(inputs.data.layout)
+        return ModelFacts(kind=self.name, config=config.net.dump(), layout=layout, extra=extra)
+
+    def network(self, facts: ModelFacts, inputs: LatentDiffusionInputs) -> LatentDenoiser:
+        config, vae = LatentDiffusionConfig.parse(facts.config, facts.where), inputs.motion_vae
+        tokens, text_dim = (facts.fact(key, int) for key in ("latent_tokens", "text_dim"))
+        here = (vae.net.config.latent_tokens, vae.net.config.dim)
+        if (tokens, config.dim) != here:
+            raise UserError(
+                f"{facts.where}: denoises {tokens} latents of {config.dim}, and its auto-encoder makes "
+                f"{here[0]} of {here[1]}; run both stages again"
+            )
+        return LatentDenoiser(config, tokens, text_dim)
+
+    def prepare(
+        self, config: LatentDiffusionStageConfig, net: LatentDenoiser, inputs: LatentDiffusionInputs
+    ) -> None:
+        """What stands for a hidden text is the embedding of an empty one."""
+        empty = inputs.text.encoder.encode([""]).sentence
+        net.empty.copy_(torch.as_tensor(empty[0]))
+
+    def module(
+        self,
+        config: LatentDiffusionStageConfig,
+        net: LatentDenoiser,
+        inputs: LatentDiffusionInputs,
+        seed: int,
+    ) -> LatentDiffusionModule:
+        from motionloom.models.baselines.mld.module import LatentDiffusionModule
+
+        steps, vae = config.train.steps, inputs.motion_vae.net
+        return LatentDiffusionModule(net, config.optim, seed=seed, max_steps=steps, vae=vae)
+
+    def exported(self, config: LatentDiffusionStageConfig) -> tuple[str, ...]:
+        return ("stats", "text", "motion_vae")
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        vae: LoadedMotionVae = given["motion_vae"]
+        return LatentMotion(vae.layout, "bodyhand", given, self.load(stage, given, device), vae)
+
+
+register(MotionVaeStage())
+register(LatentDiffusionStage())
