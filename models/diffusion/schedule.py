@@ -73,9 +73,12 @@ class ScheduleConfig(Config):
 
     def noiser(self) -> Scheduler:
         """For training: `add_noise`. Motion is not bounded, so nothing is clipped."""
+        return self._ddpm(self.steps_offset)
+
+    def _ddpm(self, offset: int) -> Scheduler:
         from diffusers import DDPMScheduler
 
-        return self._made(DDPMScheduler, clip_sample=False, steps_offset=self.steps_offset)
+        return self._made(DDPMScheduler, clip_sample=False, steps_offset=offset)
 
     def _made(self, kind: Any, **options: object) -> Scheduler:
         """A scheduler of diffusers with tables in float64."""
@@ -94,13 +97,15 @@ class ScheduleConfig(Config):
             raise UserError(
                 f"{steps} denoising steps are more than the {self.steps} of this model's training; take fewer"
             )
+        # Where all steps of the training are taken there is no room for an offset.
+        offset = min(self.steps_offset, self.steps - 1 - (steps - 1) * (self.steps // steps))
         made: Scheduler
         if kind == "ddpm":
-            made = self.noiser()
+            made = self._ddpm(offset)
         elif kind == "ddim":
             from diffusers import DDIMScheduler
 
-            made = self._made(DDIMScheduler, clip_sample=False, steps_offset=self.steps_offset)
+            made = self._made(DDIMScheduler, clip_sample=False, steps_offset=offset)
         else:
             from diffusers import DPMSolverMultistepScheduler
 

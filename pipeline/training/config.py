@@ -85,7 +85,8 @@ class TrainedStageConfig(StageConfig):
     train: TrainConfig = TrainConfig()
     published: Path | None = Field(None, json_schema_extra=RUNTIME)
     """Safetensors of the release of a published model: they are loaded, and nothing is trained. Kinds that
-    know the names of one: diffusion (MDM). The file's checksum counts, not its place."""
+    know the names of one: diffusion (MDM), motion_vae and latent_diffusion (MLD). The file's checksum counts,
+    not its place."""
 
     def require_fit(self, hardware: Hardware) -> None:
         """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""

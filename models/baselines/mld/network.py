@@ -136,7 +136,7 @@ class LatentDenoiser(nn.Module):
 
     def forward(self, noisy: Tensor, step: Tensor, text: Tensor, conditioned: Tensor) -> Tensor:
         """noisy [B, K, C], step int64 [B], text [B, E], conditioned bool [B] (False hides the text)."""
-        dtype = self.text[1].weight.dtype
+        dtype = self.positions.table.dtype
         words = torch.where(conditioned[:, None], text.to(dtype), self.empty.to(dtype))
         # Cosines come first.
         time = step_waves(step, self.config.time_waves).roll(self.config.time_waves // 2, dims=1).to(dtype)

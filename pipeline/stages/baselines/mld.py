@@ -17,6 +17,7 @@ from motionloom.models.baselines.mld.network import (
     MotionVae,
     MotionVaeConfig,
 )
+from motionloom.models.layers.transformer import name_in_torch
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
@@ -28,10 +29,11 @@ from motionloom.pipeline.stages.networks.captions import (
     CaptionStageConfig,
     clip_batches,
     part_columns,
+    part_statistics,
 )
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import LoadedMotionVae
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, Release
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -89,16 +91,20 @@ class MotionVaeStage(TrainedStage[MotionVaeStageConfig, MotionVaeInputs, MotionV
     def network(self, facts: ModelFacts, inputs: MotionVaeInputs) -> MotionVae:
         return MotionVae(MotionVaeConfig.parse(facts.config, facts.where), facts.fact("motion_dim", int))
 
+    def release(self, net: MotionVae) -> Release:
+        """`vae.safetensors` of MLD's release."""
+        return Release(mld_names(net))
+
     def module(
         self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs, seed: int
     ) -> MotionVaeModule:
         from motionloom.models.baselines.mld.module import MotionVaeModule
 
-        layout, stats = inputs.data.layout, inputs.stats
-        columns = part_columns(layout, config.part)
+        layout = inputs.data.layout
+        mean, std = part_statistics(layout, config.part, inputs.stats)
         return MotionVaeModule(
             net, config.optim, seed=seed, max_steps=config.train.steps, layout=layout,
-            mean=stats.mean[columns], std=stats.std[columns], loss=config.loss,
+            mean=mean, std=std, loss=config.loss,
         )  # fmt: skip
 
     def batches(
@@ -187,6 +193,12 @@ class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffus
         empty = inputs.text.encoder.encode([""]).sentence
         net.empty.copy_(torch.as_tensor(empty[0]))
 
+    def release(self, net: LatentDenoiser) -> Release:
+        """`denoiser.safetensors`. Texts must be encoded as the release's were: by CLIP ViT-L/14 (768 wide) in
+        the paper's, by SentenceT5-Large in the one of MotionLCM's authors.
+        """
+        return Release(mld_names(net), unread=("mem_pos.pe",))
+
     def module(
         self,
         config: LatentDiffusionStageConfig,
@@ -205,6 +217,46 @@ class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffus
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
         vae: LoadedMotionVae = given["motion_vae"]
         return LatentMotion(vae.layout, "bodyhand", given, self.load(stage, given, device), vae)
+
+
+_NAMES = {
+    "queries": "global_motion_token",
+    "enter": "skel_embedding",
+    "leave": "final_layer",
+    "encoder_positions.table": "query_pos_encoder.pe",
+    "decoder_positions.table": "query_pos_decoder.pe",
+    "positions.table": "query_pos.pe",
+    "time.0": "time_embedding.linear_1",
+    "time.2": "time_embedding.linear_2",
+    "text.1": "emb_proj.1",
+}
+
+
+def mld_names(net: MotionVae | LatentDenoiser) -> dict[str, str]:
+    """Names of either network's tensors -> their names in MLD's release."""
+    out = {}
+    for name, _ in net.named_parameters():
+        stack, _, rest = name.partition(".")
+        layer, _, kind = name.rpartition(".")
+        if stack in ("encoder", "decoder", "stack"):
+            there = "decoder" if stack == "decoder" else "encoder"
+            out[name] = f"{there}.{_in_u(rest, net.config.layers // 2, memory=stack == 'decoder')}"
+        else:
+            out[name] = _NAMES[name] if name in _NAMES else f"{_NAMES[layer]}.{kind}"
+    return out
+
+
+def _in_u(name: str, half: int, *, memory: bool) -> str:
+    """Name of a `SkipTransformer`'s tensor there: into the U, its bottom, and out of it."""
+    if name.startswith("merge."):
+        return name.replace("merge.", "linear_blocks.")
+    if not name.startswith("blocks."):
+        return name
+    _, number, inner = name.split(".", 2)
+    index, tensor = int(number), name_in_torch(inner, memory=memory)
+    if index == half:
+        return f"middle_block.{tensor}"
+    return f"{'input' if index < half else 'output'}_blocks.{index % (half + 1)}.{tensor}"
 
 
 register(MotionVaeStage())

@@ -20,6 +20,7 @@ from motionloom.pipeline.stages.networks.captions import (
     CaptionStage,
     CaptionStageConfig,
     part_columns,
+    part_statistics,
 )
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts
 from motionloom.pipeline.training.config import TrainConfig
@@ -80,11 +81,11 @@ class MotionClipStage(CaptionStage[MotionClipStageConfig, CaptionInputs, MotionC
     ) -> MotionClipModule:
         from motionloom.models.baselines.motionclip.module import MotionClipModule
 
-        layout, stats = inputs.data.layout, inputs.stats
-        columns = part_columns(layout, config.part)
+        layout = inputs.data.layout
+        mean, std = part_statistics(layout, config.part, inputs.stats)
         return MotionClipModule(
             net, config.optim, seed=seed, max_steps=config.train.steps, layout=layout,
-            mean=stats.mean[columns], std=stats.std[columns], loss=config.loss,
+            mean=mean, std=std, loss=config.loss,
         )  # fmt: skip
 
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:

@@ -107,6 +107,16 @@ def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:
     return layout.part(part)
 
 
+def part_statistics(
+    layout: MotionLayout, part: Part, stats: FeatureStats | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and deviation of one part's columns; 0 and 1 in a dry run, which has no statistics."""
+    columns = part_columns(layout, part)
+    if stats is None:
+        return np.zeros(len(columns), np.float32), np.ones(len(columns), np.float32)
+    return stats.mean[columns], stats.std[columns]
+
+
 def part_of(facts: ModelFacts) -> Part:
     """The part that a stage noted in its facts, `extra.part`."""
     part = facts.fact("part", str)

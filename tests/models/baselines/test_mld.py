@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from plain_training import take_steps
+from safetensors.torch import save_file
 from torch import Tensor
 
 from motionloom.datasets.conditions import Condition
@@ -26,6 +28,7 @@ from motionloom.models.baselines.mld.network import (
 from motionloom.models.baselines.mld.sampling import sample_latents
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.stage_module import OptimConfig
+from motionloom.pipeline.stages.baselines.mld import LatentDiffusionStage, MotionVaeStage, mld_names
 
 SMALL = {"dim": 16, "ff": 32, "layers": 3, "heads": 2, "dropout": 0.0, "attention_dropout": 0.0}
 LENGTH = torch.tensor([12, 7])
@@ -43,6 +46,69 @@ def test_published_sizes() -> None:
     assert vae.queries.shape == (2, 256) and seven.queries.shape == (14, 256)
     assert net.time[0].weight.shape == (256, 768) and net.text[1].weight.shape == (256, 768)
     assert net.stack.merge[0].weight.shape == (256, 512) and len(net.stack.merge) == 4
+
+
+def published_u(kind: str) -> dict[str, tuple[int, ...]]:
+    """Tensors of a U of nine layers, as torch's own layers have them."""
+    layer = {"self_attn.in_proj_weight": (768, 256), "self_attn.in_proj_bias": (768,)}
+    layer |= {"self_attn.out_proj.weight": (256, 256), "self_attn.out_proj.bias": (256,)}
+    if kind == "decoder":
+        layer |= {name.replace("self", "multihead"): shape for name, shape in layer.items()}
+    layer |= {"linear1.weight": (1024, 256), "linear1.bias": (1024,)}
+    layer |= {"linear2.weight": (256, 1024), "linear2.bias": (256,)}
+    norms = (1, 2, 3) if kind == "decoder" else (1, 2)
+    layer |= {f"norm{k}.{what}": (256,) for k in norms for what in ("weight", "bias")}
+    blocks = [f"{side}_blocks.{k}" for side in ("input", "output") for k in range(4)] + ["middle_block"]
+    out = {f"{kind}.{block}.{name}": shape for block in blocks for name, shape in layer.items()}
+    for k in range(4):
+        out |= {f"{kind}.linear_blocks.{k}.weight": (256, 512), f"{kind}.linear_blocks.{k}.bias": (256,)}
+    return out | {f"{kind}.norm.{what}": (256,) for what in ("weight", "bias")}
+
+
+def test_names_and_shapes_of_the_release() -> None:
+    with torch.device("meta"):
+        vae = MotionVae(MotionVaeConfig(), 263)
+        net = LatentDenoiser(LatentDiffusionConfig(), 1, 768)
+    first = published_u("encoder") | published_u("decoder")
+    first |= {f"query_pos_{side}.pe": (500, 1, 256) for side in ("encoder", "decoder")}
+    first |= {
+        "global_motion_token": (2, 256),
+        "skel_embedding.weight": (256, 263),
+        "skel_embedding.bias": (256,),
+    }
+    first |= {"final_layer.weight": (263, 256), "final_layer.bias": (263,)}
+    second = published_u("encoder") | {"query_pos.pe": (500, 1, 256)}
+    for layer, wide in (
+        ("time_embedding.linear_1", 768),
+        ("time_embedding.linear_2", 256),
+        ("emb_proj.1", 768),
+    ):
+        second |= {f"{layer}.weight": (256, wide), f"{layer}.bias": (256,)}
+    for ours, theirs, count in ((vae, first, 297), (net, second, 125)):
+        state = ours.state_dict()
+        assert {there: tuple(state[here].shape) for here, there in mld_names(ours).items()} == theirs
+        assert len(theirs) == count
+
+
+def test_a_release_is_read_and_refused_where_it_differs(tmp_path: Path) -> None:
+    """Random weights under the published names, with the table that nobody reads."""
+    sizes = {**SMALL, "positions": 9}
+    theirs = LatentDenoiser(LatentDiffusionConfig(**sizes, time_waves=8), 1, 5)
+    state = {there: theirs.state_dict()[here].clone() for here, there in mld_names(theirs).items()}
+    save_file(state | {"mem_pos.pe": torch.zeros(9, 1, 16)}, tmp_path / "denoiser.safetensors")
+    ours = LatentDenoiser(LatentDiffusionConfig(**sizes, time_waves=8), 1, 5)
+    ours.empty.fill_(3.0)
+    stage = LatentDiffusionStage()
+    stage.release(ours).fill(tmp_path / "denoiser.safetensors", ours)
+    for name, value in theirs.named_parameters():
+        assert torch.equal(ours.state_dict()[name], value), name
+    assert (ours.empty == 3.0).all(), "what stands for no text is the text encoder's"
+    wider = LatentDenoiser(LatentDiffusionConfig(**sizes, time_waves=8), 1, 7)
+    with pytest.raises(UserError, match=r"tensor 'emb_proj\.1\.weight' is \[16, 5\].*\[16, 7\]"):
+        stage.release(wider).fill(tmp_path / "denoiser.safetensors", wider)
+    vae = MotionVae(MotionVaeConfig(**SMALL), 5)
+    with pytest.raises(UserError, match=r"denoiser\.safetensors: tensor "):
+        MotionVaeStage().release(vae).fill(tmp_path / "denoiser.safetensors", vae)
 
 
 def test_positions_start_between_zero_and_one_and_end() -> None:
@@ -240,3 +306,9 @@ def test_the_denoiser_learns_which_latents_a_text_means(vae: MotionVae) -> None:
     hits = (torch.cdist(made, centres).argmin(1) == asked).float().mean()
     # Measured: all of them.
     assert hits > 0.75, f"{hits}: under shuffled texts a quarter is right"
+
+
+@pytest.mark.parametrize(("steps", "first"), [(50, 981), (1000, 999)])
+def test_time_steps_are_offset_where_there_is_room(steps: int, first: int) -> None:
+    taken = LatentDiffusionConfig().schedule.sampler("ddim", steps).timesteps.tolist()
+    assert taken[0] == first and len(taken) == steps and taken[-1] == (1 if steps == 50 else 0)
