@@ -20,6 +20,7 @@ from rich.console import Console
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.inference.script import Script
+from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.runs.slurm import launch_recipe
@@ -228,3 +229,10 @@ def test_named_files_of_the_repository_exist(document: Path) -> None:
 def test_no_absolute_local_paths(document: Path) -> None:
     text = document.read_text(encoding="utf-8")
     assert not re.findall(r"(?:^|[\s`\"'(=:])(?:/(?!/)[A-Za-z][\w.-]*/\S*|~/\S+|[A-Z]:\\\S+)", text, re.M)
+
+
+def test_the_readme_says_what_the_models_of_the_package_know() -> None:
+    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    for name, model in shipped_models().items():
+        _, _, known = model.description.partition("it knows ")
+        assert known and known in text, f"{name} knows {known}"
