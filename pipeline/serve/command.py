@@ -105,7 +105,7 @@ def warm(model: MotionModel) -> None:
         if isinstance(generator, StreamingGenerator):
             next(model.stream(caption, seconds=1.0))
         else:
-            model.generate([caption])
+            model.generate([caption], seconds=1.0)
     if "audio" in generator.modalities:
         rate = 22_050
         clicks = (np.arange(4 * rate) % (rate // 2) < 100).astype(np.float32)

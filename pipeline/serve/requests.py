@@ -10,7 +10,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Generic, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -19,6 +19,7 @@ from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
@@ -66,6 +67,9 @@ def known_answer(name: str) -> str:
     return name
 
 
+_USUAL = 4.0
+"""Seconds of a motion by a model that must be told its length, where nobody tells it."""
+
 _SOUND = "the sound"
 _KINDS = {b"RIFF": ".wav", b"RF64": ".wav", b"fLaC": ".flac", b"OggS": ".ogg"}
 """First bytes and the file's ending; what begins otherwise is tried as MP3."""
@@ -81,7 +85,7 @@ class MotionRequest(Config):
     sound: str | None = Field(None, max_length=64)
     """Name of a sound that was sent before."""
     seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
-    """Length; without it the model decides, or the sound."""
+    """Length; without it the model decides, or the sound, or it is four seconds."""
     seed: int = Field(0, ge=0, lt=2**63)
     cfg_scale: float = Field(1.0, ge=1, le=20, allow_inf_nan=False)
     temperature: float = Field(1.0, ge=0, le=10, allow_inf_nan=False)
@@ -144,14 +148,38 @@ def notes_of(model: MotionModel, asked: MotionRequest, sound: Sound | None) -> d
 
 def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:
     """The motion that is asked for, in its format."""
+    motion = motion_of(model, asked, sound, limits)
+    if asked.format in WRITERS:
+        note = (
+            "\n".join(map(str, model.unknown(asked.captions, asked.faces))) if asked.format == "html" else ""
+        )
+        return file_answer(motion, asked.format, asked.seed, note)
+    facts = {
+        **facts_of(motion, asked.request, asked.seed),
+        "face": asked.face,
+        **notes_of(model, asked, sound),
+    }
+    if asked.format == "viewer":
+        facts["viewer"] = viewer_data([cell_of(clip_of(motion))])
+    else:
+        facts |= numbers_of(motion)
+    return json_answer(facts)
+
+
+def motion_of(
+    model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
+) -> GeneratedMotion:
+    """The motion that is asked for."""
     seconds = asked.seconds
+    if seconds is None and isinstance(model.bundle.generator, WholeMotion):
+        seconds = min(_USUAL, limits.max_seconds)
     if sound is not None:
         longest = min(sound.seconds, limits.max_seconds)
         seconds = longest if seconds is None else seconds
         if seconds > sound.seconds + 0.5:
             raise UserError(f"{seconds:g} s were asked for and the sound lasts {sound.seconds:.1f} s")
         sound = sound.slice(0.0, min(seconds, sound.seconds))
-    motion = model.bundle.generate(
+    return model.bundle.generate(
         asked.captions or None,
         face=asked.faces or None,
         sounds=None if sound is None else [sound],
@@ -160,22 +188,6 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
         sampling=asked.sampling,
         strict=True,
     )[0]
-    if asked.format in WRITERS:
-        note = (
-            "\n".join(map(str, model.unknown(asked.captions, asked.faces))) if asked.format == "html" else ""
-        )
-        return _file(motion, asked, note)
-    facts = {**_facts(motion, asked), **notes_of(model, asked, sound)}
-    if asked.format == "viewer":
-        facts["viewer"] = viewer_data([cell_of(clip_of(motion))])
-    else:
-        facts |= {
-            "joint_names": list(motion.joint_names),
-            "parents": [int(parent) for parent in motion.layout.skeleton.parents],
-            "joints": rounded(motion.joints),
-            "face_values": None if motion.face is None else rounded(motion.face),
-        }
-    return Answer(json.dumps(facts, separators=(",", ":"), allow_nan=False).encode(), "application/json")
 
 
 def stream(
@@ -202,20 +214,36 @@ def lines(
         yield "".join(frame_lines(chunk))
 
 
-def _facts(motion: GeneratedMotion, asked: MotionRequest) -> dict[str, object]:
+def facts_of(motion: GeneratedMotion, request: str, seed: int) -> dict[str, object]:
+    """What a motion is, and which request it answers."""
     return {
-        "request": asked.request,
+        "request": request,
         "caption": motion.caption,
-        "face": asked.face,
-        "seed": asked.seed,
+        "seed": seed,
         "fps": motion.fps,
         "frames": len(motion.joints),
         "seconds": motion.seconds,
     }
 
 
-def _file(motion: GeneratedMotion, asked: MotionRequest, note: str) -> Answer:
-    writer, name = WRITERS[asked.format], file_stem(asked.seed, motion.caption)
+def numbers_of(motion: GeneratedMotion) -> dict[str, object]:
+    """A motion as plain numbers."""
+    return {
+        "joint_names": list(motion.joint_names),
+        "parents": [int(parent) for parent in motion.layout.skeleton.parents],
+        "joints": rounded(motion.joints),
+        "face_values": None if motion.face is None else rounded(motion.face),
+    }
+
+
+def json_answer(facts: Mapping[str, object]) -> Answer:
+    """Facts as JSON."""
+    return Answer(json.dumps(facts, separators=(",", ":"), allow_nan=False).encode(), "application/json")
+
+
+def file_answer(motion: GeneratedMotion, form: str, seed: int, note: str) -> Answer:
+    """A motion as a file of one of `WRITERS`; `note` is a page's."""
+    writer, name = WRITERS[form], file_stem(seed, motion.caption)
     with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
         path = Path(folder) / f"motion{writer.suffix}"
         save(path, motion, note)
@@ -223,13 +251,48 @@ def _file(motion: GeneratedMotion, asked: MotionRequest, note: str) -> Answer:
     return Answer(body, writer.mime, f"{name}{writer.suffix}")
 
 
+T = TypeVar("T")
+
+
+class Recent(Generic[T]):
+    """What was used last, by name, for several threads; `what` it is in messages."""
+
+    def __init__(self, most: int, what: str) -> None:
+        self._most, self._what = most, what
+        self._kept: OrderedDict[str, T] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def keep(self, name: str, value: T) -> str:
+        """Keep a value; what was used longest ago makes room. Returns the name."""
+        with self._lock:
+            self._kept[name] = value
+            self._kept.move_to_end(name)
+            while len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+        return name
+
+    def find(self, name: str) -> T | None:
+        """The value, used now; None where it is not here."""
+        with self._lock:
+            if name in self._kept:
+                self._kept.move_to_end(name)
+            return self._kept.get(name)
+
+    def get(self, name: str) -> T:
+        """As `find`; `UserError` where it is not here."""
+        found = self.find(name)
+        if found is None:
+            raise UserError(f"{self._what} is not here any more; send it again")
+        return found
+
+
 class Sounds:
     """The sounds used last."""
 
     def __init__(self, config: ServeConfig) -> None:
         self._config = config
-        self._kept: OrderedDict[str, Sound] = OrderedDict()
-        self._lock, self._decoding = threading.Lock(), threading.Lock()
+        self._kept = Recent[Sound](config.sounds, _SOUND)
+        self._decoding = threading.Lock()
 
     def add(self, data: bytes) -> tuple[str, Sound]:
         """Decode a file's bytes and keep them; `UserError` for what is no sound or too long."""
@@ -237,22 +300,15 @@ class Sounds:
             raise UserError(f"{_SOUND}: empty (0 bytes)")
         name = hashlib.sha256(data).hexdigest()[:24]
         with self._decoding:  # one at a time: a sound takes several times its file's memory
-            with self._lock:
-                sound = self._kept.pop(name, None)
-            sound = self._decode(data) if sound is None else sound
-            with self._lock:
-                self._kept[name] = sound
-                while len(self._kept) > self._config.sounds:
-                    self._kept.popitem(last=False)
+            sound = self._kept.find(name)
+            if sound is None:
+                sound = self._decode(data)
+                self._kept.keep(name, sound)
         return name, sound
 
     def get(self, name: str) -> Sound:
-        with self._lock:
-            sound = self._kept.get(name)
-            if sound is None:
-                raise UserError("the sound is not here any more; send it again")
-            self._kept.move_to_end(name)
-            return sound
+        """`UserError` where it is not here any more."""
+        return self._kept.get(name)
 
     def _decode(self, data: bytes) -> Sound:
         longest = self._config.max_sound_seconds
