@@ -59,14 +59,15 @@ class ConditionBatch(MotionBatch):
 class ConditionedClips:
     """What training and evaluation share: which clips qualify, and making a batch of them.
 
-    `readers` are what reads each modality, by name; others are left out. With `captioned` only clips with a
+    `stats` normalise the motion, or are crops that read it otherwise. `readers` are what reads each modality,
+    by name; others are left out. With `captioned` only clips with a
     caption qualify; for "face" captions are those about the face and `columns` by default the face's.
     """
 
     def __init__(
         self,
         dataset: ClipDataset,
-        stats: FeatureStats,
+        stats: FeatureStats | Crops,
         readers: Mapping[str, object],
         *,
         max_frames: int,
@@ -79,7 +80,7 @@ class ConditionedClips:
         self.face = captioned == "face"
         if self.face and columns is None:
             columns = dataset.layout.part("face")
-        self.crops = Crops(dataset, stats, columns)
+        self.crops = stats if isinstance(stats, Crops) else Crops(dataset, stats, columns)
         self.dataset = dataset
         self.readers = {name: readers[name] for name in MODALITIES if name in readers}
         self.members = {name: modality(name).members[0] for name in self.readers}
@@ -170,7 +171,7 @@ class ConditionBatches(Dataset[ConditionBatch]):
     def __init__(
         self,
         dataset: ClipDataset,
-        stats: FeatureStats,
+        stats: FeatureStats | Crops,
         readers: Mapping[str, object],
         *,
         batch_size: int,
@@ -219,7 +220,7 @@ class EvalBatches(Dataset[ConditionBatch]):
     def __init__(
         self,
         dataset: ClipDataset,
-        stats: FeatureStats,
+        stats: FeatureStats | Crops,
         readers: Mapping[str, object] | None = None,
         *,
         batch_size: int,

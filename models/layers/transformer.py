@@ -109,11 +109,13 @@ class KVCache:
 class SelfAttention(nn.Module):
     """Multi-head self-attention."""
 
-    def __init__(self, dim: int, heads: int, attention_dropout: float) -> None:
+    def __init__(self, dim: int, heads: int, attention_dropout: float, qkv_bias: bool = True) -> None:
         super().__init__()
         self.heads = heads
         self.attention_dropout = attention_dropout
-        self.qkv = nn.Linear(dim, 3 * dim)
+        self.scale: float | None = None
+        """Of the products of queries and keys; None is the width of a head to the power of -1/2."""
+        self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
         self.out = nn.Linear(dim, dim)
 
     def forward(
@@ -133,7 +135,9 @@ class SelfAttention(nn.Module):
             causal = causal and before == 0 and length > 1
         rate = self.attention_dropout if self.training else 0.0
         causal = causal and mask is None
-        out = F.scaled_dot_product_attention(query, key, value, mask, dropout_p=rate, is_causal=causal)
+        out = F.scaled_dot_product_attention(
+            query, key, value, mask, dropout_p=rate, is_causal=causal, scale=self.scale
+        )
         merged: Tensor = self.out(out.transpose(1, 2).reshape(batch, length, dim))
         return merged
 
@@ -169,11 +173,12 @@ class Block(nn.Module):
         attention_dropout: float,
         norm: Norm = "pre",
         memory: bool = False,
+        qkv_bias: bool = True,
     ) -> None:
         super().__init__()
         self.post = norm == "post"
         self.norm_attention = nn.LayerNorm(dim)
-        self.attention = SelfAttention(dim, heads, attention_dropout)
+        self.attention = SelfAttention(dim, heads, attention_dropout, qkv_bias)
         if memory:
             self.norm_memory = nn.LayerNorm(dim)
             self.memory = CrossAttention(dim, heads, attention_dropout)
@@ -239,15 +244,17 @@ class Transformer(nn.Module):
         attention_dropout: float | None = None,
         norm: Norm = "pre",
         memory: bool = False,
+        qkv_bias: bool = True,
+        last_norm: bool = True,
     ) -> None:
         super().__init__()
         assert config.width is not None
         dim, drop = config.width[1], config.dropout
         inner = drop if attention_dropout is None else attention_dropout
         self.blocks = nn.ModuleList(
-            Block(dim, config.heads, config.ff, drop, inner, norm, memory) for _ in range(layers)
+            Block(dim, config.heads, config.ff, drop, inner, norm, memory, qkv_bias) for _ in range(layers)
         )
-        self.norm = nn.LayerNorm(dim) if norm == "pre" else nn.Identity()
+        self.norm = nn.LayerNorm(dim) if norm == "pre" and last_norm else nn.Identity()
         self.checkpointed = False
         """Compute the inside of each block again in the backward pass instead of keeping it."""
         std = math.sqrt(2 / (5 * dim))

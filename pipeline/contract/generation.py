@@ -186,6 +186,15 @@ class SeededGenerator(MotionGenerator, Protocol):
 
 
 @runtime_checkable
+class NotedGenerator(MotionGenerator, Protocol):
+    """A generator of which there is something that its figures must say."""
+
+    @property
+    def note(self) -> str:
+        """A few words; empty where there is nothing."""
+
+
+@runtime_checkable
 class DrivenGenerator(MotionGenerator, Protocol):
     """A generator whose conditions may change on the way: one motion, conditioned stretch by stretch."""
 

@@ -37,6 +37,7 @@ from motionloom.pipeline.inference.generators.standing import stood
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
     PromptEncoder,
+    alike,
     caption_list,
     frames_of,
     prompts_of,
@@ -240,7 +241,7 @@ class Bundle:
         seeds = sample_seeds(seed, 2 * len(prompts))
         noise = seeds if noise_seed is None else sample_seeds(noise_seed, len(prompts))
         out: dict[int, GeneratedMotion] = {}
-        for rows in _alike(frames, batch):
+        for rows in alike(frames, batch):
             own = tuple([draws[row] for row in rows] for draws in (seeds, seeds[len(prompts) :], noise))
             some = [prompts[row] for row in rows], [frames[row] for row in rows]
             made = self._batch(*some, own, sampling, begun and [begun[row] for row in rows])
@@ -378,13 +379,6 @@ def split_columns(
     if generator.part != "all" or not layout.has("face"):
         return motion, None
     return motion[:, layout.part("bodyhand")], motion[:, layout.part("face")]
-
-
-def _alike(frames: Sequence[int | None], batch: int) -> list[list[int]]:
-    """Rows in batches, each all with a given length or all without."""
-    free = [row for row, count in enumerate(frames) if count is None]
-    given = [row for row, count in enumerate(frames) if count is not None]
-    return [rows[i : i + batch] for rows in (free, given) for i in range(0, len(rows), batch)]
 
 
 def unknown_captions(

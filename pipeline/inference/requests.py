@@ -174,6 +174,13 @@ def frames_of(
     return out
 
 
+def alike(frames: Sequence[int | None], batch: int) -> list[list[int]]:
+    """Rows in batches, each all with a given length or all without."""
+    free = [row for row, count in enumerate(frames) if count is None]
+    given = [row for row, count in enumerate(frames) if count is not None]
+    return [rows[i : i + batch] for rows in (free, given) for i in range(0, len(rows), batch)]
+
+
 def seeds_of(
     generator: MotionGenerator, given: Sequence[NDArray[np.float32]] | None, count: int
 ) -> list[NDArray[np.float32]] | None:

@@ -1,4 +1,5 @@
-"""Small trainings of UDE's three networks on random motion: MQ, UTT with its critic, DMD.
+"""Small trainings on random motion of UDE's three networks (MQ, UTT with its critic, DMD) and of the models
+of dances that it is compared with (FACT, Bailando's three).
 
 Nothing draws per process: without dropout and z, and the DMD's noise is that of the whole batch, of which a
 rank takes its rows. So two ranks and one process can be compared.
@@ -20,9 +21,17 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.baselines.bailando.critic import ActorCritic, ActorCriticModule, RewardConfig
+from motionloom.models.baselines.bailando.gpt import CrossGpt, CrossGptConfig
+from motionloom.models.baselines.bailando.gpt_module import CrossGptModule
+from motionloom.models.baselines.bailando.vq import DanceVq, DanceVqConfig
+from motionloom.models.baselines.bailando.vq_module import DanceVqModule
+from motionloom.models.baselines.fact.module import FactModule
+from motionloom.models.baselines.fact.network import Fact, FactConfig
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import DmdModule
+from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import MqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
@@ -38,7 +47,7 @@ from motionloom.pipeline.training.trainer import fit
 LAYOUT = MotionLayout.named("smpl75")
 MQ = MqConfig(width=8, depth=1, code_dim=8, num_codes=9, quantizer="gradient", start="data")
 OPTIM = OptimConfig(optimizer="adam", lr=3e-3, warmup_steps=3)
-NAMES = ("mq", "utt", "dmd")
+NAMES = ("mq", "utt", "dmd", "fact", "dance_vq", "cross_gpt", "actor_critic")
 
 
 class Clips(Dataset[dict[str, Any]]):
@@ -70,6 +79,7 @@ class Clips(Dataset[dict[str, Any]]):
             "motion": numbers(20, LAYOUT.dim).cumsum(1) * 0.3,
             "length": length,
             "closed": order % 2 == 0,
+            "beats": (torch.arange(20) + order[:, None]) % 6 == 0,
             "held": torch.ones(self.batch, LAYOUT.dim, dtype=torch.bool),
             "conditions": {
                 "text": Condition(numbers(3, 4), ((order % 3 < 2)[:, None]).expand(-1, 3)),
@@ -123,10 +133,33 @@ def tokenizer() -> Any:
     return made
 
 
+def dances(name: str, given: dict[str, Any], dropout: float) -> StageModule:
+    """The module of a model of dances; motions are taken for 25 joints."""
+    sizes: dict[str, Any] = {"dim": 8, "heads": 2, "ff": 8, "layers": 1, "dropout": dropout}
+    if name == "fact":
+        lengths = {"motion_frames": 10, "music_frames": 16, "predicted_frames": 3, "input_noise": dropout}
+        config = FactConfig(**sizes, **lengths, motion_layers=1, music_layers=1)
+        return FactModule(Fact(config, LAYOUT, "all", music_dim=3), OPTIM, **given)
+    codes = DanceVqConfig(width=8, depth=1, code_dim=8, halvings=2, num_codes=9, decay=0.8, reset_below=0.1)
+    vq = DanceVq(codes, 25)
+    if name == "dance_vq":
+        return DanceVqModule(vq, OPTIM, root_optim=OPTIM, root_start=10, **given)
+    for half in (vq.up, vq.down):
+        nn.init.normal_(half.quantizer.codebook)
+    vq.eval()
+    gpt = CrossGpt(CrossGptConfig(**sizes, context=4), 9, 3)
+    if name == "cross_gpt":
+        return CrossGptModule(gpt, OPTIM, vq=vq, **given)
+    reward = RewardConfig(actor_steps=2, critic_steps=3, temperature=1.0 if dropout else 0.0)
+    return ActorCriticModule(ActorCritic(gpt, 1), OPTIM, vq=vq, fps=20.0, reward=reward, **given)
+
+
 def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
     """The module of one network; `dropout` also turns on what else is drawn."""
     given: dict[str, Any] = {"seed": 3, "max_steps": steps}
     torch.manual_seed(0)
+    if name not in ("mq", "utt", "dmd"):
+        return dances(name, given, dropout)
     if name == "mq":
         return TokenizerModule(build_tokenizer(MQ, LAYOUT), OPTIM, **given)
     if name == "dmd":
@@ -168,8 +201,9 @@ def train(
     given: dict[str, Any] = {"steps": 16, "batch_size": 8, "checkpoint_every": 4, "validate_every": 8}
     config = TrainConfig(**{**given, **settings})
     module = module_of(name, config.steps, dropout=dropout).to(dtype)
-    if name != "mq":
-        module.tokenizer.module.to(dtype)  # type: ignore[operator, union-attr]
+    for frozen in (getattr(module, name, None) for name in ("tokenizer", "vq")):
+        if isinstance(frozen, Frozen):
+            frozen.module.to(dtype)
     fit(
         context(folder, Console(quiet=True), devices=devices),
         module,

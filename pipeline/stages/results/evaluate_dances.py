@@ -10,6 +10,7 @@ from pydantic import Field
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.pipeline.contract.generation import NotedGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, even_slices
@@ -148,7 +149,7 @@ class _DanceEvaluation(Evaluation):
     @cached_property
     def protocol(self) -> dict[str, Fact]:
         """What one has to know to get the same figures again, but for the seed."""
-        config, clips = self.config, self.clips
+        config, clips, maker = self.config, self.clips, self.bundle.generator
         return {
             "split": self.dataset.split,
             "clips": len(clips),
@@ -157,6 +158,7 @@ class _DanceEvaluation(Evaluation):
             "shuffles": config.shuffles,
             "feature_fps": config.feature_fps,
             **({"seed_motion": f"the first {self.begun} frames of each recording"} if self.begun else {}),
+            **({"note": maker.note} if isinstance(maker, NotedGenerator) and maker.note else {}),
             **self.drawn_as(self.bundle),
         }
 

@@ -1,7 +1,7 @@
-"""UDE's trainings stop and go on: after a kill bit for bit, and on two ranks as on one.
+"""Trainings of UDE, FACT and Bailando stop and go on: after a kill bit for bit, and on two ranks as on one.
 
-MQ with its codebook learnt by gradient, MATE + UTT against a critic with spectral norm,
-and the DMD. The processes of the two ranks run this file as a script.
+MQ with its codebook learnt by gradient, MATE + UTT against a critic with spectral norm, the DMD, and the
+models of dances. The processes of the two ranks run this file as a script.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def test_the_critic_and_its_spectral_norms_are_in_the_checkpoint(tmp_path: Path)
 
 # ---- two ranks
 
-PAIRS = {"mq": torch.float64, "utt": torch.float32, "dmd": torch.float64}
+PAIRS = {name: torch.float32 if name == "utt" else torch.float64 for name in NAMES}
 """UTT's logits are float32 in any case, and its decoder reads what comes of them."""
 BOUND = 1e-5
 

@@ -1,0 +1,66 @@
+"""Windows of clips as joints in metres, for networks that read positions, and the beats of their music."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from motionloom.datasets.loading.condition_batches import ConditionBatch
+from motionloom.datasets.loading.crops import Crops
+from motionloom.datasets.modalities.modality import FrameStats
+from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.shards.clips import ClipDataset
+
+
+class JointCrops(Crops):
+    """Reads joints [T, 3 N] where `Crops` reads normalised columns; each clip starts where it starts."""
+
+    def __init__(self, dataset: ClipDataset) -> None:
+        self.dataset = dataset
+        self.width = 3 * dataset.layout.num_joints
+        self.present = np.ones((4, self.width), dtype=np.bool_)
+        self.clips = np.arange(len(dataset))
+
+    def fill(
+        self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int, present: int
+    ) -> None:
+        """Joints of frames `start .. start + length` into `out` [T >= length, 3 N], then zeros."""
+        joints = joints_of(clip[: start + length], self.dataset.layout)[start:]
+        out[:length] = joints.reshape(length, -1)
+        out[length:] = 0.0
+
+
+class BeatBatch(ConditionBatch):
+    """A batch of dances."""
+
+    beats: Tensor
+    """bool [B, T], frames with a beat of the music."""
+
+
+class BeatBatches(Dataset[BeatBatch]):
+    """Batches with music, and its beats.
+
+    Args:
+        stats: What the music is normalised by.
+    """
+
+    def __init__(self, batches: Dataset[ConditionBatch], stats: FrameStats, fps: float) -> None:
+        self.batches, self.stats, self.fps = batches, stats, fps
+
+    def __len__(self) -> int:
+        return len(self.batches)  # type: ignore[arg-type]
+
+    def __getitem__(self, k: int) -> BeatBatch:
+        batch = self.batches[k]
+        features, mask, _ = batch["conditions"]["audio"]
+        beats = torch.zeros_like(mask)
+        for row, heard in enumerate(mask):
+            rows = features[row][heard].numpy() * self.stats.std + self.stats.mean
+            times = MODALITIES["audio"].ticks(None, rows, self.fps) if len(rows) else []
+            frames = np.round(np.array(times) * self.fps).astype(int)
+            beats[row, frames[frames < len(rows)]] = True
+        return {**batch, "beats": beats}

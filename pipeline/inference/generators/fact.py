@@ -1,0 +1,67 @@
+"""Dances that go on from a motion, by FACT: frame after frame, each from those before it and the music."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import UserError
+from motionloom.models.baselines.fact.network import Fact
+from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.store.networks import device_of
+
+
+@dataclass(frozen=True)
+class FactGenerator:
+    """One dance for each music; it draws nothing, so the motion that it begins with makes the difference."""
+
+    net: Fact
+    layout: MotionLayout
+    part: Part
+    given: Mapping[str, Any]
+    """What its stage was given; "stats" and "audio" of it."""
+    method = "fact"
+    modalities = frozenset({"audio"})
+    settings = frozenset[str]()
+    unit_frames = 1
+    max_frames = None
+
+    @property
+    def prepared(self) -> Mapping[str, object]:
+        return {"audio": self.given.get("audio")}
+
+    @property
+    def seed_frames(self) -> int:
+        return self.net.config.motion_frames
+
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        """Features in their own units; without seed motions each goes on from a kept one, by its seed."""
+        if request.frames is None:
+            raise UserError("FACT makes a length that it is given, and none was; give music, or --seconds")
+        columns, stats = self.layout.part(self.part), self.given["stats"]
+        mean, std = stats.mean[columns], stats.std[columns]
+        if request.seed_motions is None:
+            begun = self.net.kept[[seed % len(self.net.kept) for seed in request.seeds]]
+        else:
+            begun = torch.from_numpy((np.stack(list(request.seed_motions)) - mean) / std)
+        made = self.net.go_on(
+            begun.to(device_of(self.net), torch.float32), music_of(request, self.given), max(request.frames)
+        )
+        own = np.asarray(made.cpu().numpy() * std + mean, np.float32)
+        return [motion[:count] for motion, count in zip(own, request.frames, strict=True)]
+
+
+def music_of(request: GenerationRequest, given: Mapping[str, Any]) -> Tensor:
+    """The normalised music [B, L, E] of a request; 0 after each row's end."""
+    found = request.conditions.get("audio")
+    if found is None:
+        raise UserError("this model dances to music, and none was given")
+    return MODALITIES["audio"].normalise(given["audio"], found).features
