@@ -7,8 +7,11 @@ features.
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from typing import Any
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from motionloom.models.diffusion.dmd import Dmd, dmd_loss
 from motionloom.models.diffusion.network import MotionDiffusion
@@ -16,12 +19,42 @@ from motionloom.models.diffusion.observed import Showing
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
-from motionloom.models.training.distributed import mean_of_rows
+from motionloom.models.training.distributed import masked_mean, mean_of_rows
 from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
 
-class DiffusionModule(StageModule):
-    """Trains a `MotionDiffusion` on captioned `ConditionBatches`."""
+class DenoiserModule(StageModule):
+    """Trains a denoiser of whole motions on captioned `ConditionBatches`; a kind of it says `predicted`."""
+
+    net: Any
+
+    def __init__(self, net: nn.Module, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.noiser = self.net.config.schedule.noiser()
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
+        [B, D] (optional: all). Time steps and noise are drawn in each call.
+        """
+        motion, schedule = batch["motion"], self.net.config.schedule
+        mask = length_mask(batch["length"], motion.shape[1])
+        step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
+        noise = torch.randn_like(motion)
+        found = self.predicted(self.noiser.add_noise(motion, noise, step), step, batch, mask)
+        target = motion if schedule.predicts == "sample" else noise
+        return {"loss": self.mean(found - target.to(found.dtype), mask, batch.get("present"))}
+
+    @abstractmethod
+    def predicted(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
+        """The network's answer [B, T, D] to noisy motions at step [B]; mask bool [B, T]."""
+
+    def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
+        """Of squared errors [B, T, D] where mask [B, T] and present [B, D] say: every real frame alike."""
+        return masked_mean(error.square(), mask, present)
+
+
+class DiffusionModule(DenoiserModule):
+    """Trains a `MotionDiffusion`. Every clip counts alike, as in MDM; in evaluation no caption is dropped."""
 
     net: MotionDiffusion
 
@@ -36,34 +69,21 @@ class DiffusionModule(StageModule):
     ) -> None:
         """`showing` is for networks with `observed` columns."""
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.noiser = net.config.schedule.noiser()
         self.showing = showing
 
-    def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
-        [B, D] (optional: all).
-
-        Every clip counts alike, as in MDM. Time steps and noise are drawn in each call; in evaluation no
-        caption is dropped.
-        """
-        motion, length, text = batch["motion"], batch["length"], batch["conditions"]["text"].pooled
-        schedule = self.net.config.schedule
-        mask = length_mask(length, motion.shape[1])
-        step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
-        noise = torch.randn_like(motion)
+    def predicted(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
         hidden = self.net.config.condition_dropout if self.training else 0.0
-        conditioned = torch.rand(len(motion), device=motion.device) >= hidden
-        noisy = self.noiser.add_noise(motion, noise, step)
-        seen = None if self.showing is None else self.showing(motion, length)
-        found = self.net(noisy, step, text, mask, conditioned, seen)
-        target = motion if schedule.predicts == "sample" else noise
-        error = found - target.to(found.dtype)
-        loss = mean_of_rows(error.square(), mask, batch.get("present"))
+        conditioned = torch.rand(len(noisy), device=noisy.device) >= hidden
+        seen = None if self.showing is None else self.showing(batch["motion"], batch["length"])
+        found: Tensor = self.net(noisy, step, batch["conditions"]["text"].pooled, mask, conditioned, seen)
+        return found
+
+    def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
+        loss = mean_of_rows(error.square(), mask, present)
         weight = self.net.config.velocity_weight
         if weight:
-            between = error.diff(dim=1).square()
-            loss = loss + weight * mean_of_rows(between, mask[:, 1:], batch.get("present"))
-        return {"loss": loss}
+            loss = loss + weight * mean_of_rows(error.diff(dim=1).square(), mask[:, 1:], present)
+        return loss
 
 
 class DmdModule(StageModule):

@@ -20,6 +20,12 @@ from motionloom.models.baselines.mld.network import (
 )
 from motionloom.models.baselines.motionclip.module import MotionClipModule
 from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipConfig
+from motionloom.models.baselines.motiondiffuse.module import MotionDiffuseModule
+from motionloom.models.baselines.motiondiffuse.network import (
+    CaptionConfig,
+    MotionDiffuse,
+    MotionDiffuseConfig,
+)
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.evaluator.module import EvaluatorModule
@@ -190,6 +196,13 @@ def motionclip() -> tuple[StageModule, Batches]:
     return module.eval(), lambda step: motion(step, 133) | captions(step)
 
 
+def motiondiffuse() -> tuple[StageModule, Batches]:
+    caption = CaptionConfig(dim=8, ff=8, layers=1, heads=2)
+    config = MotionDiffuseConfig(dim=16, ff=16, layers=1, heads=2, caption=caption)
+    module = UndrawnMotionDiffuse(MotionDiffuse(config, 20, TEXT), OPTIM, seed=0, max_steps=STEPS)
+    return module.eval(), lambda step: motion(step, 20) | captions(step)
+
+
 class Undrawn(StageModule):
     """Time steps and noise are those of the whole batch, of which each rank takes its part."""
 
@@ -225,6 +238,10 @@ class UndrawnLatents(Undrawn, LatentDiffusionModule):
     """MLD's second stage."""
 
 
+class UndrawnMotionDiffuse(Undrawn, MotionDiffuseModule):
+    """MotionDiffuse's."""
+
+
 class Pairs(EvaluatorModule):
     """The evaluator's autoencoder and its pairs, which share no gradient, in one loss."""
 
@@ -258,6 +275,7 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "motion_vae": motion_vae,
     "latent_diffusion": latent_diffusion,
     "motionclip": motionclip,
+    "motiondiffuse": motiondiffuse,
     "evaluator": evaluator,
 }
 

@@ -1,7 +1,8 @@
-"""Motion of text by a diffusion model: MDM, and the second facial baseline (HumanTOMATO B.5.2)."""
+"""Motion of text by a diffusion model: MDM, MotionDiffuse, the second facial baseline (HumanTOMATO B.5.2)."""
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.models.baselines.motiondiffuse.network import MotionDiffuse
+from motionloom.models.baselines.motiondiffuse.sampling import sample_motions as sample_motiondiffuse
 from motionloom.models.diffusion.network import MotionDiffusion
 from motionloom.models.diffusion.sampling import sample_motions
-from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.pipeline.contract.editing import EditRequest
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -20,25 +23,38 @@ from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.store.networks import device_of
 
 
+class DenoisedMotion(WholeMotion):
+    """Any model that denoises a whole motion."""
+
+    who = "this diffusion model"
+    method = "diffusion"
+    settings = frozenset({"sampler", "denoising_steps"})
+
+    @property
+    @abstractmethod
+    def schedule(self) -> ScheduleConfig:
+        """Of the training."""
+
+    def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
+        """As asked for, or else DDPM in 50 steps, or the training's where those are fewer."""
+        return sampling.sampler or "ddpm", sampling.denoising_steps or min(50, self.schedule.steps)
+
+
 @dataclass(frozen=True)
-class DiffusionMotion(WholeMotion):
+class DiffusionMotion(DenoisedMotion):
     """Denoising from a sentence embedding, of any part of the body (MDM; B.5.2)."""
 
     net: MotionDiffusion
     window: int = 196
     """Frames that are edited at once: the longest motion of its training."""
-    who = "this diffusion model"
-    method = "diffusion"
+
+    @property
+    def schedule(self) -> ScheduleConfig:
+        return self.net.config.schedule
 
     @property
     def settings(self) -> frozenset[str]:  # type: ignore[override]
-        more = {"face_cfg_scale"} if self.part == "face" else set()
-        return frozenset({"cfg_scale", "sampler", "denoising_steps"} | more)
-
-    def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
-        """As asked for, or else DDPM in 50 steps, or the training's where those are fewer."""
-        steps = sampling.denoising_steps or min(50, self.net.config.schedule.steps)
-        return sampling.sampler or "ddpm", steps
+        return super().settings | {"cfg_scale"} | ({"face_cfg_scale"} if self.part == "face" else set())
 
     def normalised(self, request: GenerationRequest, frames: Sequence[int]) -> list[Tensor]:
         sampler, steps = self.denoising(request.sampling)
@@ -59,3 +75,24 @@ class DiffusionMotion(WholeMotion):
 
     def _guidance(self, sampling: SamplingConfig) -> float:
         return sampling.face_guidance if self.part == "face" else sampling.cfg_scale
+
+
+@dataclass(frozen=True)
+class MotionDiffuseMotion(DenoisedMotion):
+    """Denoising from the tokens of a caption, without guidance (MotionDiffuse)."""
+
+    net: MotionDiffuse
+
+    @property
+    def schedule(self) -> ScheduleConfig:
+        return self.net.config.schedule
+
+    @property
+    def max_frames(self) -> int:
+        return self.net.max_frames
+
+    def normalised(self, request: GenerationRequest, frames: Sequence[int]) -> list[Tensor]:
+        sampler, steps = self.denoising(request.sampling)
+        return sample_motiondiffuse(
+            self.net, request.text(self.who), frames, seeds=request.seeds, sampler=sampler, steps=steps
+        )

@@ -28,7 +28,14 @@ class Recorder(DataPreview):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"), [("tma", {}), ("diffusion", {}), ("evaluator", {}), ("h2vq", {"reset_below": 0.1})]
+    ("name", "options"),
+    [
+        ("tma", {}),
+        ("diffusion", {}),
+        ("evaluator", {}),
+        ("h2vq", {"reset_below": 0.1}),
+        ("motiondiffuse", {"dim": 16, "layers": 1}),
+    ],
 )
 def test_training_clips_are_opened_for_training(name: str, options: dict[str, Any]) -> None:
     kind = stage_kind(name, "here")

@@ -1,0 +1,78 @@
+"""MotionDiffuse stage (HumanTOMATO Tables 1, 13 and 14)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from motionloom.models.baselines.motiondiffuse.network import MotionDiffuse, MotionDiffuseConfig
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.inference.generators.diffusion import MotionDiffuseMotion
+from motionloom.pipeline.stages.networks.captions import (
+    CaptionInputs,
+    CaptionStage,
+    CaptionStageConfig,
+    part_columns,
+    part_of,
+)
+from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts
+from motionloom.pipeline.training.config import TrainConfig
+
+if TYPE_CHECKING:
+    from motionloom.models.baselines.motiondiffuse.module import MotionDiffuseModule
+
+
+class MotionDiffuseStageConfig(CaptionStageConfig):
+    """A denoiser conditioned on the tokens of captions; the defaults are the paper's."""
+
+    net: MotionDiffuseConfig = MotionDiffuseConfig()
+    optim: OptimConfig = OptimConfig(optimizer="adam", lr=2e-4, betas=(0.9, 0.999), grad_clip=0.5)
+    train: TrainConfig = TrainConfig(steps=230_000, batch_size=1024)
+
+
+class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, MotionDiffuse]):
+    """A denoiser, trained on whole clips and the tokens of their captions."""
+
+    name = "motiondiffuse"
+    summary = "MotionDiffuse"
+    config = MotionDiffuseStageConfig
+    inputs = CaptionInputs
+    curves = (Curve("loss"),)
+
+    def gives(self, config: MotionDiffuseStageConfig) -> frozenset[str]:
+        return super().gives(config) | {GENERATOR}
+
+    def facts(self, config: MotionDiffuseStageConfig, inputs: CaptionInputs) -> ModelFacts:
+        layout = inputs.data.layout
+        width = len(part_columns(layout, config.part))
+        extra = {"motion_dim": width, "text_dim": inputs.text.dim, "max_frames": config.max_frames}
+        return ModelFacts(
+            kind=self.name,
+            config=config.net.dump(),
+            layout=LayoutFacts.of(layout),
+            extra={**extra, "part": config.part},
+        )
+
+    def network(self, facts: ModelFacts, inputs: CaptionInputs) -> MotionDiffuse:
+        config = MotionDiffuseConfig.parse(facts.config, facts.where)
+        return MotionDiffuse(
+            config, *(facts.fact(key, int) for key in ("motion_dim", "text_dim", "max_frames"))
+        )
+
+    def module(
+        self, config: MotionDiffuseStageConfig, net: MotionDiffuse, inputs: CaptionInputs, seed: int
+    ) -> MotionDiffuseModule:
+        from motionloom.models.baselines.motiondiffuse.module import MotionDiffuseModule
+
+        return MotionDiffuseModule(net, config.optim, seed=seed, max_steps=config.train.steps)
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
+        return MotionDiffuseMotion(given["stats"].layout, part, given, net)
+
+
+register(MotionDiffuseStage())
