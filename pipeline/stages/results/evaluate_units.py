@@ -58,8 +58,8 @@ class EvaluateConfig(StageConfig):
     among: int = Field(61, ge=2)
     """Candidates of the accuracy of UDE's Table 1."""
     lengths: Literal["free", "recorded"] = "free"
-    """How long generated motions are: as the generator decides, or as the recorded clip is, which is all that
-    VAEs and diffusion models can do."""
+    """How long generated motions are: as the generator decides, or as the recorded clip is (at most what the
+    generator makes), which is all that VAEs and diffusion models can do."""
     sampling: SamplingConfig = SamplingConfig()
     face_basis: Path | None = None
     """A head's expression basis, `.npy` of floats [V, 3, 50] in metres (such as the expression part of
@@ -221,7 +221,8 @@ class EvaluationUnits(Evaluation):
         """Motions for the captions of some clips, as latents and by whether they do what is said."""
         assert self.bundle is not None
         truths, fps = self.truths[piece], self.dataset.layout.fps
-        recorded = [len(t.features) / fps for t in truths]
+        most = self.bundle.generator.max_frames
+        recorded = [min(len(t.features), most or len(t.features)) / fps for t in truths]
         seed, noise_seed = self.seeds(draw, piece.start)
         motions = self.bundle.generate(
             [t.caption for t in truths],
