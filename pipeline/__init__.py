@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from motionloom.pipeline.contract.generation import Prompt
     from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
     from motionloom.pipeline.contract.stage import StageKind, register
+    from motionloom.pipeline.inference.captioning import captions
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.motion import GeneratedMotion
     from motionloom.pipeline.inference.outputs import write_motions
@@ -38,6 +39,7 @@ __all__ = [
     "StreamConfig",
     "TrainedStage",
     "UserError",
+    "captions",
     "compare_runs",
     "compare_with_paper",
     "evaluate_run",
@@ -63,6 +65,7 @@ _HOMES = {
     "StreamConfig": "pipeline.contract.sampling",
     "TrainedStage": "pipeline.training.trained_stage",
     "UserError": "datasets.schema",
+    "captions": "pipeline.inference.captioning",
     "compare_runs": "pipeline.results.compare.command",
     "compare_with_paper": "pipeline.results.paper.compare",
     "evaluate_run": "pipeline.runs.api",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 from motionloom.datasets.check.faults import Fault
 from motionloom.datasets.loading.crops import caption_spans
 from motionloom.datasets.schema import Caption
-from motionloom.datasets.synth.actions.truth import Record
+from motionloom.datasets.synth.actions.truth import SIDES, Record
+from motionloom.datasets.synth.hands import hand_shape
 from motionloom.datasets.synth.measure import described, measure
 
 _ACTIONS = {
@@ -35,6 +37,15 @@ _ACTIONS = {
 _OTHERS = r"then|while|after|before|danc\w+|sit\w*|bow\w*|reach\w*|point\w*|crawl\w*|lie|lies|step\w*|not"
 """Words of captions that are about more than these rules know."""
 _OPPOSITE = {"left": "right", "right": "left", "forward": "backward", "backward": "forward"}
+_HAND = r"(?:the |his |her |their )?(left|right|both) hands?"
+_HANDS = {
+    "fist": rf"fists? (?:with|of) {_HAND}|{_HAND} in(?:to)? (?:a )?fists?",
+    "point": rf"pointing (?:the index finger of|with) {_HAND}",
+    "spread": rf"spread\w* the fingers of {_HAND}|the fingers of {_HAND} spread",
+    "pinch": rf"pinch\w*(?: thumb and index finger)? (?:with|of) {_HAND}",
+    "wave_fingers": rf"(?:wiggling|waving) the fingers of {_HAND}",
+}
+"""What is said of fingers, by the shapes of `truth.HANDS`."""
 _TIMES = {"once": 1, "one time": 1, "twice": 2, "two times": 2, "three times": 3, "thrice": 3}
 _TIMES |= {"four times": 4, "five times": 5} | {f"{n} times": n for n in range(2, 6)}
 
@@ -67,6 +78,51 @@ def claim_of(text: str) -> Record | None:
     return out if len(out) > 1 else None
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """What a caption says of one thing, and what the motion shows of it."""
+
+    what: str
+    """action, side, direction, count, left_hand or right_hand."""
+    said: str
+    seen: str | None
+    """None where the rules see nothing of it."""
+    holds: bool | None
+    """None where the rules cannot tell."""
+
+    @property
+    def opposite(self) -> bool:
+        return self.seen is not None and self.seen == _OPPOSITE.get(self.said)
+
+
+def verdicts(text: str, joints: NDArray[np.floating], fps: float) -> list[Verdict]:
+    """What a caption claims of joints [T, N >= 22, 3], T >= 4; of fingers where N is 52."""
+    out, rest = [], text.lower()
+    for shape, pattern in _HANDS.items():
+        for found in re.finditer(pattern, rest):
+            said = next(side for side in found.groups() if side)
+            for number, side in enumerate(SIDES if joints.shape[1] >= 52 else ()):
+                if said in (side, "both"):
+                    seen = hand_shape(joints, number, fps)
+                    out.append(Verdict(f"{side}_hand", shape, seen, seen == shape))
+        rest = re.sub(pattern, " ", rest)  # its side is not that of the action
+    claim = claim_of(rest)
+    if claim is None:
+        return out
+    action = str(claim["action"])
+    does, recognised = described(joints, fps, action), measure(joints, fps).action == action
+    rows = [Verdict("action", action, action if recognised else None, True if recognised else None)]
+    for name in ("side", "direction", "count"):
+        if (want := claim.get(name)) is None:
+            continue
+        got = does.get(name)
+        row = Verdict(name, str(want), None if got is None else str(got), None)
+        # A side or a direction is also seen in a motion that the rules take for another action.
+        decided = got is not None and (recognised or row.opposite or (want == got and str(want) in _OPPOSITE))
+        rows.append(replace(row, holds=want == got) if decided else row)
+    return rows + out
+
+
 def caption_faults(captions: Sequence[Caption], joints: NDArray[np.floating], fps: float) -> Iterator[Fault]:
     """The captions that joints [T, N >= 22, 3] contradict; of several that say the same the first."""
     said: list[Record] = []
@@ -75,13 +131,8 @@ def caption_faults(captions: Sequence[Caption], joints: NDArray[np.floating], fp
         if claim is None or claim in said or span.frames < 4:
             continue
         said.append(claim)
-        part = joints[span.first : span.end]
-        does = described(part, fps, str(claim["action"]))
-        recognised = measure(part, fps).action == claim["action"]
-        for name in ("side", "direction", "count"):
-            want, got = claim.get(name), does.get(name)
-            opposite = got is not None and got == _OPPOSITE.get(str(want))
-            if want is not None and want != got and (opposite or (recognised and got is not None)):
-                text = f"'{span.text}': the {name} is {got}, not {want}"
-                yield Fault("caption disagrees", text, 2.0 if opposite else 1.0, span.first)
+        for one in verdicts(span.text, joints[span.first : span.end], fps):
+            if one.holds is False and one.what in claim:
+                text = f"'{span.text}': the {one.what} is {one.seen}, not {one.said}"
+                yield Fault("caption disagrees", text, 2.0 if one.opposite else 1.0, span.first)
                 break

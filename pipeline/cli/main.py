@@ -21,6 +21,7 @@ import typer
 
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cli.caption import caption
 from motionloom.pipeline.cli.data import data_app
 from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.generate import generate
@@ -207,6 +208,7 @@ def launch(
 
 
 app.command()(generate)
+app.command()(caption)
 
 
 @app.command()

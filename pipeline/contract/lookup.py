@@ -11,7 +11,16 @@ from pydantic import Field
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, Role, Stage, StageKind, stage_kind
+from motionloom.pipeline.contract.stage import (
+    CAPTIONER,
+    GENERATOR,
+    Finished,
+    Inputs,
+    Role,
+    Stage,
+    StageKind,
+    stage_kind,
+)
 from motionloom.pipeline.store.files import read_record
 from motionloom.pipeline.store.run_folder import (
     BUNDLE_FILE,
@@ -86,7 +95,7 @@ def _loadable(record: StageRecord, made: dict[Path, Finished]) -> Finished:
     folder = record.folder
     where, run, exported = str(folder / "artifact.json"), owner_of(folder), in_export(folder)
     kind = stage_kind(record.kind, where)
-    if record.version != kind.version and (exported or GENERATOR in _gives(kind, record)):
+    if record.version != kind.version and (exported or _gives(kind, record) & {GENERATOR, CAPTIONER}):
         raise UserError(
             f"{where}: made by version {record.version} of stage kind {kind.name}, which is now "
             f"version {kind.version}; run the recipe again{' and export it' * exported}"
@@ -164,6 +173,11 @@ def generators_of(run: Path) -> list[Finished]:
     return [makers[place] for place in order if place in makers]
 
 
+def captioners_of(run: Path) -> list[Finished]:
+    """The finished stages of a run that caption motions, in the recipe's order."""
+    return [stage for stage in finished_stages(run).values() if stage.gives(CAPTIONER)]
+
+
 def _listed(run: Path) -> list[Path]:
     """Folders of the stages that a run's recipe lists as its model (`inputs: {generators: [gpt]}`)."""
     roles = [entry.get("inputs") for entry in stages_of(run).values()]
@@ -184,22 +198,25 @@ class BundleFile(Config):
     layout: LayoutFacts
     generators: tuple[str, ...]
     """Stages that generate, the default first."""
+    captioners: tuple[str, ...] = ()
+    """Stages that caption motions."""
     sampling: dict[str, object] = Field(default_factory=dict)
     """Fields of `SamplingConfig` that its motions are best drawn with, where nobody says otherwise."""
 
 
-def open_exported(folder: Path) -> list[Finished]:
-    """The stages of an export that generate, the default first."""
+def open_exported(folder: Path, what: str = GENERATOR) -> list[Finished]:
+    """The stages of an export that generate, the default first; or that give `CAPTIONER`."""
     path, reader, made = folder / BUNDLE_FILE, RunReader(folder), dict[Path, Finished]()
-    makers = []
-    for name in read_bundle(folder).generators:
+    makers, listed = [], read_bundle(folder)
+    for name in listed.captioners if what == CAPTIONER else listed.generators:
         record = reader.find(folder / name) if re.fullmatch(STAGE_NAME, name) else None
         if record is None:
             raise UserError(not_here(folder, name))
         stage = _finished(record, made)
-        if not stage.gives(GENERATOR):
+        if not stage.gives(what):
+            does = "captions" if what == CAPTIONER else "generates"
             raise UserError(
-                f"{path}: its stage '{stage.name}' of kind {stage.kind.name} generates nothing; export the "
+                f"{path}: its stage '{stage.name}' of kind {stage.kind.name} {does} nothing; export the "
                 f"run again"
             )
         makers.append(stage)

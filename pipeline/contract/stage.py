@@ -30,6 +30,7 @@ from pydantic.config import JsonDict
 from rich.console import Console
 
 from motionloom.datasets.schema import Config, UserError
+from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.inputs import Every as Every
 from motionloom.pipeline.contract.inputs import Inputs as Inputs
@@ -45,6 +46,9 @@ CPU = torch.device("cpu")
 
 GENERATOR = "generator"
 """What a stage gives that makes motion: `StageKind.generator`."""
+
+CAPTIONER = "captioner"
+"""What a stage gives that says what motions show: `StageKind.captioner`."""
 
 ALIGNMENT = "alignment"
 """What a stage gives that embeds text and motion in one space: it loads as a `LoadedTma`."""
@@ -144,6 +148,10 @@ class StageCache:
     def generator(self, stage: Finished) -> MotionGenerator:
         require_unchanged(stage.folder)
         return stage.kind.generator(stage, self.given_to(stage), self.device)
+
+    def captioner(self, stage: Finished) -> MotionCaptioner:
+        require_unchanged(stage.folder)
+        return stage.kind.captioner(stage, self.given_to(stage), self.device)
 
 
 def _refuse(said: str) -> NoReturn:
@@ -256,6 +264,10 @@ class StageKind(ABC, Generic[C]):
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
         """A generator of motion, of a kind that gives `GENERATOR`."""
         raise NotImplementedError(f"stages of kind {self.name} generate nothing")
+
+    def captioner(self, stage: Finished, given: Inputs, device: torch.device) -> MotionCaptioner:
+        """What says what motions show, of a kind that gives `CAPTIONER`."""
+        raise NotImplementedError(f"stages of kind {self.name} say nothing")
 
     def exported(self, config: C) -> tuple[str, ...]:
         """Roles whose stages an export must take along for this stage to load."""

@@ -39,6 +39,8 @@ MODEL = ""
 RECORDED = "recorded motion"
 TRAINING = "training clips, as many"
 NEAREST = "nearest training clip"
+OWN_CAPTION = "another caption of the clip, by the rest"
+COMMON_CAPTION = "most frequent training caption"
 NEAREST_WORDS = "nearest training caption"
 NEAREST_LABELS = "nearest training labels"
 NEAREST_MUSIC = "training dance to the nearest music"
@@ -51,7 +53,7 @@ TableRows = tuple[str, list[str], list[list[str]]]
 """Title, columns and rows of a table."""
 ROWS = (
     MODEL, RECORDED, NEAREST_WORDS, NEAREST_LABELS, TRAINING, NEAREST, NEAREST_MUSIC, RANDOM_DANCE,
-    OTHER_MUSIC, STILL, MEAN_FACE, CHANCE,
+    OTHER_MUSIC, OWN_CAPTION, COMMON_CAPTION, STILL, MEAN_FACE, CHANCE,
 )  # fmt: skip
 """In the order in which they are shown."""
 

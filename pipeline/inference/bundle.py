@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
+from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import (
     DenoisingGenerator,
     DrivenGenerator,
@@ -30,9 +31,9 @@ from motionloom.pipeline.contract.generation import (
     Prompt,
     Stretch,
 )
-from motionloom.pipeline.contract.lookup import exported_sampling, generators_of, open_exported
+from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import CPU, Finished, StageCache
+from motionloom.pipeline.contract.stage import CAPTIONER, CPU, Finished, StageCache
 from motionloom.pipeline.inference.generators.standing import stood
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
@@ -47,6 +48,7 @@ from motionloom.pipeline.inference.requests import (
     require_used,
     require_words,
     seeds_of,
+    split_columns,
     ticks_of,
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
@@ -62,33 +64,38 @@ if TYPE_CHECKING:
 
 _AT_ONCE = 64
 """Motions sampled together."""
+_NO_BODY = "no finished stage here generates body motion; run the recipe to the end first"
 
 
 class Bundle:
     """The generators of a model, loaded at once so that a broken one is found first, all on one device."""
 
     def __init__(
-        self, stages: Sequence[Finished], stage_cache: StageCache, recommended: SamplingConfig | None = None
+        self,
+        stages: Sequence[Finished],
+        stage_cache: StageCache,
+        recommended: SamplingConfig | None = None,
+        captioners: Sequence[Finished] = (),
     ) -> None:
-        self.stages = tuple(stages)
-        """The stages that generate, the default of each kind first."""
+        self.stages, self.captioners = tuple(stages), tuple(captioners)
+        """The stages that generate, the default of each kind first; and those that caption motions."""
         self.stage_cache = stage_cache
         self.recommended = recommended or SamplingConfig()
         """How its motions are best drawn; fields that are not set here are nobody's recommendation."""
         self._generators: dict[Path, MotionGenerator] = {}
         self._encoders: dict[Path, PromptEncoder] = {}
-        for stage in self.stages:
+        for stage in (*self.stages, *self.captioners):
             self._open(stage)
-        parts = [self.of(stage).part for stage in self.stages]
-        if all(part == "face" for part in parts):
-            raise UserError("no finished stage here generates body motion; run the recipe to the end first")
+        if {self.of(stage).part for stage in self.stages} <= {"face"} and not self.captioners:
+            raise UserError(_NO_BODY)
 
     @staticmethod
     def open(name: Path | str, device: torch.device = CPU) -> Bundle:
         """Open a run folder, an exported folder, or a model that comes with the package, by its name."""
         folder = model_folder(name)
         if (folder / BUNDLE_FILE).is_file():
-            return Bundle._of(folder, open_exported(folder), device, exported_sampling(folder))
+            found = open_exported(folder), StageCache(device), exported_sampling(folder)
+            return Bundle._of(folder, (*found, open_exported(folder, CAPTIONER)))
         if not (folder / "recipe.yaml").is_file():
             if not folder.exists():
                 raise UserError(no_such_model(name))
@@ -101,20 +108,15 @@ class Bundle:
 
     @staticmethod
     def from_run(run: Path, device: torch.device = CPU) -> Bundle:
-        makers = generators_of(run)
-        for stage in makers:
+        makers, captioners = generators_of(run), captioners_of(run)
+        for stage in (*makers, *captioners):
             require_consistent(owner_of(stage.folder), [stage.folder.name])
-        return Bundle._of(run, makers, device)
+        return Bundle._of(run, (makers, StageCache(device), None, captioners))
 
     @staticmethod
-    def _of(
-        folder: Path,
-        stages: Sequence[Finished],
-        device: torch.device,
-        recommended: SamplingConfig | None = None,
-    ) -> Bundle:
+    def _of(folder: Path, found: tuple[Any, ...]) -> Bundle:
         try:
-            return Bundle(stages, StageCache(device), recommended)
+            return Bundle(*found)
         except UserError as error:
             if str(error).startswith(str(folder)):
                 raise
@@ -143,7 +145,10 @@ class Bundle:
     @cached_property
     def main(self) -> Finished:
         """The stage that generates body and hands."""
-        return next(stage for stage in self.stages if self.of(stage).part != "face")
+        for stage in self.stages:
+            if self.of(stage).part != "face":
+                return stage
+        raise UserError(_NO_BODY)
 
     @property
     def generator(self) -> MotionGenerator:
@@ -152,11 +157,10 @@ class Bundle:
     @cached_property
     def faces(self) -> dict[str, Finished]:
         """The stages that generate faces, by method; the first is the default."""
-        found = [(self.of(stage), stage) for stage in self.stages]
         out: dict[str, Finished] = {}
-        for generator, stage in found:
-            if generator.part == "face":
-                out.setdefault(generator.method, stage)
+        for stage in self.stages:
+            if self.of(stage).part == "face":
+                out.setdefault(self.of(stage).method, stage)
         return out
 
     def choose_face(self, wanted: str | None) -> Finished | None:
@@ -171,9 +175,16 @@ class Bundle:
             )
         return named[wanted]
 
+    @cached_property
+    def captioner(self) -> MotionCaptioner:
+        """What says what motions show: the recipe's first."""
+        if not self.captioners:
+            raise UserError("no finished stage here captions motion; add one of kind captioner to the recipe")
+        return self.stage_cache.captioner(self.captioners[0])
+
     @property
     def layout(self) -> MotionLayout:
-        return self.generator.layout
+        return self.generator.layout if self.stages else self.captioner.layout
 
     @property
     def device(self) -> torch.device:
@@ -370,15 +381,6 @@ class Bundle:
             replace(one, beats=() if one.prompt.stands else tuple(t for t in own if t < one.seconds))
             for one, own in zip(made, ticks, strict=True)
         ]
-
-
-def split_columns(
-    motion: NDArray[np.float32], generator: MotionGenerator, layout: MotionLayout
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Body-hand features and, of a generator that makes all columns, the expression."""
-    if generator.part != "all" or not layout.has("face"):
-        return motion, None
-    return motion[:, layout.part("bodyhand")], motion[:, layout.part("face")]
 
 
 def unknown_captions(

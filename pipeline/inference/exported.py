@@ -1,4 +1,4 @@
-"""Writing an export: the stages that generation needs, each in a folder of its own, and `bundle.json`."""
+"""Writing an export: the stages that it needs, each in a folder of its own, and `bundle.json`."""
 
 from __future__ import annotations
 
@@ -30,9 +30,12 @@ def write_bundle(run: Path, out: Path, *, half: bool = False, sampling: Sampling
     What is set of `sampling` goes with the model: motions are drawn so where nobody says otherwise.
     """
     bundle, sampling = Bundle.from_run(run), sampling or SamplingConfig()
-    require_used(bundle, None, sampling)
+    if bundle.stages:
+        require_used(bundle, None, sampling)
     for stage in bundle.stages:
         bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
+    for stage in bundle.captioners:
+        bundle.stage_cache.captioner(stage)
     out.mkdir(parents=True, exist_ok=True)
     _write_stages(bundle, out, half, sampling.model_dump(mode="json", exclude_unset=True))
     write_json(out / "config.json", HUB_CONFIG)
@@ -43,9 +46,9 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
 
     Stages of other runs come along like the run's own, so an export is whole in itself.
     """
-    makers, skeleton = bundle.stages, bundle.layout.skeleton
+    makers, captioners, skeleton = bundle.stages, bundle.captioners, bundle.layout.skeleton
     needed: dict[Path, Finished] = {}
-    for stage in makers:
+    for stage in (*makers, *captioners):
         _collect(stage, needed)
     names = _names(needed.values())
     (out / BUNDLE_FILE).unlink(missing_ok=True)
@@ -75,6 +78,7 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
         format=FORMAT,
         layout=LayoutFacts.of(bundle.layout),
         generators=tuple(names[stage.folder] for stage in makers),
+        captioners=tuple(names[stage.folder] for stage in captioners),
         sampling=sampling,
     )
     write_json(out / BUNDLE_FILE, facts.dump())

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import (
     MotionGenerator,
@@ -263,3 +264,12 @@ def weight_bytes(stages: Iterable[Finished]) -> int:
     """Size of the networks of some stages."""
     files = (stage.folder / MODEL_FILES[0] for stage in stages)
     return sum(path.stat().st_size for path in files if path.is_file())
+
+
+def split_columns(
+    motion: NDArray[np.float32], generator: MotionGenerator, layout: MotionLayout
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Body-hand features and, of a generator that makes all columns, the expression."""
+    if generator.part != "all" or not layout.has("face"):
+        return motion, None
+    return motion[:, layout.part("bodyhand")], motion[:, layout.part("face")]

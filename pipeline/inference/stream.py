@@ -29,10 +29,16 @@ from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.generation import Prompt, StreamingGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
-from motionloom.pipeline.inference.bundle import Bundle, split_columns, unknown_captions
+from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.generators.standing import Standing
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.requests import require_driven, require_seed, require_used, weight_bytes
+from motionloom.pipeline.inference.requests import (
+    require_driven,
+    require_seed,
+    require_used,
+    split_columns,
+    weight_bytes,
+)
 from motionloom.pipeline.inference.script import DrivenSegment, Script, segment_frames
 from motionloom.pipeline.launch.hardware import threads_for
 from motionloom.pipeline.render.score import Driver, Segment

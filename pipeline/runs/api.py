@@ -139,7 +139,8 @@ def _stages_again(
     given = {name: value for name, value in changes.items() if value is not None}
     for number, stage in enumerate(stages):
         out = folder / target / stage.name if number else folder / target
-        config = stage.kind.config.parse({**stage.config.dump(), **given}, target)
+        taken = {name: value for name, value in given.items() if name in stage.kind.config.model_fields}
+        config = stage.kind.config.parse({**stage.config.dump(), **taken}, target)
         inputs = _inputs_again(folder, recipe, stage, state)
         if team.leads:
             out.mkdir(exist_ok=True)

@@ -55,16 +55,21 @@ class TrainedTokenizer:
         return stats
 
     @torch.no_grad()
-    def encode(self, motions: Sequence[NDArray[np.float32]]) -> Codes:
-        """Tokens of motions [T, C], its columns in their own units; what exceeds whole groups is left out."""
+    def encode(self, motions: Sequence[NDArray[np.float32]], present: Sequence[int] | None = None) -> Codes:
+        """Tokens of motions [T, C], its columns in their own units; what exceeds whole groups is left out.
+
+        `present` [n] says by the bits of `ClipMeta.present` what each motion holds; None = all.
+        """
         groups = torch.tensor([len(motion) // GROUP_FRAMES for motion in motions])
         batch = torch.zeros(len(motions), int(groups.max()) * GROUP_FRAMES, self.net.dim)
         mean, std = self.stats.mean[self.columns], self.stats.std[self.columns]
         for row, motion, count in zip(batch, motions, (groups * GROUP_FRAMES).tolist(), strict=True):
             row[:count] = torch.from_numpy(((motion[:count] - mean) / std).astype(np.float32))
         device = device_of(self.net)
-        groups = groups.to(device)
-        return Codes(self.net.encode(batch.to(device), groups * GROUP_FRAMES), groups)
+        groups, held = groups.to(device), None
+        if present is not None:
+            held = torch.from_numpy(self.layout.present_columns[list(present)][:, self.columns]).to(device)
+        return Codes(self.net.encode(batch.to(device), groups * GROUP_FRAMES, held), groups)
 
     @torch.no_grad()
     def decode(self, codes: Mapping[str, Tensor], groups: Sequence[int]) -> list[NDArray[np.float32]]:

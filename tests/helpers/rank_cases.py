@@ -26,6 +26,11 @@ from motionloom.models.baselines.motiondiffuse.network import (
     MotionDiffuse,
     MotionDiffuseConfig,
 )
+from motionloom.models.baselines.tm2t.losses import CaptionLossConfig, Seq2SeqLossConfig
+from motionloom.models.baselines.tm2t.module import CaptionerModule
+from motionloom.models.baselines.tm2t.network import Captioner, CaptionerConfig
+from motionloom.models.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig
+from motionloom.models.baselines.tm2t.seq2seq_module import Seq2SeqModule
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
 from motionloom.models.evaluator.module import EvaluatorModule
@@ -37,6 +42,7 @@ from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.losses import TmaLossConfig
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
+from motionloom.models.tokenizer.base import Stream
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (
     AnyTokenizerConfig,
@@ -259,6 +265,49 @@ def evaluator() -> tuple[StageModule, Batches]:
     return module.double().eval(), lambda step: motion(step, 133) | captions(step)
 
 
+def _interleaved(step: int) -> tuple[dict[str, Tensor], torch.Generator]:
+    """Tokens of clips of which one on the first rank lacks hands, and two on the other."""
+    generator = torch.Generator().manual_seed(step)
+    codes = {
+        "body": torch.randint(9, (BATCH, 10), generator=generator),
+        "hand": torch.randint(9, (BATCH, 5), generator=generator),
+    }
+    groups = torch.tensor([5, 5, 4, 1, 2, 1])
+    tokens, kinds, _ = interleave(codes, ("body", "body", "hand"), ends={"body": 9, "hand": 9}, groups=groups)
+    handless = torch.tensor([False, False, True, False, True, True])
+    known = ~(handless[:, None] & (kinds == 1)) | (tokens == 9)
+    return {"tokens": tokens, "kinds": kinds, "known": known}, generator
+
+
+_STREAMS = (Stream("body", 9, 2), Stream("hand", 9, 1))
+_PATTERN = ("body", "body", "hand")
+_SAID = torch.tensor([[4, 5, 6, 2], [5, 2, 0, 0], [6, 6, 2, 0], [4, 2, 0, 0], [2, 0, 0, 0], [5, 4, 5, 2]])
+
+
+def captioner(summed: bool = False) -> tuple[StageModule, Batches]:
+    config = CaptionerConfig(layers=1, dim=16, heads=2, ff=32, block_size=20, max_words=4)
+    net = Captioner(config, _STREAMS, _PATTERN, 7)
+    module = CaptionerModule(net, OPTIM, seed=0, max_steps=STEPS, loss=CaptionLossConfig(summed=summed))
+    return module.eval(), lambda step: _interleaved(step)[0] | {"text": _SAID}
+
+
+def seq2seq() -> tuple[StageModule, Batches]:
+    """With inverse alignment by the likeliest tokens."""
+    net = Seq2Seq(Seq2SeqConfig(reader=8, dim=8, max_tokens=20), _STREAMS, _PATTERN, TEXT)
+    judge = captioner()[0].net.double()
+    assert isinstance(judge, Captioner)
+    loss = Seq2SeqLossConfig()
+    module = Seq2SeqModule(net, OPTIM, seed=0, max_steps=STEPS, loss=loss, captioner=judge)
+
+    def batch(step: int) -> dict[str, Tensor]:
+        tokens, generator = _interleaved(step)
+        words = torch.randn(BATCH, 4, TEXT, generator=generator, dtype=torch.float64)
+        mask = torch.arange(4)[None] < torch.tensor([4, 2, 3, 1, 4, 2])[:, None]
+        return tokens | {"words": words, "mask": mask, "said": _SAID}
+
+    return module.eval(), batch
+
+
 CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "h2vq": lambda: tokenizer(H2VQConfig(**BOOK, root_gain=5.0, finger_gain=2.0)),
     "h2vq, one rank without hands": lambda: tokenizer(H2VQConfig(**BOOK), (True, False, True) + 3 * (False,)),
@@ -277,6 +326,9 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "motionclip": motionclip,
     "motiondiffuse": motiondiffuse,
     "evaluator": evaluator,
+    "captioner": captioner,
+    "captioner, words added up": lambda: captioner(summed=True),
+    "seq2seq": seq2seq,
 }
 
 

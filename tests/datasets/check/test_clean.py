@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from motionloom.datasets.check.claims import caption_faults, claim_of
+from motionloom.datasets.check.claims import caption_faults, claim_of, verdicts
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.decisions import decide, undo
 from motionloom.datasets.check.faults import motion_faults
@@ -144,6 +145,21 @@ def test_captions_that_say_another_thing(people: list[tuple[Joints, list[str]]])
                 assert fault.kind == "caption disagrees" and said in fault.text
                 judged += 1
     assert judged > 20
+
+
+def test_what_a_caption_claims_is_seen_or_not() -> None:
+    """Of whole bodies, hands too: all that true captions claim holds; of the mirror image no side does."""
+    config = SynthConfig(clips=24, seed=5, layout="wholebody363")
+    seen: Counter[str] = Counter()
+    for clip in (make_clip(k, config) for k in range(config.clips)):
+        for text in clip.texts:
+            for one in verdicts(text, clip.joints, 30.0):
+                assert one.holds is not False, (text, one)
+                seen[one.what] += one.holds is True
+            wrong = [one for one in verdicts(text, mirror(clip.joints, config.motion_layout.skeleton), 30.0)
+                     if one.what in ("side", "direction") and one.said in ("left", "right")]  # fmt: skip
+            assert all(one.holds is False and one.seen == WRONG[one.said] for one in wrong)
+    assert min(seen[what] for what in ("action", "side", "count", "left_hand", "right_hand")) >= 3, seen
 
 
 # --- a set, and decisions about it ------------------------------------------------------------------------

@@ -1,0 +1,62 @@
+"""`motionloom caption`: what clips show, in words."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from motionloom.datasets.schema import Dropped, UserError
+from motionloom.pipeline.cli.convert import say
+from motionloom.pipeline.cli.options import AsJson, Device, ModelFolder, print_json
+from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.store.files import require_file_place
+
+
+def caption(
+    run_folder: ModelFolder,
+    clips: Annotated[
+        list[Path], typer.Argument(help="Files (.npz of generate, .bvh, .amc, .glb), archives or folders.")
+    ],
+    count: Annotated[int, typer.Option("--k", min=1, help="Sentences for each clip, likeliest first.")] = 3,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Also write JSON lines, for `data convert … --captions`."),
+    ] = None,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> None:
+    """The likeliest sentences about clips, by a model with a captioner, each checked on the joints.
+
+    Example: `motionloom caption runs/mine walk.bvh --k 5`
+
+    Example: `motionloom caption runs/mine takes -o captions.jsonl --k 1`
+    """
+    from motionloom.datasets.base.files import write_text
+    from motionloom.pipeline.inference.captioning import captions
+    from motionloom.pipeline.inference.model import MotionModel
+
+    console = make_console(aside=as_json)
+    if out is not None:
+        require_file_place(out)
+    model, found, left_out = MotionModel(run_folder, device), [], []
+    for one in captions(model, clips, count):
+        if isinstance(one, Dropped):
+            left_out.append(one)
+            say(console, f"left out: {one.source}: {one.reason}")
+            continue
+        found.append(one)
+        say(console, f"{one.file} ({one.seconds:.1f} s)")
+        for sentence in one.sentences:
+            say(console, f"  {sentence.probability:6.1%}  {sentence.text}{sentence.checks}")
+    if not found:
+        raise UserError(
+            f"{left_out[0].source}: {left_out[0].reason}" if left_out else f"{clips[0]}: no clip in it"
+        )
+    if out is not None:
+        write_text(out, "".join(f"{json.dumps(one.record(), ensure_ascii=False)}\n" for one in found))
+        say(console, f"{out}: {len(found)} clips")
+    if as_json:
+        print_json([one.record() for one in found])

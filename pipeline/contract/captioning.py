@@ -1,0 +1,57 @@
+"""What a captioner of motions is asked, and what it answers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.layout import MotionLayout, Part
+
+
+@dataclass(frozen=True)
+class Sentence:
+    """What a captioner says of a motion."""
+
+    text: str
+    log_probability: float
+    """Of the whole sentence, as the captioner has it; natural logarithm."""
+
+    @property
+    def probability(self) -> float:
+        return math.exp(self.log_probability)
+
+
+class MotionCaptioner(Protocol):
+    """A trained stage that says what motions show."""
+
+    @property
+    def layout(self) -> MotionLayout:
+        """The layout of whole frames."""
+
+    @property
+    def part(self) -> Part:
+        """The columns of the layout that it reads."""
+
+    @property
+    def min_frames(self) -> int:
+        """Shorter motions cannot be read."""
+
+    @property
+    def max_frames(self) -> int:
+        """Of longer motions, what comes after is not read."""
+
+    def reads(self, present: int) -> bool:
+        """Whether it can read motions that hold only what these bits of `ClipMeta.present` say."""
+
+    def caption(
+        self, motions: Sequence[NDArray[np.float32]], count: int, present: Sequence[int] | None = None
+    ) -> list[list[Sentence]]:
+        """Of each motion [T, C], its columns in their own units, up to `count` sentences, likeliest first.
+
+        `present` [n] says by the bits of `ClipMeta.present` what each holds; None = all.
+        """

@@ -1,0 +1,139 @@
+"""Captions of motions, measured: against what people said, by TMA, and on the joints.
+
+Beside the model stand answers that need none: the caption of the training clip whose TMA latent is nearest,
+which is a hard rival, the most frequent training caption, and another caption of the clip itself, judged by
+the rest.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from motionloom.datasets.check.claims import verdicts
+from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.models.metrics.captions import bert_score, bleu, cider_d, rouge_l, words_of
+from motionloom.models.metrics.retrieval import r_precision
+from motionloom.pipeline.evaluation.estimate import row_estimates, weighted
+from motionloom.pipeline.evaluation.figures import (
+    COMMON_CAPTION,
+    NEAREST,
+    Better,
+    Estimate,
+    Figure,
+    Metric,
+    Protocol,
+    group_figures,
+)
+from motionloom.pipeline.evaluation.truth import Truth, has_caption, truth_of
+from motionloom.pipeline.store.networks import LoadedTma, TokensOfCaptions, embed_motions
+
+_TOP, _AT_ONCE = 3, 256
+
+_WORDS: tuple[tuple[str, str, Better], ...] = (
+    *((f"bleu-{n}", f"BLEU-{n}", "higher") for n in range(1, 5)),  # type: ignore[misc]
+    ("rouge-l", "ROUGE-L", "higher"),
+    ("cider-d", "CIDEr-D", "higher"),
+    ("bert", "BERTScore F1", "higher"),
+)
+METRICS = (
+    *(Metric(f"captions.{name}", title, better) for name, title, better in _WORDS),
+    *(Metric(f"captions.R-precision-{k}", f"R-precision {k}", "higher") for k in range(1, _TOP + 1)),
+    Metric("captions.claims_hold", "claims that hold", "higher", "share"),
+    Metric("captions.claims_decided", "captions with a claim", "", "share"),
+)
+
+
+@dataclass(frozen=True)
+class CaptionedClips:
+    """The clips of an evaluation, n of them."""
+
+    truths: Sequence[Truth]
+    references: Sequence[Sequence[str]]
+    """What people said of each."""
+    fps: float
+    text: TokensOfCaptions
+    """Its token states are BERTScore's."""
+    tma: LoadedTma | None
+    size: int
+    """Motions among which TMA finds a caption's own."""
+    seed: int
+
+    def measured(
+        self, captions: Sequence[str], references: Sequence[Sequence[str]] | None = None
+    ) -> dict[str, Estimate]:
+        """The figures of one caption for each clip, by the clips' captions unless `references` are others."""
+        known = self.references if references is None else references
+        states = _states(self.text, [*captions, *(text for own in known for text in own)])
+        said = [words_of(caption) for caption in captions]
+        by = [[words_of(one) for one in own] for own in known]
+        rarities = cider_d(said, by)
+        rows = []
+        for row, truth in enumerate(self.truths):
+            found = {
+                "captions.rouge-l": rouge_l(said[row], by[row]),
+                "captions.cider-d": rarities[row],
+                "captions.bert": max(bert_score(states[captions[row]], states[one])[2] for one in known[row]),
+            }
+            checks = verdicts(captions[row], truth.joints, self.fps)
+            decided = [one.holds for one in checks if one.holds is not None]
+            found["captions.claims_decided"] = float(bool(decided))
+            rows.append(found | weighted("captions.claims_hold", sum(decided), len(decided)))
+        out = row_estimates([rows])
+        out |= {f"captions.bleu-{n}": Estimate(value) for n, value in enumerate(bleu(said, by), start=1)}
+        if self.tma is not None:
+            latents = self.tma.embed_captions(list(captions), self.tma.given["text"])
+            found_by = r_precision(_unit(latents), self.motions, batch=self.size, top=_TOP, seed=self.seed)
+            top = found_by.tolist()
+            out |= {f"captions.R-precision-{k}": Estimate(value) for k, value in enumerate(top, start=1)}
+        return out
+
+    @cached_property
+    def motions(self) -> Tensor:
+        """TMA's latents of the clips, of length 1 [n, Z]."""
+        assert self.tma is not None
+        return _latents(self.tma, self.truths)
+
+
+def caption_figures(rows: Mapping[str, Mapping[str, Estimate]], protocol: Protocol) -> list[Figure]:
+    """Row -> what was measured of its captions, as one table."""
+    title = "Captions of the clips: words shared with people's, found again by TMA, checked on the joints"
+    return group_figures(title, METRICS, rows, protocol)
+
+
+def _states(text: TokensOfCaptions, captions: Iterable[str]) -> dict[str, Tensor]:
+    """Token states [S, E] of each caption."""
+    words, out = sorted(set(captions)), dict[str, Tensor]()
+    for start in range(0, len(words), _AT_ONCE):
+        some = words[start : start + _AT_ONCE]
+        tokens, mask = text.tokens(some)
+        out |= {one: torch.from_numpy(tokens[row][mask[row]]) for row, one in enumerate(some)}
+    return out
+
+
+def _unit(latents: Tensor) -> Tensor:
+    return functional.normalize(latents.double(), dim=-1)
+
+
+def _latents(tma: LoadedTma, truths: Sequence[Truth]) -> Tensor:
+    return _unit(embed_motions(tma, [t.features for t in truths], [t.present for t in truths]))
+
+
+def trivial_captions(train: ClipDataset, clips: CaptionedClips) -> dict[str, list[str]]:
+    """Row -> a caption of the training set for each clip."""
+    usable = np.flatnonzero(has_caption(train)).tolist()
+    truths = [truth_of(train, clip) for clip in usable]
+    counts = Counter(caption.text for clip in usable for caption in train.texts(clip))
+    common = min(counts, key=lambda text: (-counts[text], text))
+    out = {COMMON_CAPTION: [common] * len(clips.truths)}
+    if clips.tma is not None:
+        near = (clips.motions @ _latents(clips.tma, truths).t()).argmax(1).tolist()
+        out[NEAREST] = [truths[clip].caption for clip in near]
+    return out

@@ -1,0 +1,200 @@
+"""Captions of clips in files: what a captioner says, and what its words claim, checked on the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.check.claims import Verdict, verdicts
+from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.common.features import features_of
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.schema import FACE, HANDS, PRESENT_ALL, Dropped, UserError
+from motionloom.pipeline.contract.captioning import MotionCaptioner, Sentence
+from motionloom.pipeline.inference.edits.clips import read_clip
+from motionloom.pipeline.inference.edits.recorded import LEAST_FRAMES
+from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.motion import GeneratedMotion
+
+MACHINE = "captioner"
+"""`source` of captions that no person wrote."""
+
+
+@dataclass(frozen=True)
+class CheckedSentence(Sentence):
+    """A sentence, and which of its claims the joints bear out."""
+
+    verdicts: tuple[Verdict, ...] = ()
+
+    @property
+    def checks(self) -> str:
+        """What its claims are worth, for people; empty where the rules can tell nothing."""
+        marks = {True: "yes", False: "no"}
+        told = [
+            f"{one.what} {marks[one.holds]}" + (f" ({one.seen})" if one.holds is False and one.seen else "")
+            for one in self.verdicts
+            if one.holds is not None
+        ]
+        return f"  [{', '.join(told)}]" if told else ""
+
+    def record(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "text": self.text,
+            "probability": self.probability,
+            "claims": list(map(asdict, self.verdicts)),
+        }
+
+
+@dataclass(frozen=True)
+class CaptionedClip:
+    """What is said of one clip, likeliest first."""
+
+    id: str
+    """Its name, as a conversion of the same source has it."""
+    file: str
+    """Its place in the source."""
+    seconds: float
+    """Of it that were read."""
+    sentences: tuple[CheckedSentence, ...]
+
+    def record(self) -> dict[str, Any]:
+        """A line for `data convert --captions`, which reads the captions; the rest informs people."""
+        texts = [{"text": one.text, "source": MACHINE} for one in self.sentences]
+        said = [one.record() for one in self.sentences]
+        return {"id": self.id, "file": self.file, "captions": texts, "said": said}
+
+
+class ReadClip(NamedTuple):
+    """A clip in the layout of a captioner."""
+
+    id: str
+    file: str
+    features: NDArray[np.float32]
+    """[T, D]."""
+    present: int
+    """What it holds, by the bits of `ClipMeta.present`."""
+
+
+def captions(
+    model: MotionModel, clips: Iterable[Path | str | GeneratedMotion], count: int = 3
+) -> Iterator[CaptionedClip | Dropped]:
+    """What each clip shows, in up to `count` sentences, likeliest first, checked on the joints; or why it
+    cannot be read.
+
+    A clip is a motion, a file, or an archive or folder of files (`read_clips`). `UserError` where the model
+    has no captioner.
+    """
+    captioner = model.bundle.captioner
+    for clip in clips:
+        if isinstance(clip, GeneratedMotion):
+            features = features_for(clip.joints, clip.fps, captioner.layout, clip.face)
+            yield from caption_clips(captioner, [ReadClip("", clip.words, *features)], count)
+        else:
+            yield from caption_clips(captioner, read_clips(Path(clip), captioner.layout), count)
+
+
+def read_clips(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped]:
+    """The clips of a file, an archive or a folder: BVH and ASF/AMC as the converter reads them; npz and GLB
+    as they are written here. `UserError` where there are none.
+    """
+    if not source.exists():
+        raise UserError(f"{source}: no such file or folder")
+    paths = sorted(source.rglob("*")) if source.is_dir() else [source]
+    root = source if source.is_dir() else source.parent
+    recorded = [path for path in paths if path.suffix.lower() in (".npz", ".glb")]
+    if len(recorded) < len(paths) or not recorded:
+        try:
+            yield from _of_mocap(source, layout)
+        except UserError:
+            if not recorded:
+                raise
+    for path in recorded:
+        name = path.relative_to(root).as_posix()
+        try:
+            clip = read_clip(path)
+            yield ReadClip(
+                name.rpartition(".")[0], name, *features_for(clip.joints, clip.fps, layout, clip.face)
+            )
+        except UserError as error:
+            yield Dropped(source=str(path), reason=str(error).removeprefix(f"{path}: "))
+
+
+def features_for(
+    joints: NDArray[np.floating], fps: float, layout: MotionLayout, face: NDArray[np.floating] | None = None
+) -> tuple[NDArray[np.float32], int]:
+    """Features [T', D] of joints [T, 22 or 52, 3], and what they hold; hands at rest where there are none."""
+    has_hands = joints.shape[1] >= layout.num_joints > BODY_JOINTS
+    if joints.shape[1] < layout.num_joints:
+        joints = with_resting_hands(joints)
+    has_face = face is not None and layout.has("face")
+    present = HANDS * has_hands | FACE * has_face
+    joints = joints[:, : layout.num_joints]
+    return features_of(joints, fps, layout, face=face if has_face else None), present
+
+
+def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped]:
+    """Fingers where all skeletons have them; else hands at rest, which count as none."""
+    given = {"source": source, "layout": layout.name, "fps": layout.fps, "uncaptioned": "keep"}
+    hands = layout.num_joints > BODY_JOINTS
+    with TemporaryDirectory() as maps:
+        try:
+            conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), maps=Path(maps))
+        except UserError:
+            if not hands:
+                raise
+            hands, given["fingers"] = False, "missing"
+            conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), maps=Path(maps))
+    plan, converter = conversion.plan, conversion.converter
+    yield from (*plan.broken, *plan.rejected, *plan.dropped)
+    clips = {clip.label(): clip for _, clip in plan.items}
+    step = converter.features(list(clips.values()))
+    assert step is not None  # mocap is read batch by batch
+    for batch in step.batches:
+        for label, made in batch.clips():
+            if isinstance(made, Dropped):
+                yield made
+            else:
+                yield ReadClip(clips[label].id, clips[label].found.path, made, HANDS * hands)
+
+
+def caption_clips(
+    captioner: MotionCaptioner, clips: Iterable[ReadClip | Dropped], count: int
+) -> Iterator[CaptionedClip | Dropped]:
+    """What the captioner says of each clip that it can read, in order; `count` sentences at most."""
+    layout, columns = captioner.layout, captioner.layout.part(captioner.part)
+    for clip in clips:
+        if isinstance(clip, Dropped):
+            yield clip
+            continue
+        frames = len(clip.features)
+        if frames < max(captioner.min_frames, LEAST_FRAMES):
+            least = max(captioner.min_frames, LEAST_FRAMES)
+            yield Dropped(
+                source=clip.file,
+                reason=f"{frames} frames at {layout.fps:g} a second; a captioner reads {least} or more",
+            )
+            continue
+        # Without a part that the tokens cannot do without, it is read at rest.
+        present = clip.present if captioner.reads(clip.present) else PRESENT_ALL
+        (found,) = captioner.caption([clip.features[:, columns]], count, [present])
+        joints = joints_of(clip.features[:, layout.part("bodyhand")], layout)
+        joints = joints[: captioner.max_frames, : None if clip.present & HANDS else BODY_JOINTS]
+        yield CaptionedClip(
+            clip.id,
+            clip.file,
+            len(joints) / layout.fps,
+            tuple(
+                CheckedSentence(one.text, one.log_probability, tuple(verdicts(one.text, joints, layout.fps)))
+                for one in found
+            ),
+        )
