@@ -45,7 +45,7 @@ def search(
 
         config = ServeConfig.parse({"port": port}, "search")
         try:
-            from motionloom.pipeline.serve.command import serve_search
+            from motionloom.pipeline.serve.search import serve_search
         except ModuleNotFoundError as error:
             if error.name not in ("starlette", "uvicorn"):
                 raise

@@ -289,11 +289,7 @@ def edit_clip(
     face = None if face_stage is None else encoded(face_stage)
     results = edited(asked, *encoded(bundle.main), face, samples=samples, seed=seed, sampling=sampling)
     shared: dict[str, Any] = {"layout": layout, "seed": seed}
-    own = asked.features[asked.inside]
-    original = GeneratedMotion(
-        Prompt(clip.caption), own[:, layout.part("bodyhand")], asked.to_world(asked.joints), asked.face,
-        kept=np.ones(len(own), dtype=np.bool_), layout=layout,
-    )  # fmt: skip
+    original = original_of(asked, clip.caption)
     words = "; ".join(dict.fromkeys(text for text, _ in asked.shares() if text.strip()))
     return [
         EditedMotion(
@@ -302,3 +298,12 @@ def edit_clip(
         )
         for one in results
     ]  # fmt: skip
+
+
+def original_of(asked: EditFrames, caption: str) -> GeneratedMotion:
+    """The clip of a task as the model reads it: at its frame rate, on the floor."""
+    own, layout = asked.features[asked.inside], asked.layout
+    return GeneratedMotion(
+        Prompt(caption), own[:, layout.part("bodyhand")], asked.to_world(asked.joints), asked.face,
+        kept=np.ones(len(own), dtype=np.bool_), layout=layout,
+    )  # fmt: skip

@@ -21,6 +21,7 @@ from starlette.types import ASGIApp
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, change, received, why_not
 from motionloom.pipeline.serve.guard import BROKEN, guarded, read_body
 from motionloom.pipeline.serve.requests import (
     Answer,
@@ -35,12 +36,13 @@ from motionloom.pipeline.serve.requests import (
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
 T = TypeVar("T")
+Asked = TypeVar("Asked", MotionRequest, ChangeRequest)
 
-_SCRIPTS = ("serve.js",)
+_SCRIPTS = ("serve.js", "edit.js", "lanes.js", "figure.js", "task.js")
 """Of the page, besides the viewer's."""
 
 _UPLOADS = 4
-"""Sounds that are received at a time; others wait unread."""
+"""Sounds and clips that are received at a time; others wait unread."""
 
 _LOOK = 0.25
 """Seconds after which a waiting request looks whether its client is still there."""
@@ -51,7 +53,7 @@ class Site:
 
     def __init__(self, model: MotionModel, config: ServeConfig, worker: Worker, name: str) -> None:
         self.model, self.config, self.worker, self.name = model, config, worker, name
-        self.sounds = Sounds(config)
+        self.sounds, self.clips = Sounds(config), Clips(model, config)
         self._uploads = asyncio.Semaphore(_UPLOADS)
 
     @property
@@ -62,13 +64,15 @@ class Site:
             Route("/api/generate", self.generate, methods=["POST"]),
             Route("/api/stream", self.stream, methods=["POST"]),
             Route("/api/sounds", self.add_sound, methods=["POST"]),
+            Route("/api/clips", self.add_clip, methods=["POST"]),
+            Route("/api/edit", self.edit, methods=["POST"]),
         ]
         return guarded("page.html", _SCRIPTS, routes, self.config.host, self.config.allow_hosts)
 
     async def info(self, request: Request) -> Response:
         bundle, limits = self.model.bundle, self.config
         longest = min(limits.max_seconds, self.model.max_seconds)
-        skeleton = bundle.layout.skeleton
+        skeleton, why = bundle.layout.skeleton, why_not(self.model)
         return JSONResponse(
             {
                 "model": self.name,
@@ -79,11 +83,13 @@ class Site:
                 "joint_names": list(skeleton.joints),
                 "parents": [int(parent) for parent in skeleton.parents],
                 "settings": sorted(bundle.generator.settings),
+                "edit": {"possible": why is None, "why": why or ""},
                 "sampling": bundle.recommended.model_dump(mode="json", exclude_unset=True),
                 "limits": {
                     "seconds": longest,
                     "caption": limits.max_caption,
-                    "sound_bytes": _bytes(limits),
+                    "sound_bytes": _bytes(limits.max_sound_mb),
+                    "clip_bytes": _bytes(limits.max_clip_mb),
                     "sound_seconds": limits.max_sound_seconds,
                     "waiting": limits.waiting,
                 },
@@ -92,9 +98,18 @@ class Site:
         )
 
     async def generate(self, request: Request) -> Response:
-        asked, sound = await self._asked(request)
-        future = self._submit(asked, lambda: make(self.model, asked, sound, self.config))
-        answer: Answer = await self._outcome(request, future, asked)
+        asked, sound = await self._asked(request, MotionRequest)
+        return await self._made(request, asked, lambda: make(self.model, asked, sound, self.config))
+
+    async def edit(self, request: Request) -> Response:
+        """A clip of which a part is made anew."""
+        asked, sound = await self._asked(request, ChangeRequest)
+        return await self._made(request, asked, lambda: change(self.clips, asked, sound))
+
+    async def _made(
+        self, request: Request, asked: MotionRequest | ChangeRequest, call: Callable[[], Answer]
+    ) -> Response:
+        answer = await self._outcome(request, self._submit(asked, call), asked)
         headers = {"x-request": asked.request}
         if answer.file:
             headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
@@ -102,7 +117,7 @@ class Site:
 
     async def stream(self, request: Request) -> Response:
         """One motion as JSON lines, while it is made."""
-        asked, sound = await self._asked(request)
+        asked, sound = await self._asked(request, MotionRequest)
         loop, pieces = asyncio.get_running_loop(), asyncio.Queue[str | None]()
         gone = False
 
@@ -148,16 +163,28 @@ class Site:
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
         async with self._uploads:
-            data = await read_body(request, "the sound", _bytes(self.config), self.config.patience)
+            most = _bytes(self.config.max_sound_mb)
+            data = await read_body(request, "the sound", most, self.config.patience)
         try:
             name, sound = await asyncio.to_thread(self.sounds.add, data)
         except UserError as error:
             raise HTTPException(400, str(error)) from None
         return JSONResponse({"sound": name, "seconds": round(sound.seconds, 3)})
 
-    async def _asked(self, request: Request) -> tuple[MotionRequest, Sound | None]:
-        kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
-        if kind != "application/json":
+    async def add_clip(self, request: Request) -> Response:
+        """Keep the motion file that the body is, under a name for later requests."""
+        if (why := why_not(self.model)) is not None:
+            raise HTTPException(400, why)
+        async with self._uploads:
+            data = await read_body(request, CLIP, _bytes(self.config.max_clip_mb), self.config.patience)
+        try:
+            return JSONResponse(await asyncio.to_thread(lambda: received(*self.clips.add(data))))
+        except UserError as error:
+            raise HTTPException(400, str(error)) from None
+
+    async def _asked(self, request: Request, kind: type[Asked]) -> tuple[Asked, Sound | None]:
+        media = request.headers.get("content-type", "").split(";")[0].strip().lower()
+        if media != "application/json":
             raise HTTPException(415, "send JSON with Content-Type: application/json")
         most = round(self.config.max_request_kb * 1024)
         data = await read_body(request, "the request", most, self.config.patience)
@@ -171,15 +198,17 @@ class Site:
         if not isinstance(given, dict):
             raise HTTPException(400, 'the request is not a JSON object like {"caption": "a person waves"}')
         try:
-            asked = MotionRequest.parse(given, "request")
+            asked = kind.parse(given, "request")
             asked.require_within(self.config, self.model)
             sound = None if asked.sound is None else self.sounds.get(asked.sound)
+            if isinstance(asked, ChangeRequest) and isinstance(asked.clip, str):
+                self.clips.get(asked.clip)
         except UserError as error:
             name = given.get("request")
             raise HTTPException(400, str(error), {"x-request": _plain(name)} if name else None) from None
         return asked.model_copy(update={"request": _plain(asked.request) or uuid.uuid4().hex}), sound
 
-    def _submit(self, asked: MotionRequest, call: Callable[[], T]) -> Future[T]:
+    def _submit(self, asked: MotionRequest | ChangeRequest, call: Callable[[], T]) -> Future[T]:
         named = {"x-request": asked.request}
         try:
             return self.worker.submit(call)
@@ -189,7 +218,7 @@ class Site:
         except Stopped:
             raise HTTPException(503, "the server is stopping", named) from None
 
-    async def _outcome(self, request: Request, future: Future[T], asked: MotionRequest) -> T:
+    async def _outcome(self, request: Request, future: Future[T], asked: MotionRequest | ChangeRequest) -> T:
         """The result; the call is dropped where its client goes away before it is begun."""
         result, named = asyncio.wrap_future(future), {"x-request": asked.request}
         try:
@@ -209,5 +238,5 @@ def _plain(name: object) -> str:
     return "".join(letter for letter in str(name)[:64] if letter.isascii() and letter.isprintable()).strip()
 
 
-def _bytes(config: ServeConfig) -> int:
-    return round(config.max_sound_mb * 2**20)
+def _bytes(megabytes: float) -> int:
+    return round(megabytes * 2**20)

@@ -51,8 +51,12 @@ class ServeConfig(Config):
     """Longest sound."""
     sounds: int = Field(4, ge=1)
     """Sounds that are kept; the one used longest ago makes room."""
+    max_clip_mb: float = Field(20.0, gt=0)
+    """Largest motion file."""
+    clips: int = Field(32, ge=1)
+    """Clips that are kept, with what was made of them; the one used longest ago makes room."""
     max_request_kb: float = Field(16.0, gt=0)
-    """Largest request besides a sound."""
+    """Largest request besides a sound or a clip."""
     patience: float = Field(20.0, gt=0)
     """Seconds in which a request must have arrived, its headers first."""
     connections: int = Field(256, ge=1)

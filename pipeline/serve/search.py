@@ -6,8 +6,11 @@ import asyncio
 import json
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
+from rich.console import Console
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
@@ -20,6 +23,8 @@ from motionloom.pipeline.render.viewer import ViewerData, viewer_data
 from motionloom.pipeline.results.data_page import watch
 from motionloom.pipeline.serve.guard import guarded, read_body
 from motionloom.pipeline.serve.requests import ServeConfig
+from motionloom.pipeline.serve.server import listen, run_site
+from motionloom.pipeline.serve.work import Worker
 
 SHOWN, SECONDS = 12, 5.0
 """Clips of an answer, and how much of each is shown."""
@@ -92,3 +97,12 @@ def shown(search: Search, hits: list[Hit]) -> ViewerData:
     """The clips that were found, for the viewer."""
     motions = [(hit, watch(search.splits[hit.place.split], hit.place.clip, seconds=SECONDS)) for hit in hits]
     return viewer_data([replace(one, label=f"{hit.score:.2f} · {one.label}") for hit, one in motions])
+
+
+def serve_search(root: Path, model: str, config: ServeConfig, *, device: str, console: Console) -> None:
+    """Serve the page about the data set in `root`; returns after Ctrl-C."""
+    with closing(listen(config)) as place:
+        search = Search.open(root, model, device=device, progress=True)
+        search.words("a person stands")  # loads what reads words, so that the first search does not wait
+        site = SearchSite(search, config, root.resolve().name)
+        run_site(site, place, Worker(config.waiting), site.name, console)

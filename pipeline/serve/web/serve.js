@@ -1,13 +1,15 @@
 /* The page of `motionloom serve`: asks for a motion and shows it. Everything that is shown goes through `textContent`. */
-(function () {
-"use strict";
+
+import { makeEditor } from "./edit.js";
 
 const one = (id) => document.getElementById(id);
 const form = one("ask"), status = one("status"), go = one("go"), save = one("save");
-const notes = one("notes"), start = one("start");
+const notes = one("notes"), start = one("start"), CLIP = /\.(npz|bvh|glb)$/i;
 let info = null, shown = null, asked = null, music = null, turn = 0;
+let editor = null, current = null; // what is shown, as the editor takes it
 
 function say(words, wrong) {
+  if (editor && editor.opened) editor.tell(words, wrong);
   status.textContent = words;
   status.classList.toggle("serve-wrong", Boolean(wrong));
 }
@@ -66,13 +68,28 @@ async function generate() {
   }
 }
 
-function show(answer, body) {
+function mount(data, over) {
   if (shown) shown.remove();
   start.hidden = true;
-  shown = window.motionloomViewer(one("viewer"), answer.viewer, { page: false });
-  asked = body;
-  save.hidden = false;
+  shown = window.motionloomViewer(one("viewer"), data, { page: false, over });
+  return shown;
+}
+
+function show(answer, body) {
+  mount(answer.viewer);
+  savable({ path: "/api/generate", body });
+  const { format, request, ...ref } = body;
+  current = { ref, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, face: answer.face, name: answer.caption || "a dance" };
   note(answer.notes, answer.nearest);
+}
+
+/* What the buttons save; nothing hides them. */
+function savable(what) {
+  asked = what;
+  save.hidden = !what && !(current && !editor.opened);
+  save.firstElementChild.hidden = !what;
+  one("save-words").textContent = editor.opened ? "Save the result as" : "Save as";
+  one("change").hidden = editor.opened || !info.edit.possible;
 }
 
 /* Captions to be clicked. */
@@ -95,7 +112,7 @@ function note(lines, captions) {
 
 async function keep(format) {
   try {
-    const answer = await post("/api/generate", { ...asked, format });
+    const answer = await post(asked.path, { ...asked.body, format });
     const name = /filename\*=UTF-8''(.+)/.exec(answer.headers.get("content-disposition") || "");
     const address = URL.createObjectURL(await answer.blob());
     const link = document.createElement("a");
@@ -109,6 +126,28 @@ async function keep(format) {
   }
 }
 
+const bytes = (path, file) => ask(path, { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file });
+
+/* A motion file, to be changed. */
+async function takeClip(file) {
+  if (file.size > info.limits.clip_bytes) {
+    say(`${file.name} is too large: at most ${Math.round(info.limits.clip_bytes / 2 ** 20)} MB`, true);
+    return;
+  }
+  const mine = ++turn;
+  say(`Reading ${file.name}…`);
+  try {
+    const answer = await (await bytes("/api/clips", file)).json();
+    if (mine !== turn) return;
+    current = { ref: answer.clip, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, face: "", name: file.name };
+    note(answer.notes, []);
+    say(`${file.name}: ${answer.seconds.toFixed(1)} s of motion`);
+    editor.open(current);
+  } catch (error) {
+    if (mine === turn) say(error.message, true);
+  }
+}
+
 async function take(file) {
   music = null;
   if (!file) return;
@@ -118,7 +157,7 @@ async function take(file) {
   }
   say(`Sending ${file.name}…`);
   try {
-    music = await (await ask("/api/sounds", { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file })).json();
+    music = await (await bytes("/api/sounds", file)).json();
     say(`${file.name}: ${music.seconds.toFixed(1)} s of music`);
   } catch (error) {
     say(error.message, true);
@@ -126,18 +165,29 @@ async function take(file) {
 }
 
 form.addEventListener("submit", (event) => { event.preventDefault(); generate(); });
-for (const button of save.querySelectorAll("button")) button.addEventListener("click", () => keep(button.dataset.format));
+for (const button of save.querySelectorAll("[data-format]")) button.addEventListener("click", () => keep(button.dataset.format));
+one("change").addEventListener("click", () => { note([], []); editor.open(current); });
 one("sound").addEventListener("change", () => take(one("sound").files[0]));
+one("clip").addEventListener("change", () => { if (one("clip").files.length) takeClip(one("clip").files[0]); });
 for (const name of ["dragover", "drop", "dragleave"]) {
   document.addEventListener(name, (event) => {
-    if (!info || !info.modalities.includes("audio")) return;
+    if (!info || !(info.modalities.includes("audio") || info.edit.possible)) return;
     event.preventDefault();
     document.body.classList.toggle("serve-over", name === "dragover");
-    if (name === "drop" && event.dataTransfer.files.length) {
+    if (name !== "drop" || !event.dataTransfer.files.length) return;
+    const [file] = event.dataTransfer.files;
+    if (CLIP.test(file.name) || !info.modalities.includes("audio")) dropClip(file);
+    else {
       one("sound").files = event.dataTransfer.files;
-      take(event.dataTransfer.files[0]);
+      take(file);
     }
   });
+}
+
+function dropClip(file) {
+  if (!info.edit.possible) say(`${file.name}: ${info.edit.why}`, true);
+  else if (!CLIP.test(file.name)) say(`${file.name} is no motion that can be read here: drop a BVH, GLB or npz file`, true);
+  else takeClip(file);
 }
 
 one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
@@ -158,9 +208,20 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   one("sound-field").hidden = !info.modalities.includes("audio");
   const drivers = info.modalities.map((name) => (name === "audio" ? "music" : name)).join(" or ");
   say(`${info.model}: ${drivers} to motion, at most ${info.limits.seconds} s`);
+  editor = makeEditor({
+    info, post, mount,
+    savable: (body) => savable(body && { path: "/api/edit", body }),
+    closed: (viewer, ref) => {
+      mount(viewer);
+      if (!asked && typeof ref === "object") savable({ path: "/api/generate", body: ref });
+      save.hidden = false;
+    },
+  });
+  for (const node of document.querySelectorAll(".edit-can")) node.hidden = !info.edit.possible;
+  one("change-not").hidden = info.edit.possible;
+  one("change-not").textContent = info.edit.why;
   one("start-words").textContent = info.examples.length ? "It knows, for example:" : "What you ask for is shown here.";
   one("start-examples").replaceChildren(...choices(info.examples));
   start.hidden = false;
-  if (!window.matchMedia("(pointer: coarse)").matches) one("caption").focus(); // a phone would cover the page with its keyboard
-})();
+  if (!matchMedia("(pointer: coarse)").matches) one("caption").focus(); // a phone would open its keyboard over the page
 })();

@@ -10,23 +10,39 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.serve.app import Site
-from motionloom.pipeline.serve.command import listen, server_of
 from motionloom.pipeline.serve.requests import ServeConfig
+from motionloom.pipeline.serve.server import listen, server_of
 from motionloom.pipeline.serve.work import Worker
 from motionloom.pipeline.store.known_captions import Unknown
 
 LAYOUT = MotionLayout.named("wholebody363", fps=20.0)
+
+
+class QuickGenerator:
+    """Leaves a clip that it is to edit as it is, so that it differs by pins and path alone."""
+
+    modalities, settings = frozenset({"text", "audio"}), frozenset({"cfg_scale"})
+    prepared: ClassVar[dict[str, object]] = {}
+    layout, part, method, unit_frames, max_frames = LAYOUT, "bodyhand", "quick", 1, None
+
+    def generate(self, request: Any) -> list[Any]:
+        raise NotImplementedError
+
+    def edit(self, request: Any) -> list[Any]:
+        return [request.features for _ in request.seeds]
 
 
 class QuickModel:
@@ -41,14 +57,26 @@ class QuickModel:
         self.open.set()
         self.asked: list[str] = []
         self.sampling: list[SamplingConfig] = []
-        generator = SimpleNamespace(modalities=self.modalities, settings=frozenset({"cfg_scale"}))
+        self.edited: list[EditTask] = []
+        generator = QuickGenerator()
         self.bundle = SimpleNamespace(
             layout=LAYOUT,
             faces={"gpt": None},
             generator=generator,
             recommended=SamplingConfig(cfg_scale=1.25, top_p=0.9),
             generate=self.generate,
+            main="body",
+            of=lambda stage: generator,
+            encoder=lambda stage: SimpleNamespace(encode=lambda *_: {}),
+            choose_face=lambda name: None,
+            drawing=lambda sampling: sampling,
+            stages=(),
         )
+
+    def edit(self, clip: GeneratedMotion, task: EditTask, *, seed: int = 0) -> list[EditedMotion]:
+        """As a `MotionModel` does it."""
+        self.edited.append(task)
+        return MotionModel.edit(self, clip, task, seed=seed)  # type: ignore[arg-type]
 
     def examples(self) -> list[str]:
         return ["a person bows"]
@@ -163,3 +191,27 @@ def run_server() -> Callable[..., Any]:
 def quick(walk: Callable[..., Any]) -> QuickModel:
     """The model."""
     return QuickModel(walk)
+
+
+@pytest.fixture
+def visit(browser: Any, until: Callable[..., None], run_server: Any, quick: Any) -> Iterator[Any]:
+    """Opens the page of a server with the quick model; fails if the page complains or asks elsewhere."""
+    trouble: list[str] = []
+    with run_server(quick, max_seconds=6.0) as served:
+        own = f"http://127.0.0.1:{served.port}/"
+        pages = []
+
+        def go(width: int = 1200, height: int = 800) -> Any:
+            page = browser.new_page(viewport={"width": width, "height": height}, accept_downloads=True)
+            page.on("pageerror", lambda error: trouble.append(str(error)))
+            page.on("console", lambda m: trouble.append(m.text) if "Content Security" in m.text else None)
+            page.on("request", lambda r: r.url.startswith((own, "blob:", "data:")) or trouble.append(r.url))
+            page.goto(own)
+            until(page, "document.getElementById('status').textContent.startsWith('quick')")
+            pages.append(page)
+            return page
+
+        yield go
+        for page in pages:
+            page.close()
+    assert not trouble

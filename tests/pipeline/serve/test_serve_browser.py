@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,30 +15,6 @@ pytestmark = pytest.mark.browser
 
 DRAWN = "window.__viewer && window.__viewer.draws > 0"
 SIZES = {"desktop": (1200, 800), "phone": (390, 780)}
-
-
-@pytest.fixture
-def visit(browser: Any, until: Callable[..., None], run_server: Any, quick: Any) -> Iterator[Any]:
-    """Opens the page of a server with the quick model; fails if the page complains or asks elsewhere."""
-    trouble: list[str] = []
-    with run_server(quick, max_seconds=6.0) as served:
-        own = f"http://127.0.0.1:{served.port}/"
-        pages = []
-
-        def go(width: int = 1200, height: int = 800) -> Any:
-            page = browser.new_page(viewport={"width": width, "height": height}, accept_downloads=True)
-            page.on("pageerror", lambda error: trouble.append(str(error)))
-            page.on("console", lambda m: trouble.append(m.text) if "Content Security" in m.text else None)
-            page.on("request", lambda r: r.url.startswith((own, "blob:", "data:")) or trouble.append(r.url))
-            page.goto(own)
-            until(page, "document.getElementById('status').textContent.startsWith('quick')")
-            pages.append(page)
-            return page
-
-        yield go
-        for page in pages:
-            page.close()
-    assert not trouble
 
 
 def tone(seconds: float) -> bytes:

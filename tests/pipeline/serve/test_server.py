@@ -23,9 +23,9 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.generators.whole import WholeMotion
-from motionloom.pipeline.serve import command
-from motionloom.pipeline.serve.command import listen
+from motionloom.pipeline.serve import command, server
 from motionloom.pipeline.serve.requests import ServeConfig
+from motionloom.pipeline.serve.server import listen
 
 WAVE = {"caption": "a person waves", "seconds": 1.0}
 
@@ -81,7 +81,7 @@ def test_info_and_page(served: Any) -> None:
     assert info["limits"]["seconds"] == 5.0 and info["limits"]["waiting"] == 32
     page = served.ask("GET", "/")
     assert page.status == 200 and page.headers["content-type"].startswith("text/html")
-    for name in ("serve.css", "viewer.js", "serve.js"):
+    for name in ("serve.css", "viewer.js", "serve.js", "edit.js", "lanes.js", "figure.js", "task.js"):
         assert served.ask("GET", f"/assets/{name}").status == 200
     policy = page.headers["content-security-policy"]
     assert "default-src 'none'" in policy and "unsafe-inline" not in policy
@@ -323,7 +323,8 @@ def test_a_taken_port_is_one_sentence() -> None:
 def test_without_the_extra_it_says_so(
     monkeypatch: pytest.MonkeyPatch, call: Callable[..., Any], tmp_path: Path
 ) -> None:
-    monkeypatch.delitem(sys.modules, "motionloom.pipeline.serve.command")
+    for name in ("command", "server"):
+        monkeypatch.delitem(sys.modules, f"motionloom.pipeline.serve.{name}")
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     done = call("serve", tmp_path)
     assert done.code == 2 and "serve needs uvicorn: pip install 'motionloom[serve]'" in done.err
@@ -345,7 +346,7 @@ def test_the_command_says_where_and_who_can_reach_it(
 
     monkeypatch.setattr(command.MotionModel, "from_pretrained", lambda *_, **options: quick)
     monkeypatch.setattr(command, "warm", lambda model: None)
-    monkeypatch.setattr(command, "server_of", lambda site, worker: Interrupted())
+    monkeypatch.setattr(server, "server_of", lambda site, worker: Interrupted())
     said = Console(file=io.StringIO(), width=200)
     command.serve(tmp_path, ServeConfig(host=host, port=0), console=said)
     text = said.file.getvalue()  # type: ignore[attr-defined]

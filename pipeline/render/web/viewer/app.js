@@ -32,8 +32,9 @@ function readTheme(root) {
   };
 }
 
+/* `options`: `page`, whether the viewer has a page of its own; `over(ctx, lens, k, frame)`, which draws on top of cell k. */
 function mountViewer(root, data, options) {
-  const page = Boolean(options && options.page);
+  const page = Boolean(options && options.page), over = options && options.over;
   const clips = data.motions.map((raw) => openClip(raw, data.skeletons[raw.skeleton], data.faceStep));
   const sounds = data.sounds || [], scores = data.scores || [];
   clips.forEach((clip, k) => { clip.sound = data.motions[k].sound; clip.score = scores[data.motions[k].score]; });
@@ -148,6 +149,8 @@ function mountViewer(root, data, options) {
     return makeLens(target, camera.yaw, camera.pitch, distance, width, height);
   };
 
+  const lensOfCell = (cell) => lensOf(cell, cell.canvas.clientWidth, cell.canvas.clientHeight);
+
   // ---- drawing
   // Ground, trail and what is written on a cell; sticks too where the stage cannot draw, else what it is to draw.
   const paint = (cell) => {
@@ -178,6 +181,7 @@ function mountViewer(root, data, options) {
   const paintAll = (some) => {
     const items = some.map(paint).filter(Boolean);
     if (items.length) stage.draw(items, (item) => item.ctx.drawImage(stage.canvas, ...item.source, ...item.box));
+    if (over) for (const cell of some) over(cell.ctx, lensOfCell(cell), cells.indexOf(cell), localFrame(cell.clip));
   };
   let before = 0;
   const tick = (now) => {
@@ -301,8 +305,9 @@ function mountViewer(root, data, options) {
     get segment() { return lead && segmentAt(lead.score, localTime(lead)); },
     get view() { return stage && stage.ready ? "webgl" : "2d"; }, stage, pace,
     bones: (k) => [...bonesAt(clips[k], localFrame(clips[k]))], // what moves the mesh now, for checks from outside
-    lens: (k) => lensOf(cells[k], cells[k].canvas.clientWidth, cells[k].canvas.clientHeight),
-    setSpeed, setSound, listen: (k) => follow(clips[k]),
+    lens: (k) => lensOfCell(cells[k]), canvas: (k) => cells[k].canvas, floor: (k) => clips[k].floor,
+    joints: (k, at = localFrame(clips[k])) => jointsAt(clips[k], at),
+    look: (from) => { Object.assign(camera, from); refresh(); }, project, rayThrough, refresh, setSpeed, setSound, listen: (k) => follow(clips[k]),
   };
   window.__viewers = window.__viewers || [];
   window.__viewers.push(handle);

@@ -26,6 +26,12 @@ function makeLens(target, yaw, pitch, distance, width, height) {
   };
 }
 
+/* From the eye through a pixel: the step that goes one metre deep. */
+function rayThrough(lens, x, y) {
+  const right = (x - lens.cx) / lens.focal, up = (lens.cy - y) / lens.focal;
+  return lens.back.map((back, i) => right * lens.right[i] + up * lens.up[i] - back);
+}
+
 /* Pixels x and y, depth in metres, and pixels per metre of a point. */
 function project(lens, p) {
   const d = minus(p, lens.eye), depth = -dot(d, lens.back), s = lens.focal / Math.max(depth, NEAR);

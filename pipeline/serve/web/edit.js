@@ -1,0 +1,218 @@
+/* Changing a motion: the panel below the figure, what it holds, and what it asks of the server. */
+
+import { buildLanes } from "./lanes.js";
+import { figureTools } from "./figure.js";
+import { HANDLES, History, freshState, mark, missing, paceOf, pin, resize, rowsOf, say, taskOf, walk } from "./task.js";
+
+const one = (id) => document.getElementById(id);
+const panel = one("edit"), go = one("edit-go"), why = one("edit-why"), marks = one("edit-marks"), draw = one("edit-draw");
+
+/* The editor of a page. `page` gives `info`, `post(path, body)` and `mount(viewerData, over)`; it is told what can be saved,
+   `savable(asked)`, and when the panel is shut, `closed(viewerData, ref)`. */
+export function makeEditor(page) {
+  const { info } = page, fps = info.fps, rows = info.edit.possible ? rowsOf(info) : [];
+  let clips = [], history = null, draft = null, chosen = null, viewer = null, mounted = null, busy = false, turn = 0, seen = -1;
+  let results = new Map(); // by the state that they are of
+  const state = () => draft || history.now, clipOf = (one) => clips[one.source];
+
+  const style = () => {
+    const of = (name) => getComputedStyle(one("edit-colours")).getPropertyValue(name);
+    return { accent: of("color"), card: of("background-color"), ink: of("border-left-color") };
+  };
+  const tools = figureTools({
+    names: info.joint_names, parents: info.parents, state, style,
+    active: () => history !== null,
+    hold: () => { viewer.play(false); viewer.setFrame(viewer.frame); },
+    drag: (joint, frame, position, done) => change((next) => pin(next, joint, frame, position, fps), done),
+    drew: (points) => {
+      tools.draw(false);
+      if (points) change((next) => { if (!walk(next, Math.min(viewer.frame, next.frames - 10), points)) tell("That path was too short: draw from the figure's feet to where it is to go."); }, true);
+      update();
+    },
+  });
+  const lanes = info.edit.possible ? buildLanes(one("edit-time"), rows, fps, {
+    seek: (frame) => { viewer.play(false); viewer.setFrame(frame); lanes.seek(frame); },
+    mark: (names, from, to, keep, done) => change((next) => mark(next, names, from, to, keep), done),
+    words: (from, to, done) => { chosen = from; change((next) => say(next, from, to, ""), done); if (done) one("edit-say").focus(); },
+    choose: (said) => { chosen = said.from; viewer.setFrame(said.from); update(); one("edit-say").focus(); },
+    cancel: () => { draft = null; update(); },
+  }) : null;
+
+  /* A new state from the one before the gesture; kept in the history when the gesture is done. */
+  function change(how, done) {
+    const next = structuredClone(history.now);
+    how(next);
+    draft = done ? null : next;
+    if (done) history.push(next);
+    update();
+  }
+
+  function tell(words, wrong) {
+    why.textContent = words;
+    why.classList.toggle("serve-wrong", Boolean(wrong));
+  }
+
+  function update() {
+    const now = state(), lack = missing(now, rows, fps), said = now.words.find(({ from }) => from === chosen), result = results.get(history.now);
+    mount(result ? result.answer.viewer : clipOf(now).viewer);
+    lanes.show(now, chosen, viewer.frame);
+    viewer.refresh();
+    one("edit-name").textContent = clipOf(now).name;
+    go.disabled = busy || Boolean(lack);
+    go.textContent = result ? "Try another" : "Make the change";
+    if (!busy) tell(lack || (result ? result.words : ready(now)));
+    one("edit-undo").disabled = busy || !history.canUndo;
+    one("edit-redo").disabled = busy || !history.canRedo;
+    one("edit-on").hidden = !result;
+    page.savable(result ? result.asked : null);
+    draw.setAttribute("aria-pressed", String(tools.drawing));
+    draw.textContent = tools.drawing ? "Do not draw" : now.path ? "Draw another path" : "Draw a path";
+    if (document.activeElement !== one("edit-caption")) one("edit-caption").value = now.caption;
+    if (document.activeElement !== one("edit-seconds")) one("edit-seconds").value = (now.frames / fps).toFixed(1);
+    one("edit-said").hidden = !said;
+    if (said) {
+      one("edit-said-when").textContent = `What happens from ${(said.from / fps).toFixed(1)} to ${(said.to / fps).toFixed(1)} s`;
+      if (document.activeElement !== one("edit-say")) one("edit-say").value = said.text;
+    }
+    marks.replaceChildren(...[...now.pins.map((one) => ({
+      words: `${HANDLES[one.joint].label} at ${(one.frame / fps).toFixed(2)} s`, frame: one.frame,
+      drop: (next) => { next.pins = next.pins.filter(({ joint, frame }) => joint !== one.joint || frame !== one.frame); },
+    })), ...(now.path ? [{ words: pathWords(now), frame: now.path.from, drop: (next) => { next.path = null; } }] : [])].map(chip));
+    marks.hidden = !marks.children.length;
+  }
+  const pathWords = (now) => {
+    const { metres, speed } = paceOf(now, fps);
+    return `path of ${metres.toFixed(1)} m from ${(now.path.from / fps).toFixed(1)} s on, ${speed.toFixed(1)} m/s${speed > 2.2 ? ", a run" : ""}`;
+  };
+  const ready = (now) => `Ready. What is striped is made anew${now.caption.trim() ? `, as “${now.caption.trim()}” says` : ""}.`;
+
+  /* Something that was dragged or drawn: goes to its time, or takes it away. */
+  function chip({ words, frame, drop }) {
+    const node = document.createElement("span"), to = document.createElement("button"), off = document.createElement("button");
+    to.type = off.type = "button";
+    to.textContent = words;
+    off.textContent = "×";
+    off.title = `Take away: ${words}`;
+    off.setAttribute("aria-label", off.title);
+    to.addEventListener("click", () => { viewer.play(false); viewer.setFrame(frame); });
+    off.addEventListener("click", () => change(drop, true));
+    node.append(to, off);
+    return node;
+  }
+
+  function mount(data) {
+    if (data === mounted) return;
+    const camera = viewer && viewer.camera, frame = viewer && viewer.frame;
+    mounted = data;
+    viewer = page.mount(data, (ctx, lens, k, at) => {
+      tools.over(ctx, lens, k, at);
+      if (k === 0 && history && viewer && viewer.frame !== seen) lanes.seek(seen = viewer.frame);
+    });
+    tools.attach(viewer);
+    if (camera) viewer.look(camera);
+    viewer.play(data.motions.length > 1);
+    viewer.setFrame(data.motions.length > 1 ? 0 : frame || Math.floor(data.motions[0].frames / 2));
+  }
+
+  /* Begins with a clip: `{ ref, viewer, frames, caption, face, name }`; `ref` is what the server knows it by. */
+  function open(clip) {
+    clips = [clip];
+    history = new History(freshState(rows, clip, 0));
+    results = new Map();
+    draft = chosen = mounted = viewer = null;
+    turn += 1;
+    busy = panel.hidden = false;
+    document.body.classList.add("serve-editing");
+    window.scrollTo(0, 0);
+    update();
+  }
+  function close() {
+    const { ref } = clipOf(state());
+    tools.draw(false);
+    panel.hidden = true;
+    document.body.classList.remove("serve-editing");
+    history = viewer = null;
+    turn += 1;
+    page.closed({ ...mounted, motions: mounted.motions.slice(-1) }, ref);
+  }
+  /* Goes on from what was made: a state of its own, so that it can be undone. */
+  function goOn() {
+    const now = history.now, { answer } = results.get(now), [, after] = answer.viewer.motions, clip = clipOf(now);
+    const name = clip.name.endsWith(", changed") ? clip.name : `${clip.name}, changed`;
+    clips.push({ ...clip, ref: answer.clip, viewer: { ...answer.viewer, motions: [{ ...after, label: "changed" }] }, frames: after.frames, caption: now.caption, name });
+    draft = chosen = null;
+    history.push(freshState(rows, clips.at(-1), clips.length - 1));
+    update();
+  }
+
+  /* How near a result is to what was asked. */
+  function metBy(report, task) {
+    const far = (what, cm) => `${what} ${cm < 0.05 ? "exactly" : `within ${cm.toFixed(1)} cm`}`, found = [];
+    if (report.kept_cm !== null) found.push(far("what stays is as it was", report.kept_cm));
+    if (report.path_cm !== null) found.push(far("the path is met", report.path_cm));
+    Object.values(report.pins_cm).forEach((cm, k) => found.push(far(`the ${HANDLES[task.pins[k].joint].label} is there`, cm)));
+    return found.length ? sentence(found.join(", ")) : "";
+  }
+  const sentence = (words) => `${words[0].toUpperCase()}${words.slice(1)}.`;
+
+  async function make() {
+    const mine = ++turn, now = history.now, before = results.get(now), seed = before ? before.asked.seed + 1 : 0, clip = clipOf(now);
+    const asked = { clip: clip.ref, task: taskOf(now, rows, fps, clip.face), seed, format: "viewer", request: `edit-${Date.now()}-${turn}` }, began = performance.now();
+    busy = true;
+    update();
+    const clock = setInterval(() => tell(`Working… ${Math.round((performance.now() - began) / 1000)} s`), 1000);
+    tell("Working…");
+    try {
+      const answer = await (await page.post("/api/edit", asked)).json();
+      if (mine !== turn) return;
+      if (answer.request !== asked.request) throw new Error("this answer belongs to another request; try again");
+      const took = ((performance.now() - began) / 1000).toFixed(1);
+      results.set(now, { asked, answer, words: [`Made in ${took} s.`, metBy(answer.report, asked.task), ...answer.notes.map(sentence)].filter(Boolean).join(" ") });
+      busy = false;
+      update();
+    } catch (error) {
+      if (mine !== turn) return;
+      busy = false;
+      update();
+      tell(error.message, true);
+    } finally {
+      clearInterval(clock);
+    }
+  }
+
+  go.addEventListener("click", make);
+  one("edit-close").addEventListener("click", close);
+  one("edit-undo").addEventListener("click", () => { history.undo(); update(); });
+  one("edit-redo").addEventListener("click", () => { history.redo(); update(); });
+  one("edit-none").addEventListener("click", () => change((next) => mark(next, rows.map(({ name }) => name), 0, next.frames, false), true));
+  one("edit-all").addEventListener("click", () => change((next) => Object.assign(next, freshState(rows, clipOf(next), next.source)), true));
+  one("edit-on").addEventListener("click", goOn);
+  draw.addEventListener("click", () => {
+    if (!tools.drawing) { viewer.play(false); viewer.setFrame(Math.min(viewer.frame, Math.max(state().frames - 10, 0))); }
+    tools.draw(!tools.drawing);
+    if (tools.drawing) viewer.canvas(0).scrollIntoView({ block: "nearest" });
+    update();
+  });
+  one("edit-caption").addEventListener("change", () => change((next) => { next.caption = one("edit-caption").value; }, true));
+  one("edit-say").addEventListener("input", () => {
+    draft = structuredClone(state());
+    draft.words.find(({ from }) => from === chosen).text = one("edit-say").value;
+    update();
+  });
+  one("edit-say").addEventListener("change", () => { if (draft) { history.push(draft); draft = null; update(); } });
+  one("edit-unsay").addEventListener("click", () => { draft = null; change((next) => { next.words = next.words.filter(({ from }) => from !== chosen); }, true); });
+  one("edit-seconds").addEventListener("change", () => {
+    const frames = Math.round(Number(one("edit-seconds").value) * fps), most = Math.floor(info.limits.seconds * fps);
+    if (frames >= fps / 2) change((next) => resize(next, Math.min(frames, most)), true); else update();
+  });
+  document.addEventListener("keydown", (event) => {
+    if (panel.hidden || !(event.ctrlKey || event.metaKey) || event.target.matches("input[type=text]")) return;
+    const back = event.key === "z" && !event.shiftKey, forth = event.key === "y" || (event.key.toLowerCase() === "z" && event.shiftKey);
+    if (!back && !forth) return;
+    if (back) history.undo(); else history.redo();
+    update();
+    event.preventDefault();
+  });
+
+  return { open, tell, get opened() { return history !== null; } };
+}

@@ -1,0 +1,189 @@
+/* What is drawn over the figure and dragged there: joints to be somewhere, and a path over the floor. */
+
+import { HANDLES, placeAt } from "./task.js";
+
+const DOT = 7, GRASP = { mouse: 14, touch: 26 }; // pixels: a dot's radius, and how near to it a pointer takes hold
+const CEILING = 2.9;
+
+/* Where the middle joint of a limb goes when its end is drawn to `goal`, by the lengths of its two bones. */
+function bend(start, middle, end, goal) {
+  const minus = (a, b) => a.map((v, i) => v - b[i]), size = (a) => Math.hypot(...a), dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
+  const upper = size(minus(middle, start)), lower = size(minus(end, middle)), line = minus(goal, start);
+  const reach = Math.min(Math.max(size(line), Math.abs(upper - lower) + 1e-3), upper + lower - 1e-4);
+  const along = line.map((v) => v / (size(line) || 1)), bone = minus(middle, start);
+  const side = minus(bone, along.map((v) => v * dot(bone, along))), width = size(side) || 1;
+  const x = (reach * reach + upper * upper - lower * lower) / (2 * reach), y = Math.sqrt(Math.max(upper * upper - x * x, 0));
+  return { middle: start.map((v, i) => v + along[i] * x + (side[i] / width) * y), end: start.map((v, i) => v + along[i] * reach) };
+}
+
+/* Tools on the first figure of a viewer.
+
+   `host` gives `state()`, `names` and `parents` of the joints, and takes `drag(joint, frame, position, done)`,
+   `drew(points, done)` and `hold()`, which stops the motion. */
+export function figureTools(host) {
+  const joint = (name) => host.names.indexOf(name), handles = Object.keys(HANDLES).filter((name) => joint(name) >= 0);
+  let viewer = null, held = null, near = null, drawing = null;
+
+  const onFloor = ([x, z], level) => [x, level, z];
+  const placeOf = (joints, j) => [joints[3 * j], joints[3 * j + 1], joints[3 * j + 2]];
+  const frame = () => Math.min(viewer.frame, host.state().clip - 1);
+  const pinned = (name, at) => host.state().pins.find((pin) => pin.joint === name && pin.frame === at);
+  const now = (name) => { const found = pinned(name, frame()); return found ? found.position : placeOf(viewer.joints(0), joint(name)); };
+  const pixel = (event) => { const box = viewer.canvas(0).getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+  const pointAt = (lens, [x, y], depth) => viewer.rayThrough(lens, x, y).map((v, i) => lens.eye[i] + depth * v);
+  const handleAt = (event) => {
+    const [x, y] = pixel(event), lens = viewer.lens(0);
+    const far = handles.map((name) => { const p = viewer.project(lens, now(name)); return [Math.hypot(p[0] - x, p[1] - y), name]; }).sort((a, b) => a[0] - b[0])[0];
+    return far && far[0] < GRASP[event.pointerType === "touch" ? "touch" : "mouse"] ? far[1] : null;
+  };
+  const floorAt = (event) => {
+    const lens = viewer.lens(0), ray = viewer.rayThrough(lens, ...pixel(event)), depth = (viewer.floor(0) - lens.eye[1]) / ray[1];
+    if (!(depth > 0) || depth > 40) return null; // above the horizon
+    return [0, 2].map((i) => lens.eye[i] + depth * ray[i]);
+  };
+
+  function press(event) {
+    if (event.button || held || !host.active()) return;
+    if (drawing) {
+      const place = floorAt(event);
+      if (!place) return;
+      const root = placeOf(viewer.joints(0, frame()), 0);
+      held = { points: [[root[0], root[2]], place] };
+    } else {
+      const name = handleAt(event);
+      if (!name) return;
+      held = { name, frame: frame(), depth: viewer.project(viewer.lens(0), now(name))[2], moved: false };
+    }
+    host.hold();
+    viewer.canvas(0).setPointerCapture(event.pointerId);
+    event.stopImmediatePropagation();
+    event.preventDefault();
+  }
+  function move(event) {
+    if (!held) {
+      const over = host.active() && !drawing && event.pointerType === "mouse" && !event.buttons ? handleAt(event) : null;
+      if (over !== near) { near = over; viewer.refresh(); }
+      viewer.canvas(0).classList.toggle("edit-near", Boolean(near));
+      return;
+    }
+    event.stopImmediatePropagation();
+    if (held.points) {
+      const place = floorAt(event);
+      if (place) held.points.push(place);
+    } else {
+      held.moved = true;
+      held.position = pointAt(viewer.lens(0), pixel(event), held.depth);
+      held.position[1] = Math.min(Math.max(held.position[1], viewer.floor(0)), CEILING);
+      host.drag(held.name, held.frame, held.position, false);
+    }
+    viewer.refresh();
+  }
+  function release(event) {
+    if (!held) return;
+    event.stopImmediatePropagation();
+    const was = held;
+    held = null;
+    if (was.points) host.drew(event.type === "pointerup" ? was.points : null);
+    else if (was.moved) host.drag(was.name, was.frame, was.position, true);
+    viewer.refresh();
+  }
+
+  /* Listens before the viewer does, which turns the camera by the same gestures. */
+  function attach(shown) {
+    viewer = shown;
+    held = near = drawing = null;
+    const canvas = viewer.canvas(0), first = { capture: true };
+    canvas.addEventListener("pointerdown", press, first);
+    canvas.addEventListener("pointermove", move, first);
+    for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, release, first);
+  }
+
+  /* Looks down while a path is drawn. */
+  function draw(on) {
+    if (Boolean(drawing) === on) return;
+    if (on) {
+      drawing = viewer.camera;
+      viewer.look({ pitch: 1.1, zoom: 0.5, panX: 0, panY: 0 });
+    } else {
+      viewer.look(drawing);
+      drawing = null;
+    }
+    viewer.canvas(0).classList.toggle("edit-drawing", on);
+  }
+
+  // ---- drawing
+  function drawPath(ctx, lens, points, level, colour) {
+    const seen = points.map((point) => viewer.project(lens, onFloor(point, level))).filter((p) => p[2] > 0.2);
+    if (seen.length < 2) return;
+    ctx.strokeStyle = ctx.fillStyle = colour;
+    ctx.lineJoin = ctx.lineCap = "round";
+    ctx.lineWidth = 4;
+    ctx.beginPath();
+    for (const [x, y] of seen) ctx.lineTo(x, y);
+    ctx.stroke();
+    const [x, y] = seen.at(-1), [u, v] = seen[Math.max(seen.length - 4, 0)], angle = Math.atan2(y - v, x - u);
+    ctx.beginPath();
+    for (const side of [0, 2.5, -2.5]) ctx.lineTo(x + 13 * Math.cos(angle + side), y + 13 * Math.sin(angle + side));
+    ctx.fill();
+  }
+  function dot(ctx, [x, y], radius, fill, stroke) {
+    ctx.beginPath();
+    ctx.arc(x, y, radius, 0, 2 * Math.PI);
+    ctx.fillStyle = fill;
+    ctx.strokeStyle = stroke;
+    ctx.lineWidth = 2.5;
+    ctx.fill();
+    ctx.stroke();
+  }
+  function label(ctx, [x, y], words, style) {
+    ctx.font = "600 12.5px system-ui, sans-serif";
+    const wide = ctx.measureText(words).width, left = Math.min(Math.max(x + 13, 4), ctx.canvas.clientWidth - wide - 12);
+    ctx.fillStyle = style.card;
+    ctx.globalAlpha = 0.9;
+    ctx.beginPath();
+    ctx.roundRect(left - 5, y - 10, wide + 10, 20, 6);
+    ctx.fill();
+    ctx.globalAlpha = 1;
+    ctx.fillStyle = style.ink;
+    ctx.fillText(words, left, y + 4.5);
+  }
+  /* The limb as it would be, where a joint is drawn away. */
+  function drawLimb(ctx, lens, joints, name, goal, colour) {
+    const end = joint(name), middle = host.parents[end], start = host.parents[middle];
+    const limb = /wrist|ankle/.test(name) ? bend(...[start, middle, end].map((j) => placeOf(joints, j)), goal) : null;
+    const line = limb ? [placeOf(joints, start), limb.middle, limb.end] : [placeOf(joints, end), goal];
+    ctx.strokeStyle = colour;
+    ctx.lineCap = ctx.lineJoin = "round";
+    ctx.lineWidth = 9;
+    ctx.globalAlpha = 0.45;
+    ctx.beginPath();
+    for (const p of line) { const [x, y] = viewer.project(lens, p); ctx.lineTo(x, y); }
+    ctx.stroke();
+    ctx.globalAlpha = 1;
+  }
+
+  /* Over the clip's figure: dots to drag and what was dragged. Over the result's: what it was to meet. */
+  function over(ctx, lens, k, at) {
+    if (!viewer || !host.active()) return;
+    const state = host.state(), style = host.style(), level = viewer.floor(k), own = Math.round(at), joints = viewer.joints(k);
+    const path = held && held.points ? held.points : state.path && state.path.points;
+    if (path) {
+      drawPath(ctx, lens, path, level, style.accent);
+      if (state.path && !held && own >= state.path.from) dot(ctx, viewer.project(lens, onFloor(placeAt(state, own), level)), 5, style.card, style.accent);
+    }
+    for (const { joint: name, frame: when, position } of state.pins) {
+      if (when !== own) continue;
+      if (k === 0) drawLimb(ctx, lens, joints, name, position, style.accent);
+      dot(ctx, viewer.project(lens, position), DOT + 2, k ? "transparent" : style.accent, style.accent);
+    }
+    if (drawing && !held && k === 0) label(ctx, [2, 54], "Draw on the floor, from the feet on", style);
+    if (k || drawing || viewer.playing) return;
+    for (const name of handles) {
+      const place = viewer.project(lens, now(name)), taken = pinned(name, own);
+      if (!taken) dot(ctx, place, name === near ? DOT + 2 : DOT, style.card, style.accent);
+      if (name === near || (held && held.name === name)) label(ctx, place, HANDLES[name].label, style);
+    }
+  }
+
+  return { attach, draw, over, get drawing() { return Boolean(drawing); } };
+}

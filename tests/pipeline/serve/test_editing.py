@@ -1,0 +1,117 @@
+"""Changing clips over HTTP: what is made, what is kept for later, and what is refused."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+WALK = {"caption": "a person walks", "seconds": 2.0, "seed": 4}
+ARM = {
+    "keep": [{"parts": ["all"], "but": ["left_arm", "left_hand"]}],
+    "pins": [{"at": 1.0, "joint": "left_wrist", "position": [0.75, 1.2, 1.1]}],
+}
+
+
+@pytest.fixture
+def served(run_server: Callable[..., Any], quick: Any) -> Iterator[Any]:
+    with run_server(quick, max_seconds=5.0, max_clip_mb=0.5, max_caption=40, clips=3) as made:
+        yield made
+
+
+def npz(joints: Any, fps: float = 20.0) -> bytes:
+    out = io.BytesIO()
+    np.savez(out, joints=joints, metadata=np.array(json.dumps({"fps": fps, "caption": "a walk"})))
+    return out.getvalue()
+
+
+def test_a_motion_that_was_generated_is_changed(served: Any, quick: Any) -> None:
+    said = served.post("/api/edit", {"clip": WALK, "task": ARM, "request": "mine"}).json
+    joints, wrist = np.array(said["joints"]), said["joint_names"].index("left_wrist")
+    assert said["request"] == "mine" and said["frames"] == len(joints) == 40
+    assert np.linalg.norm(joints[20, wrist] - [0.75, 1.2, 1.1]) < 0.03, (
+        "the shown figure is there, within its fit"
+    )
+    assert said["report"]["pins_cm"] == {"left_wrist at 1.00 s": pytest.approx(0.0, abs=0.01)}
+    assert said["report"]["path_cm"] is None, "nothing was asked of it"
+    cells = served.post("/api/edit", {"clip": WALK, "task": ARM, "format": "viewer"}).json["viewer"][
+        "motions"
+    ]
+    assert [cell["label"] for cell in cells] == ["before", "after"]
+    bvh = served.post("/api/edit", {"clip": WALK, "task": ARM, "format": "bvh"})
+    assert bvh.body.startswith(b"HIERARCHY") and ".bvh" in bvh.headers["content-disposition"]
+    assert len(quick.edited) == 1 and quick.asked == ["a person walks"], "made once, and answered three times"
+    on = served.post("/api/edit", {"clip": said["clip"], "task": {"seconds": 3.0}}).json
+    assert on["frames"] == 60, "a result is a clip of its own"
+
+
+def test_a_file_is_read_and_changed(served: Any, walk: Callable[..., Any]) -> None:
+    said = served.ask("POST", "/api/clips", npz(walk(61, 30.0)[:, :22], 30.0)).json
+    assert said["frames"] == pytest.approx(40, abs=1) and said["viewer"]["motions"][0]["joints"] == 52
+    assert said["caption"] == "a walk" and "30 frames/s" in said["notes"][0]
+    wave = served.post("/api/edit", {"clip": said["clip"], "task": ARM, "format": "bvh"}).body
+    read = served.ask("POST", "/api/clips", wave).json
+    assert read["frames"] == pytest.approx(said["frames"], abs=1) and read["clip"] != said["clip"]
+
+
+@pytest.mark.parametrize(
+    ("clip", "task", "words"),
+    [
+        ("gone", ARM, "the clip is not here any more; send it again"),
+        (WALK, {"keep": [{"parts": ["foot"]}]}, "'all', 'upper', 'lower'"),
+        (WALK, {"kept": []}, "unknown key 'task.kept'; did you mean 'keep'?"),
+        (WALK, {}, "nothing of the clip is kept"),
+        (WALK, {"seconds": 5.5}, "5.5 s were asked for; this server makes at most 5 s"),
+        (WALK, {"words": [{"start": 0, "end": 1, "text": "w" * 41}]}, "a caption has 41 letters"),
+        (WALK, {"pins": [{"at": 1, "joint": "tail", "position": [0, 1, 0]}]}, "no joint 'tail'"),
+        (WALK, {"pins": [{"at": 1, "joint": "head", "position": [0, 9, 0]}]}, "9 m above the floor"),
+        (WALK, {"path": [{"at": 0, "x": 0, "z": 0}, {"at": 1, "x": 60, "z": 0}]}, "nobody runs faster"),
+        ({"caption": " "}, ARM, "caption is empty"),
+        ({**WALK, "seconds": 9}, ARM, "9 s were asked for"),
+        (3, ARM, "clip"),
+    ],
+)
+def test_what_cannot_be_done_is_one_sentence(served: Any, clip: Any, task: Any, words: str) -> None:
+    got = served.post("/api/edit", {"clip": clip, "task": task, "request": "mine"})
+    assert got.status == 400 and words in got.json["error"] and got.json["request"] == "mine"
+
+
+@pytest.mark.parametrize(
+    ("data", "status", "words"),
+    [
+        (b"", 400, "the clip: empty (0 bytes)"),
+        (b"PK\x03\x04 no archive", 400, "the clip: "),
+        (b"glTF\x02\x00\x00\x00", 400, "the clip: "),
+        (b"HIERARCHY\nROOT hips {", 400, "the clip: "),
+        (b"a person walks", 400, "the clip: "),
+        (npz(np.zeros((3, 22, 3))), 400, "3 frames are no motion"),
+        (npz(np.zeros((40, 7, 3))), 400, "[40, 7, 3], wanted [T, 22 or 52, 3]"),
+        (npz(np.full((40, 22, 3), np.nan)), 400, "the clip: "),
+        (bytes(600_000), 413, "the clip is larger than this server takes: at most 524288 bytes"),
+    ],
+)
+def test_what_is_no_clip(served: Any, data: bytes, status: int, words: str) -> None:
+    got = served.ask("POST", "/api/clips", data)
+    assert got.status == status and words in got.json["error"] and "/tmp" not in got.json["error"]
+
+
+def test_a_clip_that_is_too_long(served: Any, walk: Callable[..., Any]) -> None:
+    got = served.ask("POST", "/api/clips", npz(walk(110)[:, :22]))
+    assert got.status == 400 and got.json["error"] == "the clip lasts 6 s; this server takes at most 5 s"
+
+
+def test_a_model_that_makes_whole_motions_says_so(run_server: Callable[..., Any], quick: Any) -> None:
+    quick.bundle.generator = SimpleNamespace(modalities=quick.modalities, settings=frozenset())
+    with run_server(quick) as served:
+        edit = served.ask("GET", "/api/info").json["edit"]
+        assert edit["possible"] is False and "makes motions and changes none" in edit["why"]
+        for got in (
+            served.post("/api/edit", {"clip": WALK, "task": ARM}),
+            served.ask("POST", "/api/clips", b"HIERARCHY"),
+        ):
+            assert got.status == 400 and got.json["error"] == edit["why"]
