@@ -145,12 +145,15 @@ export function makeEditor(page) {
     update();
   }
 
-  /* How near a result is to what was asked. */
-  function metBy(report, task) {
+  /* How near a result is to what was asked; joints as they are shown, since the figure that is shown keeps its bones' lengths. */
+  function metBy(report, { pins }) {
     const far = (what, cm) => `${what} ${cm < 0.05 ? "exactly" : `within ${cm.toFixed(1)} cm`}`, found = [];
     if (report.kept_cm !== null) found.push(far("what stays is as it was", report.kept_cm));
     if (report.path_cm !== null) found.push(far("the path is met", report.path_cm));
-    Object.values(report.pins_cm).forEach((cm, k) => found.push(far(`the ${HANDLES[task.pins[k].joint].label} is there`, cm)));
+    for (const { joint, frame, position } of pins) {
+      const at = 3 * info.joint_names.indexOf(joint), place = viewer.joints(1, frame).subarray(at, at + 3);
+      found.push(far(`the ${HANDLES[joint].label} is there`, 100 * Math.hypot(...position.map((v, i) => v - place[i]))));
+    }
     return found.length ? sentence(found.join(", ")) : "";
   }
   const sentence = (words) => `${words[0].toUpperCase()}${words.slice(1)}.`;
@@ -167,8 +170,11 @@ export function makeEditor(page) {
       if (mine !== turn) return;
       if (answer.request !== asked.request) throw new Error("this answer belongs to another request; try again");
       const took = ((performance.now() - began) / 1000).toFixed(1);
-      results.set(now, { asked, answer, words: [`Made in ${took} s.`, metBy(answer.report, asked.task), ...answer.notes.map(sentence)].filter(Boolean).join(" ") });
+      const result = { asked, answer, words: "" };
+      results.set(now, result);
       busy = false;
+      update();
+      result.words = [`Made in ${took} s.`, history.now === now ? metBy(answer.report, now) : "", ...answer.notes.map(sentence)].filter(Boolean).join(" ");
       update();
     } catch (error) {
       if (mine !== turn) return;
