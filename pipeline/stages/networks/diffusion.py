@@ -67,11 +67,10 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
 
     def release(self, net: MotionDiffusion) -> Release | None:
         """MDM's `trans_enc`."""
-        return (
-            None
-            if net.config.norm == "pre" or net.config.observed
-            else Release(mdm_names(net), unread=("*.pe", "clip_model.*"))
-        )
+        config = net.config
+        if config.norm == "pre" or config.observed or config.quieted:
+            return None
+        return Release(mdm_names(net), unread=("*.pe", "clip_model.*"))
 
     def module(
         self, config: DiffusionStageConfig, net: MotionDiffusion, inputs: CaptionInputs, seed: int
