@@ -329,7 +329,8 @@ class SkipTransformer(Transformer):
     ) -> Tensor:
         """As the base class; all frames at once, so without a cache."""
         given = (_to_heads(mask), causal, None, memory, _to_heads(memory_mask))
-        half, kept = len(self.merge), list[Tensor]()
+        half = len(self.merge)
+        kept: list[Tensor] = []  # `list[Tensor]()` is none of torch.compile's words
         for index, block in enumerate(self.blocks):
             if index > half:
                 x = self.merge[index - half - 1](torch.cat([x, kept.pop()], dim=-1))
