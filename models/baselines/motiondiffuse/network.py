@@ -40,7 +40,9 @@ class CaptionConfig(StackConfig):
 
 
 class MotionDiffuseConfig(StackConfig):
-    """Sizes; the defaults are the paper's."""
+    """Sizes; the defaults are the paper's. Noise passes only through networks as wide as there are columns:
+    narrower ones need `schedule: {betas: linear, predicts: sample}` [ours].
+    """
 
     dim: int = Field(default=512, ge=2, multiple_of=2)
     layers: int = Field(default=8, ge=1)
