@@ -159,7 +159,10 @@ TABLES = {
     ),
 }  # fmt: skip
 SEEDS = (7, 8, 9)
-COMMANDS = dict.fromkeys(("dances", "dance_texts"), "motionloom run ude-dance")
+COMMANDS = dict.fromkeys(("dances", "dance_texts"), "motionloom run ude-dance") | {
+    "edit": "python benchmarks/edit.py inbetween --write",
+    "edit_real": "python benchmarks/edit.py inbetween --write --name edit_real --real *.bvh",
+}
 
 
 def collect(run: Path) -> None:

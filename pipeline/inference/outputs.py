@@ -40,6 +40,7 @@ def write_motions(
     seed: int,
     scores: Sequence[Score] | None = None,
     names: Sequence[str] | None = None,
+    labels: Sequence[str] | None = None,
     figure: FigureOptions | None = None,
     say: Callable[[str], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -48,7 +49,8 @@ def write_motions(
 
     What was written there before is removed. `title` and `note` are the page's. `scores`, one for each
     motion: sound for the film and the page, beats and segments for the page. Without them each motion comes
-    with what drove it. `names` are what files are called after, instead of the captions. `figure` says how
+    with what drove it. `names` are what files are called after, instead of the captions; `labels` are what
+    the page says above each. `figure` says how
     the shown figure follows the generated joints, and `say` is given a line on each motion that it is far
     from.
     `progress` is called with frames done and all frames of a film.
@@ -69,7 +71,8 @@ def write_motions(
     names = [motion.caption for motion in motions] if names is None else names
     for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
         name = file_stem(number, names[number])
-        clips.append(OutputClip(shown(motion, options), score, options, seed, arkit="arkit" in formats))
+        label = "generated" if labels is None else labels[number]
+        clips.append(OutputClip(shown(motion, options), score, options, seed, label, "arkit" in formats))
         if say is not None and (remark := clips[-1].shown.remark):
             say(f"{name}: {remark}")
         for _, writer in writers:

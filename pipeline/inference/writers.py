@@ -35,6 +35,8 @@ class OutputClip:
     score: Score
     options: FigureOptions
     seed: int | None = None
+    label: str = "generated"
+    """What the page says above it."""
     arkit: bool = False
     """Whether GLB files carry ARKit's 52 shapes of the face, instead of the synthetic source's own."""
 
@@ -140,7 +142,7 @@ def write_html(path: Path, outputs: Outputs) -> None:
     """The viewer page with all motions."""
     from motionloom.pipeline.render.viewer import write_viewer
 
-    write_viewer(path, [cell_of(clip) for clip in outputs.clips], outputs.title, outputs.note)
+    write_viewer(path, [cell_of(clip, clip.label) for clip in outputs.clips], outputs.title, outputs.note)
 
 
 def write_mp4(path: Path, outputs: Outputs) -> None:

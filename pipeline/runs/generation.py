@@ -69,6 +69,19 @@ def _print_note(console: Console, note: object) -> None:
     console.print(f"note: {note}", style="yellow", markup=False, highlight=False, soft_wrap=True)
 
 
+def formats_of(formats: str | None) -> list[str]:
+    """The formats of `--format`, in its words; the default ones without."""
+    wanted = default_formats()
+    if formats is not None:
+        wanted = [name.strip() for name in formats.split(",") if name.strip()]
+    for name in wanted:
+        if name not in WRITERS:
+            raise UserError(f"--format {name}: no such format{nearest(name, list(WRITERS))}")
+    if not wanted:
+        raise UserError(f"--format {formats!r} names no format; known: {', '.join(WRITERS)}")
+    return wanted
+
+
 def generate_motions(
     folder: Path,
     captions: Sequence[str] = (),
@@ -100,14 +113,7 @@ def generate_motions(
     _require_driver(captions, face, audio, script, seconds)
     if samples < 1:
         raise UserError(f"--samples {samples}: take 1 or more")
-    wanted = default_formats()
-    if formats is not None:
-        wanted = [name.strip() for name in formats.split(",") if name.strip()]
-    for name in wanted:
-        if name not in WRITERS:
-            raise UserError(f"--format {name}: no such format{nearest(name, list(WRITERS))}")
-    if not wanted:
-        raise UserError(f"--format {formats!r} names no format; known: {', '.join(WRITERS)}")
+    wanted = formats_of(formats)
     # All that needs no model is checked before one is opened.
     require_words(caption_list(captions))
     require_seed(seed)

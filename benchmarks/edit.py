@@ -1,0 +1,248 @@
+"""How well clips are edited: gaps filled, paths and pins met, beside what needs no model.
+
+    python benchmarks/edit.py inbetween --write
+    python benchmarks/edit.py inbetween --real clips/*.bvh --name edit_real
+
+Test clips are made here, from the data settings of the recipe, or are BVH files. Of each the middle 40 % is
+taken away and made again: by the model, along straight lines, along splines through all that is kept, and as
+the training clip whose figure is nearest at both ends of the gap, laid between them. Then the model fills the
+same gap with the left wrist pinned in its middle, and goes a bent path with nothing kept, with the pull of
+several strengths and without the last exact step, so that its price shows.
+
+Seeds are those of the drawing; of the training there is one. `--write` makes the record that
+`docs/results.md` shows, and the card of a shipped model, whose figures are these.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from model_card import digests, test_clips, truth_from
+from numpy.typing import NDArray
+from results import RECORDS, read_records, table_of, write
+from rich.console import Console
+
+from motionloom.datasets.motion.body.landing import eased, landed
+from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.canonical import ground, heading, resample
+from motionloom.datasets.motion.features.joints import local_joints_of
+from motionloom.datasets.schema import UserError
+from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
+from motionloom.models.metrics.dance import foot_skating
+from motionloom.models.metrics.editing import accelerations, seam_acceleration
+from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.edits.clips import read_clip
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
+from motionloom.pipeline.inference.model import MotionModel, edit_clip
+from motionloom.pipeline.inference.motion import EditedMotion
+from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
+from motionloom.pipeline.runs.recipe import load_recipe
+
+RECIPE = "humantomato-inbetween"
+TRAINING = 300
+"""Training clips among which the nearest is looked for."""
+GAP = (0.3, 0.7)
+SEEDS = (0, 1, 2)
+STRENGTHS = (0.0, 1.0, 5.0)
+CARD = Path(__file__).with_name("edit_card.md")
+COLUMNS = [
+    {"title": "from the recording, cm", "figure": "away", "digits": 1, "scale": 1.0},
+    {"title": "acceleration at the seams, m/s²", "figure": "seams", "digits": 1, "scale": 1.0},
+    {"title": "acceleration inside, m/s²", "figure": "inside", "digits": 1, "scale": 1.0},
+    {"title": "feet slide, % of steps", "figure": "skating", "digits": 0, "scale": 100.0},
+    {"title": "pin missed by, cm", "figure": "pin", "digits": 1, "scale": 1.0},
+    {"title": "path missed by, cm", "figure": "path", "digits": 1, "scale": 1.0},
+]
+Joints = NDArray[np.float64]
+
+
+def measured(joints: Joints, clip: Joints, fps: float, gap: slice) -> dict[str, float]:
+    """Figures of a filled gap, beside the clip as it was."""
+    seams = np.array([gap.start - 1, gap.stop - 1])
+    return {
+        "away": 100 * float(np.linalg.norm(joints[gap] - clip[gap], axis=-1).mean()),
+        "seams": seam_acceleration(joints, fps, seams),
+        "inside": float(accelerations(joints, fps)[gap.start + 2 : gap.stop - 4].mean()),
+        "skating": foot_skating(joints[max(0, gap.start - 2) : gap.stop + 2], fps),
+    }
+
+
+def straight(clip: Joints, gap: slice) -> Joints:
+    out = clip.copy()
+    share = np.linspace(0, 1, gap.stop - gap.start + 2)[1:-1, None, None]
+    out[gap] = clip[gap.start - 1] * (1 - share) + clip[gap.stop] * share
+    return out
+
+
+def splined(clip: Joints, gap: slice) -> Joints:
+    from scipy.interpolate import CubicSpline
+
+    frames = np.r_[0 : gap.start, gap.stop : len(clip)]
+    out = clip.copy()
+    out[gap] = CubicSpline(frames, clip[frames])(np.arange(gap.start, gap.stop))
+    return out
+
+
+def nearest(clip: Joints, gap: slice, fps: float, training: Sequence[Joints]) -> Joints:
+    """The stretch of a training clip whose figure is nearest to the clip's at both ends, laid between."""
+    size = gap.stop - gap.start + 1
+    ends = local_joints_of(clip, fps)[[gap.start - 1, gap.stop]]
+    best = (np.inf, clip)
+    for other in training:
+        local = local_joints_of(other, fps)
+        if len(local) > size:
+            off = np.linalg.norm(local[:-size] - ends[0], axis=-1).mean(1)
+            off += np.linalg.norm(local[size:] - ends[1], axis=-1).mean(1)
+            start = int(off.argmin())
+            if off[start] < best[0]:
+                best = (float(off[start]), other[start : start + size + 1])
+    found = best[1]
+    known = np.zeros(size + 1, dtype=bool)
+    known[[0, -1]] = True
+    angle, place = heading(found, fps), ground(found[:, 0])
+    wanted, there = heading(clip, fps), ground(clip[:, 0])
+    turn, move = np.zeros(size + 1), np.zeros(size + 1, dtype=np.complex128)
+    turn[[0, -1]] = wanted[[gap.start - 1, gap.stop]] - angle[[0, -1]]
+    move[[0, -1]] = there[[gap.start - 1, gap.stop]] - place[[0, -1]]
+    out = clip.copy()
+    laid, _ = landed(found, angle, eased(move, known), eased(turn, known))
+    out[gap] = laid[1:-1]
+    return out
+
+
+def edited(model: MotionModel, clip: RecordedClip, seed: int, task: dict[str, object]) -> EditedMotion:
+    asked = EditTask.parse(task, "task")
+    [made] = edit_clip(model.bundle, clip, asked, samples=1, seed=seed, sampling=SamplingConfig())
+    return made
+
+
+def tasks_of(clip: Joints, fps: float, gap: slice) -> tuple[dict[str, object], dict[str, object]]:
+    """A pin in the middle of the gap, a hand's breadth from where the wrist was; and a bent path."""
+    keep = [{"end": gap.start / fps}, {"start": gap.stop / fps}]
+    middle, last = (gap.start + gap.stop) // 2, (len(clip) - 1) / fps
+    aim = clip[middle, 20] + [0.05, 0.1, 0.1]
+    pin = {"at": middle / fps, "joint": "left_wrist", "position": [float(value) for value in aim]}
+    start = clip[0, 0]
+    path = [
+        {"at": last * share, "x": float(start[0] + x), "z": float(start[2] + z)}
+        for share, x, z in ((0.0, 0.0, 0.0), (0.5, 0.2, 0.6), (1.0, 0.8, 0.9))
+    ]
+    return {"keep": keep, "pins": [pin]}, {"path": path, "caption": "a person walks forward"}
+
+
+def asked_of(clip: Joints, fps: float, gap: slice) -> dict[str, dict[str, object]]:
+    """What the model is asked for, by the row's title."""
+    pin, path = tasks_of(clip, fps, gap)
+    out = {"**the model**": {"keep": pin["keep"]}}
+    for strength in STRENGTHS:
+        loose = {"strength": strength, "exact": False}
+        out[f"pinned, pull {strength:g}"] = pin | loose
+        out[f"on a path, pull {strength:g}"] = path | loose
+    return out | {"pinned, exact at the end": pin, "on a path, exact at the end": path}
+
+
+def figures_of(made: EditedMotion, clip: Joints, fps: float, gap: slice) -> dict[str, float]:
+    figures = measured(made.joints, clip, fps, gap)
+    if np.isfinite(made.report.path_cm):  # nothing is kept, so there is no gap
+        return {"skating": made.report.skating, "inside": figures["inside"], "path": made.report.path_cm}
+    pins = list(made.report.pins_cm.values())
+    return figures | ({"pin": float(np.mean(pins))} if pins else {})
+
+
+def rows_of(
+    model: MotionModel, clips: Sequence[RecordedClip], training: Sequence[Joints], console: Console
+) -> list[dict[str, object]]:
+    """The rows of the record: of the model one value a seed, its mean over the clips."""
+    fps = model.fps
+    rivals: dict[str, Callable[[Joints, slice], Joints]] = {
+        "recorded": lambda clip, gap: clip,
+        "straight lines": straight,
+        "splines": splined,
+        f"nearest of {TRAINING} training clips": lambda clip, gap: nearest(clip, gap, fps, training),
+    }
+    found: dict[str, dict[int, list[dict[str, float]]]] = {}
+    for number, clip in enumerate(clips, start=1):
+        gap = slice(*(round(share * len(clip.joints)) for share in GAP))
+        for title, rival in rivals.items():
+            filled = measured(rival(clip.joints, gap), clip.joints, fps, gap)
+            found.setdefault(title, {}).setdefault(SEEDS[0], []).append(filled)
+        for title, task in asked_of(clip.joints, fps, gap).items():
+            for seed in SEEDS:
+                figures = figures_of(edited(model, clip, seed, task), clip.joints, fps, gap)
+                found.setdefault(title, {}).setdefault(seed, []).append(figures)
+        console.print(f"{number} of {len(clips)}", highlight=False)
+    rows: list[dict[str, object]] = []
+    for title, runs in found.items():
+        names = [str(column["figure"]) for column in COLUMNS if column["figure"] in runs[SEEDS[0]][0]]
+        cells = {
+            name: [float(np.mean([one[name] for one in run])) for run in runs.values()] for name in names
+        }
+        rows.append({"title": title, "cells": cells, "seeds": list(runs), "protocol": {"clips": len(clips)}})
+    return rows
+
+
+def on_the_floor(clip: RecordedClip, fps: float) -> RecordedClip:
+    """At the model's frame rate, the floor at height 0, with hands at rest where it has none."""
+    joints = resample(clip.joints, clip.fps, fps)
+    joints = joints if clip.has_hands else with_resting_hands(joints)
+    joints[..., 1] -= joints[..., 1].min()
+    return RecordedClip(clip.name, joints, fps, clip.face)
+
+
+def training_of(config: SynthConfig, count: int) -> list[Joints]:
+    train = [index for index in range(config.clips) if split_of(index, config) == "train"]
+    chosen = np.random.default_rng(0).permutation(len(train))[:count]
+    return [truth_from(make_sample(train[k], config), config).joints for k in chosen]
+
+
+def write_card(model: Path, title: str, description: str, clips: int) -> None:
+    """The card of a shipped model, from the records."""
+    records = read_records()
+    size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
+    tables = "\n\n".join(table_of(records[name]) for name in ("edit", "edit_real") if name in records)
+    sums = "\n".join(f"    {value}  {name}" for name, value in digests(model).items())
+    text = CARD.read_text(encoding="utf-8").format(
+        description=description, bytes=size, tables=tables, recipe=RECIPE, clips=clips, digests=sums
+    )
+    (model / "README.md").write_text(text, encoding="utf-8")
+    facts = {"name": title, "description": description, "recipe": RECIPE}
+    (model / CARD_FIGURES).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("model", type=Path, help="an exported folder, or the name of a model of the package")
+    parser.add_argument("--real", nargs="+", type=Path, help="BVH files, in place of synthetic test clips")
+    parser.add_argument("--clips", type=int, default=10, help="synthetic test clips")
+    parser.add_argument("--name", default="edit", help="of the record")
+    parser.add_argument("--write", action="store_true", help="write the record, and the model's card")
+    args = parser.parse_args()
+    model, console = MotionModel(args.model, "cpu"), Console()
+    recipe = load_recipe(RECIPE)
+    truths, config = test_clips(recipe, args.clips)
+    clips = [RecordedClip(truth.id, truth.joints, model.fps, truth.face) for truth in truths]
+    if args.real:
+        clips = [read_clip(path) for path in args.real]
+    clips = [on_the_floor(clip, model.fps) for clip in clips]
+    if not clips:
+        raise UserError("no clips to edit")
+    rows = rows_of(model, clips, training_of(config, TRAINING), console)
+    kind = "recorded clips" if args.real else "synthetic test clips"
+    if args.write:
+        write(args.name, f"Gaps in {kind}, filled; {recipe.name}", COLUMNS, rows)
+        folder = model_folder(args.model)
+        write_card(folder, args.model.name, recipe.description, config.clips)
+        console.print(str(RECORDS / f"{args.name}.json"), soft_wrap=True)
+    for row in rows:
+        console.print(row)
+
+
+if __name__ == "__main__":
+    main()
