@@ -9,8 +9,8 @@ the training clip whose figure is nearest at both ends of the gap, laid between 
 same gap with the left wrist pinned in its middle, and goes a bent path with nothing kept, with the pull of
 several strengths and without the last exact step, so that its price shows.
 
-Seeds are those of the drawing; of the training there is one. `--write` makes the record that
-`docs/results.md` shows, and the card of a shipped model, whose figures are these.
+Seeds are those of the drawing; of the training there is one. `--write` makes the record and,
+from the records, the card of a shipped model.
 """
 
 from __future__ import annotations
@@ -200,15 +200,18 @@ def training_of(config: SynthConfig, count: int) -> list[Joints]:
     return [truth_from(make_sample(train[k], config), config).joints for k in chosen]
 
 
-def write_card(model: Path, title: str, description: str, clips: int) -> None:
+def write_card(model: Path, title: str, description: str, config: SynthConfig) -> None:
     """The card of a shipped model, from the records."""
     records = read_records()
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
     tables = "\n\n".join(table_of(records[name]) for name in ("edit", "edit_real") if name in records)
     sums = "\n".join(f"    {value}  {name}" for name, value in digests(model).items())
+    actions = ", ".join(config.action_names)
+    description = f"{description}; it knows {actions}"
     text = CARD.read_text(encoding="utf-8").format(
-        description=description, bytes=size, tables=tables, recipe=RECIPE, clips=clips, digests=sums
-    )
+        description=description, bytes=size, tables=tables, recipe=RECIPE, clips=config.clips,
+        actions=actions, digests=sums,
+    )  # fmt: skip
     (model / "README.md").write_text(text, encoding="utf-8")
     facts = {"name": title, "description": description, "recipe": RECIPE}
     (model / CARD_FIGURES).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
@@ -238,7 +241,7 @@ def main() -> None:
     if args.write:
         write(args.name, f"Gaps in {kind}, filled; {recipe.name}", COLUMNS, rows)
         folder = model_folder(args.model)
-        write_card(folder, args.model.name, recipe.description, config.clips)
+        write_card(folder, args.model.name, recipe.description, config)
         console.print(str(RECORDS / f"{args.name}.json"), soft_wrap=True)
     for row in rows:
         console.print(row)

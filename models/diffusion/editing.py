@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.func import jvp
@@ -225,12 +226,13 @@ class Filling:
         frames = len(known)
         bends = torch.eye(frames, dtype=torch.float64).diff(n=2, dim=0)
         bending = _STIFFNESS * bends.T @ bends
-        patterns, of = known.T.unique(dim=0, return_inverse=True)
+        patterns, of = np.unique(known.T.cpu().numpy(), axis=0, return_inverse=True)
         out = []
-        for number, pattern in enumerate(patterns.cpu()):
-            system = torch.eye(frames, dtype=torch.float64) + bending * ~pattern[:, None]
-            columns = (of == number).nonzero()[:, 0]
-            out.append((columns, torch.linalg.inv(system).to(self.given.motion)))
+        for number, pattern in enumerate(patterns):
+            free = torch.from_numpy(~pattern)[:, None]
+            smoother = torch.linalg.inv(torch.eye(frames, dtype=torch.float64) + bending * free)
+            columns = torch.from_numpy(np.flatnonzero(of.reshape(-1) == number))
+            out.append((columns.to(known.device), smoother.to(self.given.motion)))
         return out
 
 

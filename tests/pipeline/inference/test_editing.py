@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from toy_stages import MadeStage
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.canonical import canonicalize, ground
 from motionloom.datasets.motion.features.codec import encode
@@ -30,6 +31,8 @@ from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.inference.model import edit_clip
 from motionloom.pipeline.inference.motion import EditedMotion
+from motionloom.pipeline.inference.shipped_models import shipped_models
+from motionloom.pipeline.store.artifact import Artifact
 
 Walk = Callable[..., NDArray[np.float64]]
 FEW = SamplingConfig(denoising_steps=3)
@@ -245,3 +248,40 @@ def test_models_that_do_not_denoise_say_which_to_take(walk: Walk) -> None:
     other = SimpleNamespace(part="bodyhand", method="gpt", layout=layout, modalities={"text"}, prepared={})
     with pytest.raises(UserError, match=r"\(gpt\).*`inbetween`"):
         edit(Bundle([stage(other)], StageCache()), clip(walk), keep=ENDS)
+
+
+@pytest.fixture
+def inbetween() -> Path:
+    """The folder of the in-betweener that ships."""
+    if "inbetween" not in shipped_models():
+        pytest.skip("this tree has no weights in models/pretrained/inbetween")
+    return shipped_models()["inbetween"].folder
+
+
+def test_the_inbetweener_that_ships_is_small_and_whole(inbetween: Path) -> None:
+    assert shipped_models()["inbetween"].bytes <= 10e6
+    assert "synthetic" in shipped_models()["inbetween"].description
+    noted = Artifact.load_json(inbetween / "inbetween" / "artifact.json").outputs
+    assert noted and {name: one.sha256 for name, one in noted.items()} == {
+        name: sha256_of(inbetween / "inbetween" / name) for name in noted
+    }
+
+
+def test_the_command_fills_a_gap_beside_the_clip(
+    walk: Walk, inbetween: Path, call: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Smoother than twice the clip's own steps at the seams, by the model that ships and a task file."""
+    monkeypatch.chdir(tmp_path)
+    facts = np.array('{"fps": 20, "caption": "a person walks"}')
+    np.savez("walk.npz", joints=clip(walk).joints, metadata=facts)
+    Path("task.yaml").write_text("keep: [{end: 1.0}]\ncaption: a person walks forward\n")
+    made = call("edit", "inbetween", "walk.npz", "--task", "task.yaml", "--keep", "2:", "-f", "npz,html")
+    assert made.code == 0, made.err
+    assert [Path(line).name for line in made.out.split()] == [
+        "00-walk.npz", "01-walk-edited.npz", "index.html",
+    ]  # fmt: skip
+    assert "kept joints: 0.00 cm" in made.err and "the clip has no face" in made.err
+    before, after = (read_clip(Path(line)).joints for line in made.out.split()[:2])
+    steps = [np.linalg.norm(np.diff(one, axis=0), axis=-1).max() for one in (before, after)]
+    assert steps[1] < 2 * steps[0]
+    assert np.abs(after - before)[20:40].max() > 0.02
