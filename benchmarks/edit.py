@@ -206,7 +206,7 @@ def write_card(model: Path, title: str, description: str, config: SynthConfig) -
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
     tables = "\n\n".join(table_of(records[name]) for name in ("edit", "edit_real") if name in records)
     sums = "\n".join(f"    {value}  {name}" for name, value in digests(model).items())
-    actions = ", ".join(config.action_names)
+    actions = ", ".join(name for name in config.action_names if name != "then")
     description = f"{description}; it knows {actions}"
     text = CARD.read_text(encoding="utf-8").format(
         description=description, bytes=size, tables=tables, recipe=RECIPE, clips=config.clips,
