@@ -14,6 +14,7 @@ from rich.console import Console
 
 from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError
 from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.pipeline.evaluation.figures import COMMON_CAPTION, MODEL, NEAREST, OWN_CAPTION, FigureFile
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.captioning import CaptionedClip, captions
 from motionloom.pipeline.inference.model import MotionModel
@@ -32,6 +33,7 @@ stages:
     net: {layers: 1, dim: 16, heads: 2, ff: 32, attention_dropout: 0.0, max_words: 12}
     least_uses: 1
     train: {steps: 6, batch_size: 8, checkpoint_every: 2, validate_every: 2}
+  evaluate_captions: {kind: evaluate_captions, clips: 6, size: 4}
   seq2seq:
     kind: seq2seq
     net: {reader: 8, dim: 8, max_tokens: 50}
@@ -95,6 +97,36 @@ def test_a_captioner_is_trained_killed_exported_and_asked(
         assert likely == sorted(likely, reverse=True) and 0 < sum(likely) <= 1
         assert len({one.text for one in sentences}) == 3
         assert all(set(one.text.split()) <= set(words) and one.text for one in sentences)
+
+
+def test_captions_are_measured_beside_those_that_need_no_model(
+    trained: Path, recipe: Path, call: Callable[..., Any]
+) -> None:
+    """What true captions claim holds; a clip's own other caption shares more words than the most frequent."""
+    done = call("run", recipe, "--out", trained, "--only", "evaluate_captions")
+    assert done.code == 0, done.err
+    found = FigureFile.read(trained / "stages/evaluate_captions/metrics.json")
+    rows = {figure.row for figure in found.figures}
+    assert rows == {MODEL, NEAREST, COMMON_CAPTION, OWN_CAPTION}
+    for row in rows:
+        values = {one.name: one.value for one in found.figures if one.row == row}
+        assert all(0 <= value <= (10 if name == "captions.cider-d" else 1) for name, value in values.items())
+        assert {
+            "captions.bleu-4",
+            "captions.rouge-l",
+            "captions.bert",
+            "captions.R-precision-3",
+        } <= values.keys()
+    assert found.figures[0].protocol["clips"] == 6 and found.figures[0].protocol["size"] == 4
+
+    def value(name: str, row: str) -> float:
+        figure = found.of(f"captions.{name}", row)
+        assert figure is not None
+        return figure.value
+
+    assert value("claims_hold", OWN_CAPTION) == 1
+    assert value("bleu-1", OWN_CAPTION) > value("bleu-1", COMMON_CAPTION)
+    assert value("bert", OWN_CAPTION) > value("bert", COMMON_CAPTION)
 
 
 def test_text_to_motion_is_trained_killed_exported_and_asked(
@@ -186,11 +218,11 @@ def test_an_uncaptioned_folder_becomes_a_data_set(
     ],
 )
 def test_what_cannot_be_captioned_is_said_in_one_sentence(
-    name: str, says: str, trained: Path, tmp_path: Path, call: Callable[..., Any]
+    name: str, says: str, finished: Path, tmp_path: Path, call: Callable[..., Any]
 ) -> None:
     np.savez(tmp_path / "short.npz", joints=np.zeros((2, 22, 3)), metadata=json.dumps({"fps": 30}))
     (tmp_path / "figure.obj").write_text("v 0 0 0")
-    done = call("caption", trained, tmp_path / name)
+    done = call("caption", finished, tmp_path / name)
     assert done.code == 2 and says in done.err and len(done.err.strip().splitlines()) == 1
 
 
