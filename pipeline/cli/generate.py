@@ -43,6 +43,13 @@ def generate(
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
     sampling: Sampling = None,
+    seed_motion: Annotated[
+        Path | None,
+        typer.Option(
+            help="A clip (.npz, .bvh, .glb) to go on from, for models that need one (FACT, Bailando); they "
+            "take a start of a training dance without."
+        ),
+    ] = None,
     plant_feet: Annotated[bool, typer.Option(help="Hold feet still where they stand.")] = True,
     body_model: Annotated[
         Path | None, typer.Option(help="Your SMPL-X model (.npz), for --format smplx.")
@@ -77,8 +84,10 @@ def generate(
     if stream:
         from motionloom.pipeline.runs.generation import stream_motion
 
-        if samples != 1 or formats is not None:
-            raise UserError("--stream writes one motion as JSON lines: leave --samples and --format out")
+        if samples != 1 or formats is not None or seed_motion is not None:
+            raise UserError(
+                "--stream writes one motion as JSON lines: leave --samples, --format and --seed-motion out"
+            )
         stream_motion(run_folder, captions or [], out=out, console=make_console(aside=True), **asked)
         return
     from motionloom.pipeline.runs.generation import generate_motions
@@ -87,5 +96,6 @@ def generate(
     files["figure"] = {"plant_feet": plant_feet, "body_model": body_model, "arkit_bases": arkit_bases}
     folder = out or Path("motions")
     generate_motions(
-        run_folder, captions or [], samples=samples, out=folder, console=make_console(), **files, **asked
+        run_folder, captions or [], samples=samples, seed_motion=seed_motion, out=folder,
+        console=make_console(), **files, **asked,
     )  # fmt: skip

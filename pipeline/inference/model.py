@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from huggingface_hub import ModelHubMixin, snapshot_download
 from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+from numpy.typing import NDArray
 
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.conditions import Conditions
@@ -33,6 +34,7 @@ from motionloom.pipeline.inference.edits.clips import read_clip, require_clip
 from motionloom.pipeline.inference.edits.edit import edited, require_editor
 from motionloom.pipeline.inference.edits.frames import EditFrames
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
+from motionloom.pipeline.inference.edits.seed_motion import read_seed_motion
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
@@ -106,6 +108,7 @@ class MotionModel(
         seconds: float | Sequence[float] | None = None,
         seed: int = 0,
         sampling: SamplingConfig | Mapping[str, object] | None = None,
+        seed_motion: Path | str | NDArray[np.float32] | None = None,
     ) -> list[GeneratedMotion]:
         """Motions for captions, sounds or both, in order; equal arguments give equal motions.
 
@@ -114,14 +117,19 @@ class MotionModel(
         does what the words say, and it warns. `sampling` is a `SamplingConfig` or a
         mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused; of a caption
         that is far from all it was trained on, it warns. What `sampling` leaves out is as the model's export
-        recommends, or the default.
+        recommends, or the default. `seed_motion` is for models that go on from a motion, with whose last
+        frames theirs begin: a file (.npz, .bvh, .glb), or the layout's columns [T, D]; without it they take
+        the start of a training dance.
         """
+        if isinstance(seed_motion, Path | str):
+            seed_motion = read_seed_motion(Path(seed_motion), self.bundle.layout)
         for unknown in self.unknown(caption_list(captions or ()), caption_list(face or ())):
             warnings.warn(str(unknown), stacklevel=2)
         with threads_for(len(sounds or captions or ()), weight_bytes(self.bundle.stages)):
             motions = self.bundle.generate(
                 captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
                 sampling=SamplingConfig.of(sampling), strict=True,
+                seed_motions=None if seed_motion is None else [seed_motion],
             )  # fmt: skip
         for remark in remarks_of(motion.prompt for motion in motions):
             warnings.warn(remark, stacklevel=2)

@@ -95,6 +95,7 @@ def generate_motions(
     seconds: float | None = None,
     seed: int = 0,
     sampling: SamplingConfig | None = None,
+    seed_motion: Path | None = None,
     figure: Mapping[str, object] | None = None,
     device: str = "auto",
     console: Console,
@@ -102,10 +103,13 @@ def generate_motions(
     """Generate and write; returns the paths. `device`: auto, cpu, cuda or cuda:N.
 
     From captions, sound files, or both side by side (the first caption with the first file, and so on), or
-    from one script. `samples` motions of each. `figure` are the keys of `FigureOptions`.
+    from one script. `samples` motions of each. `seed_motion` is a clip to go on from. `figure` are the keys
+    of `FigureOptions`.
     """
     from motionloom.datasets.audio.excerpt import Excerpt
+    from motionloom.pipeline.contract.generation import SeededGenerator
     from motionloom.pipeline.inference.bundle import unknown_captions
+    from motionloom.pipeline.inference.edits.seed_motion import read_seed_motion
     from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
@@ -113,6 +117,8 @@ def generate_motions(
     _require_driver(captions, face, audio, script, seconds)
     if samples < 1:
         raise UserError(f"--samples {samples}: take 1 or more")
+    if script is not None and seed_motion is not None:
+        raise UserError("a script's motion goes on from no other: leave --seed-motion out")
     wanted = formats_of(formats)
     # All that needs no model is checked before one is opened.
     require_words(caption_list(captions))
@@ -139,8 +145,15 @@ def generate_motions(
                 seconds=seconds,
                 seed=seed,
                 sampling=sampling,
+                seed_motions=None if seed_motion is None else [read_seed_motion(seed_motion, bundle.layout)],
                 strict=True,
             )
+            if seed_motion is None and isinstance(bundle.generator, SeededGenerator):
+                start = bundle.generator.seed_frames / bundle.layout.fps
+                _print_note(
+                    aside,
+                    f"the first {start:.2g} s are of a training dance; --seed-motion takes a clip of yours",
+                )
         said = captions if segments is None else [segment.prompt.text for segment in segments]
         unknown_ones = unknown_captions(bundle, said, face or (), sampling.face_model)
         for unknown in unknown_ones:

@@ -124,7 +124,7 @@ class ActorCriticModule(PlayersModule):
         if "codes" not in shared:
             with evaluating(gpt):
                 codes = gpt.dance(true[:, :1], music, self.config.temperature)
-            shared |= {"codes": codes, "reward": self._rewards(codes, batch["beats"])}
+            shared |= {"codes": codes, "reward": self.rewards(codes, batch["beats"])}
         codes, reward = shared["codes"], shared["reward"][:, 1:]
         counts = heard[:, None].expand_as(reward)
         states = gpt.states(codes[:, :-1], music[:, 1:])
@@ -142,7 +142,7 @@ class ActorCriticModule(PlayersModule):
         out: Tensor = self.net.critic(states, tiled_causal(states.shape[1] // 3, states.device))
         return out
 
-    def _rewards(self, codes: Tensor, beats: Tensor) -> Tensor:
+    def rewards(self, codes: Tensor, beats: Tensor) -> Tensor:
         """[B, L] of codes [B, L, 2] and frames with a beat of the music [B, T]."""
         joints = self.vq.module.decode(codes).cpu().numpy()
         rows = [
@@ -150,6 +150,14 @@ class ActorCriticModule(PlayersModule):
             for one, heard in zip(joints, beats.cpu().numpy(), strict=True)
         ]
         return torch.from_numpy(np.stack(rows)).to(codes.device, torch.float32)
+
+
+class Unrewarded(ActorCriticModule):
+    """For dry runs, whose tensors hold no numbers that a dance could be made of."""
+
+    def rewards(self, codes: Tensor, beats: Tensor) -> Tensor:
+        """Nothing."""
+        return torch.zeros(codes.shape[:2], device=codes.device)
 
 
 def beat_rewards(

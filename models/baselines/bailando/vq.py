@@ -143,9 +143,10 @@ def places(columns: Tensor) -> Tensor:
     return columns.reshape(*columns.shape[:2], -1, 3)
 
 
-def decoded(decoder: nn.Module, vectors: Tensor) -> Tensor:
+def decoded(decoder: nn.Sequential, vectors: Tensor) -> Tensor:
     """Code vectors [B, L, d] through a decoder, [B, T, D]."""
-    out: Tensor = decoder(vectors.transpose(1, 2))
+    weights = next(decoder.parameters())  # codebooks are float32 whatever the network is
+    out: Tensor = decoder(vectors.transpose(1, 2).to(weights.dtype))
     return out.transpose(1, 2)
 
 

@@ -5,7 +5,7 @@ dance_vq -> cross_gpt -> actor_critic
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from pydantic import Field
@@ -237,10 +237,19 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
     ) -> ActorCriticModule:
         from motionloom.models.baselines.bailando.critic import ActorCriticModule
 
-        return ActorCriticModule(
-            net, config.optim, seed=seed, max_steps=config.train.steps, vq=inputs.dance_vq,
-            fps=inputs.data.layout.fps, reward=config.reward,
-        )  # fmt: skip
+        return ActorCriticModule(net, config.optim, seed=seed, **self._how(config, inputs))
+
+    def dry_module(
+        self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs
+    ) -> ActorCriticModule:
+        from motionloom.models.baselines.bailando.critic import Unrewarded
+
+        return Unrewarded(net, config.optim, seed=0, **self._how(config, inputs))
+
+    @staticmethod
+    def _how(config: ActorCriticStageConfig, inputs: ActorCriticInputs) -> dict[str, Any]:
+        known = {"vq": inputs.dance_vq, "fps": inputs.data.layout.fps}
+        return {**known, "max_steps": config.train.steps, "reward": config.reward}
 
     def batches(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, seed: int, log: Log
