@@ -109,7 +109,6 @@ def generate_motions(
     from motionloom.datasets.audio.excerpt import Excerpt
     from motionloom.pipeline.contract.generation import SeededGenerator
     from motionloom.pipeline.inference.bundle import unknown_captions
-    from motionloom.pipeline.inference.edits.seed_motion import read_seed_motion
     from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
@@ -138,6 +137,11 @@ def generate_motions(
         if segments is not None:
             motions = bundle.perform(segments, samples=samples, seed=seed, sampling=sampling)
         else:
+            begun = None
+            if seed_motion is not None:
+                from motionloom.pipeline.inference.edits.clips import read_seed_motion
+
+                begun = [read_seed_motion(seed_motion, bundle.layout)]
             motions = bundle.generate(
                 [text for text in captions for _ in range(samples)] or None,
                 face=face and (list(face) if len(face) == 1 else [t for t in face for _ in range(samples)]),
@@ -145,7 +149,7 @@ def generate_motions(
                 seconds=seconds,
                 seed=seed,
                 sampling=sampling,
-                seed_motions=None if seed_motion is None else [read_seed_motion(seed_motion, bundle.layout)],
+                seed_motions=begun,
                 strict=True,
             )
             if seed_motion is None and isinstance(bundle.generator, SeededGenerator):

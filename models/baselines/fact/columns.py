@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-import roma
 import torch
 from torch import Tensor, nn
 
@@ -57,6 +56,8 @@ class MotionColumns(nn.Module):
         """Normalised columns to the network's."""
         if not self.matrices:
             return motion
+        import roma
+
         own = motion * self.std + self.mean
         turns = roma.rotvec_to_rotmat(own[..., 3:].reshape(*own.shape[:-1], -1, 3)).flatten(-3)
         return torch.cat([own.new_zeros(*own.shape[:-1], _ZEROS), own[..., :3], turns], dim=-1)
@@ -65,6 +66,8 @@ class MotionColumns(nn.Module):
         """The network's columns to normalised ones; matrices become the nearest rotations."""
         if not self.matrices:
             return read
+        import roma
+
         turns = roma.special_procrustes(read[..., _ZEROS + 3 :].reshape(*read.shape[:-1], -1, 3, 3))
         own = torch.cat([read[..., _ZEROS : _ZEROS + 3], roma.rotmat_to_rotvec(turns).flatten(-2)], dim=-1)
         return (own - self.mean) / self.std

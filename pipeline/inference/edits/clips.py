@@ -10,9 +10,10 @@ import numpy as np
 
 from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
-from motionloom.datasets.convert.common.features import require_human
+from motionloom.datasets.convert.common.features import features_of, require_human
+from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.bvh.motion import read_bvh
-from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS
+from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
@@ -49,6 +50,23 @@ def require_clip(clip: RecordedClip) -> RecordedClip:
     except UserError as error:
         raise UserError(f"{clip.name}: {error}") from None
     return clip
+
+
+def read_seed_motion(path: Path, layout: MotionLayout) -> NDArray[np.float32]:
+    """The layout's columns [T, D] of a clip that `read_clip` reads, at the layout's frame rate: what a
+    `SeededGenerator` goes on from.
+
+    Hands that the clip does not have are at rest, and so is its face.
+    """
+    clip = read_clip(path)
+    if layout.family == "raw":
+        raise UserError(
+            f"{path}: a clip has joints, and this model goes on from the rotations of layout {layout.name}; "
+            f"leave the seed motion out, or give columns [T, {layout.dim}] in Python"
+        )
+    joints = clip.joints if layout.num_joints <= clip.joints.shape[1] else with_resting_hands(clip.joints)
+    face = clip.face if layout.has("face") else None
+    return features_of(joints[:, : layout.num_joints], clip.fps, layout, face=face)
 
 
 def _of_bvh(path: Path) -> RecordedClip:

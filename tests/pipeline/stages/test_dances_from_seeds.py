@@ -20,7 +20,7 @@ from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import dances_for, dances_of
 from motionloom.pipeline.evaluation.figures import MODEL, FigureFile
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.seed_motion import read_seed_motion
+from motionloom.pipeline.inference.edits.clips import read_seed_motion
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.store.data import Data
 
