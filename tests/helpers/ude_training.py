@@ -21,7 +21,8 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.baselines.bailando.critic import ActorCritic, ActorCriticModule, RewardConfig
+from motionloom.models.baselines.bailando.critic import ActorCritic, RewardConfig
+from motionloom.models.baselines.bailando.critic_module import ActorCriticModule
 from motionloom.models.baselines.bailando.gpt import CrossGpt, CrossGptConfig
 from motionloom.models.baselines.bailando.gpt_module import CrossGptModule
 from motionloom.models.baselines.bailando.vq import DanceVq, DanceVqConfig

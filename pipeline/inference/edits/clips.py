@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled

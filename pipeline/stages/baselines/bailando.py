@@ -31,7 +31,7 @@ from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
-    from motionloom.models.baselines.bailando.critic import ActorCriticModule
+    from motionloom.models.baselines.bailando.critic_module import ActorCriticModule
     from motionloom.models.baselines.bailando.gpt_module import CrossGptModule
     from motionloom.models.baselines.bailando.vq_module import DanceVqModule
     from motionloom.models.training.stage_module import Batch
@@ -235,14 +235,14 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
     def module(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, seed: int
     ) -> ActorCriticModule:
-        from motionloom.models.baselines.bailando.critic import ActorCriticModule
+        from motionloom.models.baselines.bailando.critic_module import ActorCriticModule
 
         return ActorCriticModule(net, config.optim, seed=seed, **self._how(config, inputs))
 
     def dry_module(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs
     ) -> ActorCriticModule:
-        from motionloom.models.baselines.bailando.critic import Unrewarded
+        from motionloom.models.baselines.bailando.critic_module import Unrewarded
 
         return Unrewarded(net, config.optim, seed=0, **self._how(config, inputs))
 

@@ -10,13 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from motionloom.datasets.conditions import Condition
-from motionloom.models.baselines.bailando.critic import (
-    ActorCritic,
-    ActorCriticModule,
-    RewardConfig,
-    beat_rewards,
-    td_error,
-)
+from motionloom.models.baselines.bailando.critic import ActorCritic, RewardConfig
+from motionloom.models.baselines.bailando.critic_module import ActorCriticModule, beat_rewards, td_error
 from motionloom.models.baselines.bailando.gpt import CrossGpt, CrossGptConfig, music_of_codes, tiled_causal
 from motionloom.models.baselines.bailando.gpt_module import CrossGptModule, codes_of
 from motionloom.models.baselines.bailando.vq import DanceVq, DanceVqConfig
