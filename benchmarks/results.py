@@ -15,7 +15,7 @@ import argparse
 import json
 import re
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -78,6 +78,21 @@ ADVERSARIAL = {
     "weight 1, spectral norm": "adv1sn",
     "weight 1 (the paper)": "adv1",
 }
+RIVALS = {
+    "T2M-GPT": "evaluate_t2m",
+    "TEMOS": "evaluate_temos",
+    "MDM": "evaluate_mdm",
+    "MLD": "evaluate_mld",
+    "MotionDiffuse": "evaluate_motiondiffuse",
+    "HumanTOMATO": "evaluate",
+}
+RIVALS_TEXT = {
+    "TEMOS": "evaluate_temos",
+    "MotionCLIP": "evaluate_motionclip",
+    "TM2T": "evaluate_tm2t",
+    "UDE": "evaluate",
+}
+RIVALS_MUSIC = {"FACT": "evaluate_fact", "Bailando": "evaluate_bailando", "UDE": "evaluate_dances"}
 NETWORKS = {"GPT": "greedy", "GRU": "greedy_gru"}
 NOISE = {"without z": "greedy", "with z": "greedy_z"}
 
@@ -98,6 +113,25 @@ DANCES = {
 LOOKUPS = {"nearest training labels": NEAREST_LABELS, "nearest training caption": NEAREST_WORDS}
 
 TABLES = {
+    "rivals": Table(
+        "Captions, whole bodies: Table 1",
+        _of("", RIVALS, ANSWERS),
+        (
+            Column("FID", "evaluator.fid", 2),
+            Column("R-Precision, top 3", "evaluator.top-3", 3),
+            Column("TMA-R-Precision (256), top 3", "tma.m2t_r3", 3),
+            Column("Matching", "evaluator.matching_score", 2),
+            Column("MModality", "evaluator.multimodality", 2),
+            Column("everything right, %", "agreement.everything", 0, 100),
+            Column("jitter", "physics.jitter", 2),
+        ),
+    ),
+    "rivals_ude_text": Table("UDE's Table 1", _of("", RIVALS_TEXT, ANSWERS), TEXT),
+    "rivals_ude_music": Table(
+        "UDE's Table 2",
+        _of("", RIVALS_MUSIC, {"recorded": RECORDED, "nearest training music": NEAREST_MUSIC}),
+        MUSIC,
+    ),
     "dances": Table(
         "Dances to unheard played songs",
         {title: ("evaluate_dances", row) for title, row in DANCES.items()},
@@ -159,16 +193,20 @@ TABLES = {
     ),
 }  # fmt: skip
 SEEDS = (7, 8, 9)
-COMMANDS = dict.fromkeys(("dances", "dance_texts"), "motionloom run ude-dance") | {
+COMMANDS = {
+    **dict.fromkeys(("dances", "dance_texts"), "motionloom run ude-dance"),
+    "rivals": "motionloom run baselines-tiny",
+    **dict.fromkeys(("rivals_ude_text", "rivals_ude_music"), "motionloom run ude-baselines-tiny"),
     "edit": "python benchmarks/edit.py inbetween --write",
     "edit_real": "python benchmarks/edit.py inbetween --write --name edit_real --real *.bvh",
 }
 
 
-def collect(run: Path) -> None:
-    """Write a record of every table of which a stage has finished."""
+def collect(run: Path, names: Iterable[str]) -> None:
+    """Write a record of each of these tables of which a stage has finished."""
     RECORDS.mkdir(exist_ok=True)
-    for name, table in TABLES.items():
+    for name in names:
+        table = TABLES[name]
         rows = [row for row in (row_of(run, table, title) for title in table.rows) if row["cells"]]
         if rows:
             write(name, table.title, [column._asdict() for column in table.columns], rows)
@@ -318,9 +356,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--collect", type=Path, help="the folder of a run")
+    parser.add_argument(
+        "--tables", nargs="+", choices=TABLES, default=list(TABLES), help="which records are made of it"
+    )
     args = parser.parse_args()
     if args.collect is not None:
-        collect(args.collect)
+        collect(args.collect, args.tables)
     PAGE.write_text(rendered(), encoding="utf-8")
 
 
