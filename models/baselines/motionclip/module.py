@@ -11,27 +11,14 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from pydantic import Field
 from torch import Tensor
 
 from motionloom.datasets.motion.features.torch_joints import present_joints, torch_joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config
-from motionloom.models.baselines.motionclip.network import MotionClip
+from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipLossConfig
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.distributed import masked_mean
 from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
-
-
-class MotionClipLossConfig(Config):
-    """Weights; the defaults are the published ones, which are of 6-D rotations and metres. Normalised columns
-    have larger errors.
-    """
-
-    features: float = Field(default=100.0, ge=0)
-    joints: float = Field(default=100.0, ge=0)
-    velocities: float = Field(default=100.0, ge=0)
-    text: float = Field(default=1.0, ge=0)
 
 
 class MotionClipModule(StageModule):

@@ -19,6 +19,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
+from motionloom.datasets.schema import Config
 from motionloom.models.baselines.motionclip.sixd import SixD
 from motionloom.models.layers.transformer import StackConfig, Transformer, sinusoid
 
@@ -36,6 +37,17 @@ class MotionClipConfig(StackConfig):
     @property
     def width(self) -> tuple[str, int]:
         return "latent", self.latent
+
+
+class MotionClipLossConfig(Config):
+    """Weights; the defaults are the published ones, which are of 6-D rotations and metres. Normalised columns
+    have larger errors.
+    """
+
+    features: float = Field(default=100.0, ge=0)
+    joints: float = Field(default=100.0, ge=0)
+    velocities: float = Field(default=100.0, ge=0)
+    text: float = Field(default=1.0, ge=0)
 
 
 class MotionClip(nn.Module):

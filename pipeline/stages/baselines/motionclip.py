@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.baselines.motionclip.module import MotionClipLossConfig
-from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipConfig
+from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipConfig, MotionClipLossConfig
 from motionloom.models.baselines.motionclip.sixd import SixD
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
