@@ -196,7 +196,7 @@ SEEDS = (7, 8, 9)
 COMMANDS = {
     **dict.fromkeys(("dances", "dance_texts"), "motionloom run ude-dance"),
     "rivals": "motionloom run baselines-tiny",
-    **dict.fromkeys(("rivals_ude_text", "rivals_ude_music"), "motionloom run baselines-ude-tiny"),
+    **dict.fromkeys(("rivals_ude_text", "rivals_ude_music"), "motionloom run baselines-tiny-ude"),
     "edit": "python benchmarks/edit.py inbetween --write",
     "edit_real": "python benchmarks/edit.py inbetween --write --name edit_real --real *.bvh",
 }
