@@ -236,8 +236,8 @@ def test_captions_from_standard_input(small_run: Any, capsys: pytest.CaptureFixt
     [
         ((), "caption"),
         (("a", "b"), "give --seconds, the length of each"),
-        (("a", "--samples", "2"), "leave --samples and --format out"),
-        (("a", "--format", "npz"), "leave --samples and --format out"),
+        (("a", "--samples", "2"), "leave --samples, --format"),
+        (("a", "--format", "npz"), "leave --samples, --format"),
     ],
 )
 def test_what_a_stream_is_not(words: tuple[str, ...], sentence: str, call: Callable[..., Any]) -> None:
