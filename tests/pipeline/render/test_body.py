@@ -287,10 +287,10 @@ def test_the_file_is_what_its_script_makes(tmp_path: Path) -> None:
         for name, values in asset().items():
             if values.dtype.kind == "U":
                 assert made[name].tolist() == values.tolist()
-            elif name.endswith("_joints"):  # shares that are nearly equal change places
+            elif name.endswith("_joints"):  # nearly equal shares change places, the least go
                 size, shares = name.removesuffix("_joints"), name.replace("_joints", "_shares")
                 ours, theirs = (_skin(one[name], one[shares]) for one in (asset(), made))
-                np.testing.assert_allclose(theirs, ours, atol=1, err_msg=size)
+                np.testing.assert_allclose(theirs, ours, atol=2, err_msg=size)
             elif not name.endswith("_shares"):  # the last digit is the processor's
                 np.testing.assert_allclose(made[name].astype(float), values.astype(float), atol=1, rtol=1e-6)
 
