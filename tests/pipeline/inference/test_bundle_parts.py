@@ -39,7 +39,8 @@ def test_finished_generators_are_found(name: str, tmp_path: Path) -> None:
     makers = [s.name for s in recipe.stages if GENERATOR in s.kind.gives(s.config)]
     assert {stage.name for stage in found} == set(makers)
     if makers:
-        assert found[0].name == ("ude" if name.startswith("ude") else "gpt")
+        first = "ude" if "ude" in makers else "gpt"
+        assert found[0].name == (first if first in makers else makers[0])
     for stage in found:
         assert stage.folder == tmp_path / "stages" / stage.name
         assert stage.config == recipe.stage(stage.name).config

@@ -228,7 +228,9 @@ def test_the_commands_settings_reach_the_sampling(
     call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     seen: dict[str, Any] = {}
-    watching = SimpleNamespace(generate=lambda captions, **options: seen.update(options) or [])
+    watching = SimpleNamespace(
+        generate=lambda captions, **options: seen.update(options) or [], generator=None
+    )
     monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: watching)
     monkeypatch.setattr("motionloom.pipeline.inference.bundle.unknown_captions", lambda *_: [])
     asked = {"sampler": "dpm++", "denoising_steps": 7, "cfg_scale": 3.0, "temperature": 0.0}
@@ -247,11 +249,11 @@ def test_what_a_run_writes_down_draws_as_its_recipe_does(name: str, tmp_path: Pa
     """With some sampling settings or none; of UDE the stage's sampler runs unless another is set."""
     again, drawn = tmp_path / "recipe.yaml", list[dict[str, object]]()
     for recipe in (name, again):
-        sets = ["ude.denoising_steps=7"] if recipe == name and name.startswith("ude") else []
+        sets = ["ude.denoising_steps=7"] if recipe == name and "ude" in name.split("-") else []
         resolved = load_recipe(recipe, sets, strict=False)
         stages = {one.name: one.config for one in resolved.stages}
         sampled = {name: one.sampling for name, one in stages.items() if hasattr(one, "sampling")}
-        assert {"generate", "evaluate", "report"} <= set(sampled)
+        assert "report" in sampled
         drawn.append({name: sampling.dump() for name, sampling in sampled.items()})
         if "ude" in stages:
             halves: list[Any] = [SimpleNamespace(modalities={"audio"}, given={}), SimpleNamespace()]
