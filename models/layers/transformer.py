@@ -18,6 +18,7 @@ Legend: B batch, L positions, S visible positions, D width, H heads.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal, Self
 
 import torch
@@ -277,15 +278,22 @@ class Transformer(nn.Module):
         """x [B, L, D]; mask bool [B, L] of visible positions or [B, L, S], or `causal`; cache to decode;
         memory [B, M, D] and its mask [B, M] or [B, L, M].
         """
-        given = (_to_heads(mask), causal)
-        seen = (memory, _to_heads(memory_mask))
-        for index, block in enumerate(self.blocks):
+        given, seen = (_to_heads(mask), causal), (memory, _to_heads(memory_mask))
+
+        def step(index: int, x: Tensor) -> Tensor:
             if cache is None:
-                x = self.through(block, x, *given, None, *seen)
-            else:
-                x = block(x, *given, cache.layers[index], *seen)
-        out: Tensor = self.norm(x)
+                return self.through(self.blocks[index], x, *given, None, *seen)
+            out: Tensor = self.blocks[index](x, *given, cache.layers[index], *seen)
+            return out
+
+        out: Tensor = self.norm(self.walk(x, step))
         return out
+
+    def walk(self, x: Tensor, step: Callable[[int, Tensor], Tensor]) -> Tensor:
+        """Through all blocks; `step` goes through one, by its number."""
+        for index in range(len(self.blocks)):
+            x = step(index, x)
+        return x
 
     def through(self, block: nn.Module, x: Tensor, *given: object) -> Tensor:
         """One block, whose inside may be computed again in the backward pass."""
@@ -318,27 +326,16 @@ class SkipTransformer(Transformer):
             if parameter.dim() == 2:
                 nn.init.xavier_uniform_(parameter)
 
-    def forward(
-        self,
-        x: Tensor,
-        mask: Tensor | None = None,
-        causal: bool = False,
-        cache: KVCache | None = None,
-        memory: Tensor | None = None,
-        memory_mask: Tensor | None = None,
-    ) -> Tensor:
-        """As the base class; all frames at once, so without a cache."""
-        given = (_to_heads(mask), causal, None, memory, _to_heads(memory_mask))
+    def walk(self, x: Tensor, step: Callable[[int, Tensor], Tensor]) -> Tensor:
         half = len(self.merge)
         kept: list[Tensor] = []  # `list[Tensor]()` is none of torch.compile's words
-        for index, block in enumerate(self.blocks):
+        for index in range(len(self.blocks)):
             if index > half:
                 x = self.merge[index - half - 1](torch.cat([x, kept.pop()], dim=-1))
-            x = self.through(block, x, *given)
+            x = step(index, x)
             if index < half:
                 kept.append(x)
-        out: Tensor = self.norm(x)
-        return out
+        return x
 
 
 def _to_heads(mask: Tensor | None) -> Tensor | None:

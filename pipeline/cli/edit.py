@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -90,7 +90,7 @@ def edit(
         "caption": caption, "face": face, "lead": lead, "seconds": seconds, "strength": strength,
         "likeness": likeness, "exact": exact,
     }  # fmt: skip
-    fields: dict[str, Any] = {name: value for name, value in plain.items() if value is not None}
+    fields: dict[str, object] = {name: value for name, value in plain.items() if value is not None}
     fields |= {
         "keep": [_kept(text) for text in keep or ()],
         "path": [_point(text) for text in path or ()],
@@ -104,38 +104,35 @@ def edit(
     )  # fmt: skip
 
 
-def task_of(file: Path | None, fields: dict[str, Any]) -> EditTask:
+def task_of(file: Path | None, fields: dict[str, object]) -> EditTask:
     """The task of a YAML file and the fields of options: lists are added to the file's, others replace."""
-    from motionloom.datasets.schema import read_plain
     from motionloom.pipeline.contract.editing import EditTask
-    from motionloom.pipeline.store.yaml import load_yaml
+    from motionloom.pipeline.store.yaml import read_yaml
 
-    given: Any = {}
+    given: dict[str, object] = {}
     if file is not None:
-        try:
-            given = load_yaml(read_plain(file).decode("utf-8"), str(file)) or {}
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"{file}: cannot be read ({error})") from None
-        if not isinstance(given, dict):
+        read = read_yaml(file) or {}
+        if not isinstance(read, dict):
             raise UserError(f"{file}: a task is a mapping, such as `keep: [{{end: 1.5}}]`")
+        given = read
     for name, value in fields.items():
         before = given.get(name)
         given[name] = [*before, *value] if isinstance(value, list) and isinstance(before, list) else value
     return EditTask.parse(given, "task" if file is None else str(file))
 
 
-def _kept(text: str) -> dict[str, Any]:
+def _kept(text: str) -> dict[str, object]:
     """Of `1:2=all-face`."""
     span, equals, parts = text.partition("=")
     start, end = _span(span, f"--keep {text}", "START:END=PARTS, such as 0:1.5 or :=lower")
-    out: dict[str, Any] = {"start": start or 0.0, "end": end}
+    out: dict[str, object] = {"start": start or 0.0, "end": end}
     if equals:
         kept, *without = parts.replace(" ", "").split("-")
         out |= {"parts": kept.split("+"), "but": without}
     return out
 
 
-def _words(text: str) -> dict[str, Any]:
+def _words(text: str) -> dict[str, object]:
     """Of `1:2=a person jumps`."""
     span, _, said = text.partition("=")
     start, end = _span(span, f"--words {text}", "START:END=TEXT, such as 1:2.5=a person jumps")
@@ -150,7 +147,7 @@ def _point(text: str) -> dict[str, float]:
     return {"at": at, "x": x, "z": z}
 
 
-def _pin(text: str) -> dict[str, Any]:
+def _pin(text: str) -> dict[str, object]:
     """Of `left_wrist@1.5=0,1.2,0.4`."""
     example = "JOINT@SECONDS=X,Y,Z, such as left_wrist@2=0.4,1.6,1"
     joint, _, rest = text.partition("@")

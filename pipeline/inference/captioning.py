@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ class CheckedSentence(Sentence):
         ]
         return f"  [{', '.join(told)}]" if told else ""
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, object]:
         """As plain data."""
         return {
             "text": self.text,
@@ -67,7 +67,7 @@ class CaptionedClip:
     """Of it that were read."""
     sentences: tuple[CheckedSentence, ...]
 
-    def record(self) -> dict[str, Any]:
+    def record(self) -> dict[str, object]:
         """A line for `data convert --captions`, which reads the captions; the rest informs people."""
         texts = [{"text": one.text, "source": MACHINE} for one in self.sentences]
         said = [one.record() for one in self.sentences]

@@ -58,6 +58,15 @@ class ModelFacts(Config):
     extra: dict[str, object] = Field(default_factory=dict)
     _where: str = PrivateAttr("model.json")
 
+    @staticmethod
+    def of(
+        kind: str, net: Config, layout: MotionLayout, extra: Mapping[str, object] | None = None
+    ) -> ModelFacts:
+        """Facts of a network of sizes `net` for motion in `layout`."""
+        return ModelFacts(
+            kind=kind, config=net.dump(), layout=LayoutFacts.of(layout), extra=dict(extra or {})
+        )
+
     def fact(self, key: str, kind: type[Fact]) -> Fact:
         """A fact in `extra`, of the kind it must be."""
         value = self.extra.get(key)

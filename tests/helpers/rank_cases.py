@@ -11,6 +11,7 @@ from torch import Tensor
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.baselines.mld.losses import MotionVaeLossConfig
 from motionloom.models.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
 from motionloom.models.baselines.mld.network import (
     LatentDenoiser,
@@ -19,7 +20,7 @@ from motionloom.models.baselines.mld.network import (
     MotionVaeConfig,
 )
 from motionloom.models.baselines.motionclip.module import MotionClipModule
-from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipConfig
+from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipConfig, MotionClipLossConfig
 from motionloom.models.baselines.motiondiffuse.module import MotionDiffuseModule
 from motionloom.models.baselines.motiondiffuse.network import (
     CaptionConfig,
@@ -185,7 +186,7 @@ BODY: dict[str, Any] = {
 
 def motion_vae() -> tuple[StageModule, Batches]:
     net = MotionVae(MotionVaeConfig(dim=16, ff=16, layers=3, heads=2), 133)
-    module = MotionVaeModule(net, OPTIM, seed=0, max_steps=STEPS, **BODY)
+    module = MotionVaeModule(net, OPTIM, seed=0, max_steps=STEPS, loss=MotionVaeLossConfig(), **BODY)
     return module.eval(), lambda step: motion(step, 133)
 
 
@@ -198,7 +199,7 @@ def latent_diffusion() -> tuple[StageModule, Batches]:
 
 def motionclip() -> tuple[StageModule, Batches]:
     net = MotionClip(MotionClipConfig(latent=TEXT, ff=16, layers=1, heads=2), 133)
-    module = MotionClipModule(net, OPTIM, seed=0, max_steps=STEPS, **BODY)
+    module = MotionClipModule(net, OPTIM, seed=0, max_steps=STEPS, loss=MotionClipLossConfig(), **BODY)
     return module.eval(), lambda step: motion(step, 133) | captions(step)
 
 

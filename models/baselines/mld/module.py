@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.baselines.joints_module import JointsModule
 from motionloom.models.baselines.mld.losses import MotionVaeLossConfig, smooth_l1_of_joints
 from motionloom.models.baselines.mld.network import LatentDenoiser, MotionVae, seen
 from motionloom.models.gpt.frozen import Frozen
@@ -17,34 +15,11 @@ from motionloom.models.tma.losses import kl_divergence, reconstruction_loss
 from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
 
-class MotionVaeModule(StageModule):
-    """Trains a `MotionVae` on whole clips.
-
-    Args:
-        layout: Its body and hands are what is modelled.
-        mean, std: Statistics of those columns, which joints are recovered by.
-    """
+class MotionVaeModule(JointsModule):
+    """Trains a `MotionVae` on whole clips."""
 
     net: MotionVae
-    mean: Tensor
-    std: Tensor
-
-    def __init__(
-        self,
-        net: MotionVae,
-        optim: OptimConfig,
-        *,
-        seed: int,
-        max_steps: int,
-        layout: MotionLayout,
-        mean: NDArray[np.floating],
-        std: NDArray[np.floating],
-        loss: MotionVaeLossConfig | None = None,
-    ) -> None:
-        super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.layout, self.loss_config = layout, loss or MotionVaeLossConfig()
-        for name, values in (("mean", mean), ("std", std)):
-            self.register_buffer(name, torch.as_tensor(values), persistent=False)
+    loss_config: MotionVaeLossConfig
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D], "length" [B], "present" bool [B, D] (optional: all).
@@ -55,7 +30,7 @@ class MotionVaeModule(StageModule):
         mask = length_mask(batch["length"], motion.shape[1])
         mu, logvar = self.net.encode(seen(motion, present), mask)
         rebuilt = self.net.decode(drawn(mu, logvar) if self.training else mu, mask)
-        found, wanted = (motions.float() * self.std + self.mean for motions in (rebuilt, motion))
+        found, wanted = map(self.in_units, (rebuilt, motion))
         zero = torch.zeros_like(mu)
         losses = {
             "features": reconstruction_loss(rebuilt, motion, mask, present),

@@ -7,48 +7,23 @@ images that shares the text stage's space, and neither comes with this project.
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.datasets.motion.features.torch_joints import present_joints, torch_joints_of
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.baselines.joints_module import JointsModule
 from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipLossConfig
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.distributed import masked_mean
-from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
+from motionloom.models.training.stage_module import Batch
 
 
-class MotionClipModule(StageModule):
-    """Trains a `MotionClip` on captioned `ConditionBatches`.
-
-    Args:
-        layout: Its body and hands are what is modelled.
-        mean, std: Statistics of those columns, which joints are recovered by.
-    """
+class MotionClipModule(JointsModule):
+    """Trains a `MotionClip` on captioned `ConditionBatches`."""
 
     net: MotionClip
-    mean: Tensor
-    std: Tensor
-
-    def __init__(
-        self,
-        net: MotionClip,
-        optim: OptimConfig,
-        *,
-        seed: int,
-        max_steps: int,
-        layout: MotionLayout,
-        mean: NDArray[np.floating],
-        std: NDArray[np.floating],
-        loss: MotionClipLossConfig | None = None,
-    ) -> None:
-        super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.layout, self.loss_config = layout, loss or MotionClipLossConfig()
-        for name, values in (("mean", mean), ("std", std)):
-            self.register_buffer(name, torch.as_tensor(values), persistent=False)
+    loss_config: MotionClipLossConfig
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
@@ -78,4 +53,4 @@ class MotionClipModule(StageModule):
         with torch.autocast(seen.device.type, enabled=False):
             if self.net.sixd is not None:
                 return self.net.sixd.joints(seen)
-            return torch_joints_of(seen * self.std + self.mean, self.layout)
+            return torch_joints_of(self.in_units(seen), self.layout)

@@ -26,7 +26,7 @@ from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, regi
 from motionloom.pipeline.inference.generators.bailando import BailandoGenerator
 from motionloom.pipeline.stages.baselines.dances import dance_batches, spread_dances
 from motionloom.pipeline.store.data import Data
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts
+from motionloom.pipeline.store.weights import ModelFacts, load_facts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -80,9 +80,7 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
                 f"(net.halvings {config.net.halvings})"
             )
         extra = {"joints": layout.num_joints}
-        return ModelFacts(
-            kind=self.name, config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra
-        )
+        return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: DanceVqInputs) -> DanceVq:
         return DanceVq(DanceVqConfig.parse(facts.config, facts.where), facts.fact("joints", int))
@@ -142,8 +140,7 @@ class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt])
     def facts(self, config: CrossGptStageConfig, inputs: CrossGptInputs) -> ModelFacts:
         codes = inputs.dance_vq.config.num_codes
         extra = {"num_codes": codes, "music_dim": inputs.audio.dim, "kept": config.kept}
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind=self.name, config=config.net.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: CrossGptInputs) -> CrossGpt:
         return gpt_of(facts)
@@ -222,8 +219,7 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
             "kept": len(gpt.kept),
             "critic_layers": config.reward.critic_layers,
         }
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind=self.name, config=gpt.config.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, gpt.config, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: ActorCriticInputs) -> ActorCritic:
         return ActorCritic(gpt_of(facts), facts.fact("critic_layers", int))

@@ -20,7 +20,7 @@ from motionloom.pipeline.inference.generators.fact import FactGenerator
 from motionloom.pipeline.stages.baselines.dances import dance_batches, spread_dances
 from motionloom.pipeline.stages.networks.captions import part_columns, part_of
 from motionloom.pipeline.store.data import Data
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -66,9 +66,7 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
         layout = inputs.data.layout
         part_columns(layout, config.part)
         extra = {"part": config.part, "music_dim": inputs.audio.dim, "kept": config.kept}
-        return ModelFacts(
-            kind=self.name, config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra
-        )
+        return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: FactInputs) -> Fact:
         config, layout = FactConfig.parse(facts.config, facts.where), facts.layout.layout()

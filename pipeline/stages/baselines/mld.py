@@ -33,7 +33,7 @@ from motionloom.pipeline.stages.networks.captions import (
 )
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import LoadedMotionVae
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, Release
+from motionloom.pipeline.store.weights import ModelFacts, Release
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -84,9 +84,7 @@ class MotionVaeStage(TrainedStage[MotionVaeStageConfig, MotionVaeInputs, MotionV
     def facts(self, config: MotionVaeStageConfig, inputs: MotionVaeInputs) -> ModelFacts:
         layout = inputs.data.layout
         extra = {"motion_dim": len(part_columns(layout, config.part)), "max_frames": config.max_frames}
-        return ModelFacts(
-            kind=self.name, config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra
-        )
+        return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: MotionVaeInputs) -> MotionVae:
         return MotionVae(MotionVaeConfig.parse(facts.config, facts.where), facts.fact("motion_dim", int))
@@ -172,8 +170,7 @@ class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffus
 
     def facts(self, config: LatentDiffusionStageConfig, inputs: LatentDiffusionInputs) -> ModelFacts:
         extra = {"latent_tokens": inputs.motion_vae.net.config.latent_tokens, "text_dim": inputs.text.dim}
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind=self.name, config=config.net.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: LatentDiffusionInputs) -> LatentDenoiser:
         config, vae = LatentDiffusionConfig.parse(facts.config, facts.where), inputs.motion_vae

@@ -21,7 +21,7 @@ from motionloom.pipeline.stages.networks.captions import (
     part_columns,
     part_statistics,
 )
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts
+from motionloom.pipeline.store.weights import ModelFacts, load_facts
 from motionloom.pipeline.training.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -60,9 +60,7 @@ class MotionClipStage(CaptionStage[MotionClipStageConfig, CaptionInputs, MotionC
                 f"set it to {inputs.text.dim}"
             )
         extra = {"motion_dim": len(part_columns(layout, config.part)), "max_frames": config.max_frames}
-        return ModelFacts(
-            kind=self.name, config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra
-        )
+        return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: CaptionInputs) -> MotionClip:
         layout = facts.layout.layout()

@@ -19,7 +19,7 @@ from motionloom.pipeline.stages.networks.captions import (
     part_columns,
     part_of,
 )
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts
+from motionloom.pipeline.store.weights import ModelFacts, load_facts
 from motionloom.pipeline.training.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -49,13 +49,8 @@ class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, M
     def facts(self, config: MotionDiffuseStageConfig, inputs: CaptionInputs) -> ModelFacts:
         layout = inputs.data.layout
         width = len(part_columns(layout, config.part))
-        extra = {"motion_dim": width, "text_dim": inputs.text.dim, "max_frames": config.max_frames}
-        return ModelFacts(
-            kind=self.name,
-            config=config.net.dump(),
-            layout=LayoutFacts.of(layout),
-            extra={**extra, "part": config.part},
-        )
+        extra = {"motion_dim": width, "text_dim": inputs.text.dim, "part": config.part}
+        return ModelFacts.of(self.name, config.net, layout, {**extra, "max_frames": config.max_frames})
 
     def network(self, facts: ModelFacts, inputs: CaptionInputs) -> MotionDiffuse:
         config = MotionDiffuseConfig.parse(facts.config, facts.where)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from pydantic import Field
@@ -32,7 +32,7 @@ from motionloom.pipeline.store.data import Data, DataPreview, captions_of
 from motionloom.pipeline.store.networks import TrainedTokenizer, require_streams, stream_facts
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, gpt_clips
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -124,8 +124,7 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
     def facts(self, config: CaptionerStageConfig, inputs: CaptionerInputs) -> ModelFacts:
         words = _vocabulary(config, inputs.data).words
         extra = {"words": list(words), **stream_facts(inputs.tokenizer.net)}
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind=self.name, config=config.net.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: CaptionerInputs) -> Captioner:
         tokenizer = inputs.tokenizer.net
@@ -208,7 +207,7 @@ class Seq2SeqInputs(Inputs):
 
 
 @dataclass(frozen=True)
-class _WordBatches(Dataset[dict[str, Any]]):
+class _WordBatches(Dataset[dict[str, object]]):
     """Batches whose "text" is the number of a caption, with the states of its words in place of it."""
 
     batches: TokenBatches
@@ -220,7 +219,7 @@ class _WordBatches(Dataset[dict[str, Any]]):
     def __len__(self) -> int:
         return len(self.batches)
 
-    def __getitem__(self, k: int) -> dict[str, Any]:
+    def __getitem__(self, k: int) -> dict[str, object]:
         batch = self.batches[k]
         rows = batch.pop("text")[:, 0]
         states, mask = self.cache.tokens([self.texts[row] for row in rows.tolist()])
@@ -242,8 +241,7 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
 
     def facts(self, config: Seq2SeqStageConfig, inputs: Seq2SeqInputs) -> ModelFacts:
         extra = {"text_dim": inputs.text.dim, **stream_facts(inputs.tokenizer.net)}
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind=self.name, config=config.net.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: Seq2SeqInputs) -> Seq2Seq:
         tokenizer = inputs.tokenizer.net

@@ -22,7 +22,7 @@ from motionloom.pipeline.stages.networks.captions import (
     part_columns,
     part_of,
 )
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, Release, load_facts
+from motionloom.pipeline.store.weights import ModelFacts, Release, load_facts
 from motionloom.pipeline.training.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -56,9 +56,7 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
         layout = inputs.data.layout
         width = len(part_columns(layout, config.part))
         extra = {"motion_dim": width, "text_dim": inputs.text.dim, "part": config.part}
-        return ModelFacts(
-            kind="diffusion", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra
-        )
+        return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: CaptionInputs) -> MotionDiffusion:
         config = DiffusionConfig.parse(facts.config, facts.where)

@@ -15,7 +15,7 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import register
 from motionloom.pipeline.stages.networks.tokenizer import WindowInputs, WindowStageConfig, window_batches
 from motionloom.pipeline.store.networks import LoadedDmd, TrainedTokenizer, require_streams, stream_facts
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -60,8 +60,7 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
                 f"net.schedule.predicts: sample"
             )
         extra = {**stream_facts(tokenizer), "window": config.window}
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind="dmd", config=config.net.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: DmdInputs) -> Dmd:
         tokenizer = inputs.tokenizer.net

@@ -16,7 +16,7 @@ from motionloom.pipeline.contract.stage import register
 from motionloom.pipeline.stages.networks.captions import CaptionInputs, CaptionStage, CaptionStageConfig
 from motionloom.pipeline.store.evaluator import LoadedEvaluator, StageWords
 from motionloom.pipeline.store.text import TextSource
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig
 
 if TYPE_CHECKING:
@@ -82,8 +82,7 @@ class EvaluatorStage(CaptionStage[EvaluatorStageConfig, CaptionInputs, Evaluator
             "encoder": text.cache.encoder if isinstance(text, TextSource) else "",
             "max_frames": config.max_frames,
         }
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind=self.name, config=config.net.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: CaptionInputs) -> Evaluator:
         config = EvaluatorConfig.parse(facts.config, facts.where)

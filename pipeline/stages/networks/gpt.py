@@ -31,7 +31,7 @@ from motionloom.pipeline.store.networks import (
 from motionloom.pipeline.store.run_folder import is_place
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, gpt_clips
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 from motionloom.pipeline.training.warm_start import START, require_start_layout, same_encoder, starts_from
@@ -122,8 +122,7 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         extra = {"text_dim": text_dim, "prior": config.prior, **stream_facts(tokenizer.net)}
         if inputs.start is not None:
             require_start_layout(inputs.data.layout, tokenizer.layout)
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind="gpt", config=config.net.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: GptInputs) -> InterleavedGPT:
         tokenizer = inputs.tokenizer.net

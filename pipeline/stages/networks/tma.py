@@ -34,7 +34,7 @@ from motionloom.pipeline.stages.networks.captions import (
     part_of,
 )
 from motionloom.pipeline.store.networks import LoadedTma
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.warm_start import (
     START,
@@ -109,7 +109,7 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
             require_start_layout(layout, inputs.start.layout)
         part_columns(layout, config.part)
         extra = {"text_dim": inputs.text.dim, "max_frames": config.max_frames, "part": config.part}
-        return ModelFacts(kind="tma", config=config.net.dump(), layout=LayoutFacts.of(layout), extra=extra)
+        return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: TmaInputs) -> Tma:
         layout, part = facts.layout.layout(), part_of(facts)

@@ -33,7 +33,7 @@ from motionloom.pipeline.contract.stage import Inputs, Stage, filled_by, registe
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import TrainedTokenizer
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 from motionloom.pipeline.training.warm_start import require_same_start, require_start_layout
@@ -152,8 +152,7 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
     def facts(self, config: TokenizerStageConfig, inputs: TokenizerInputs) -> ModelFacts:
         if inputs.start is not None:
             require_start_layout(inputs.data.layout, inputs.start.layout)
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind=config.net.kind, config=config.net.dump(), layout=layout)
+        return ModelFacts.of(config.net.kind, config.net, inputs.data.layout)
 
     def network(self, facts: ModelFacts, inputs: TokenizerInputs) -> Tokenizer:
         config = parse_tokenizer(facts.config, f"{facts.where}: config")

@@ -23,7 +23,7 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Every, Inputs, Role, Stage, register
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import LoadedUtt, TrainedTokenizer, require_streams, stream_facts
-from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -106,8 +106,7 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
             **stream_facts(tokenizer),
             "max_frames": config.max_frames,
         }
-        layout = LayoutFacts.of(inputs.data.layout)
-        return ModelFacts(kind="utt", config=config.net.dump(), layout=layout, extra=extra)
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: UttInputs) -> ConditionedUtt:
         tokenizer = inputs.tokenizer.net
