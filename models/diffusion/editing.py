@@ -98,6 +98,7 @@ class Filling:
     ) -> None:
         self.net, self.given, self.recovery = net, given, recovery
         self.guidance, self.strength, self.likeness = guidance, strength, likeness
+        self.noiser = net.config.schedule.noiser()
         frames = len(given.motion)
         self.size = min(window, frames)
         overlap = min(overlap, self.size // 2)
@@ -126,7 +127,7 @@ class Filling:
         skip = min(round(self.likeness * steps), steps - 1)
         if skip:
             begin = schedule.sampler(sampler, steps).timesteps[skip].expand(len(x)).to(x.device)
-            x = schedule.noiser().add_noise(given.motion.expand_as(x), x, begin).to(x)
+            x = self.noiser.add_noise(given.motion.expand_as(x), x, begin).to(x)
         with evaluating(self.net):
             made = schedule.denoise(self._predict, x, noise, sampler, steps, skip=skip)
         return self._replaced(self._joined(self._replaced(made)))
@@ -141,14 +142,12 @@ class Filling:
     def _predict(self, x: Tensor, step: Tensor) -> Tensor:
         """The network's prediction for motions x [n, T, D], after what is known and asked of it."""
         found = self._blended(x, step)
-        schedule = self.net.config.schedule
-        kept = schedule.noiser().alphas_cumprod[int(step)].to(x)
-        if schedule.predicts == "epsilon":
-            found = (x - (1 - kept).sqrt() * found) / kept.sqrt()
+        if self.net.config.schedule.predicts == "sample":
+            return self._pulled(self._joined(self._replaced(found)))
+        kept = self.noiser.alphas_cumprod[int(step)].to(x)
+        found = (x - (1 - kept).sqrt() * found) / kept.sqrt()
         clean = self._pulled(self._joined(self._replaced(found)))
-        if schedule.predicts == "epsilon":
-            return (x - kept.sqrt() * clean) / (1 - kept).sqrt()
-        return clean
+        return (x - kept.sqrt() * clean) / (1 - kept).sqrt()
 
     def _blended(self, x: Tensor, step: Tensor) -> Tensor:
         """The means of all rows' predictions [n, T, D]."""

@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.check.claims import Verdict, verdicts
 from motionloom.datasets.convert.bvh.plan import BvhConfig
-from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.registry import prepare
-from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.schema import FACE, HANDS, PRESENT_ALL, Dropped, UserError
+from motionloom.datasets.schema import HANDS, PRESENT_ALL, Dropped, UserError
 from motionloom.pipeline.contract.captioning import MotionCaptioner, Sentence
-from motionloom.pipeline.inference.edits.clips import read_clip
+from motionloom.pipeline.inference.edits.clips import features_for, read_clip
 from motionloom.pipeline.inference.edits.recorded import LEAST_FRAMES
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
@@ -127,19 +125,6 @@ def read_clips(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Droppe
             )
         except UserError as error:
             yield Dropped(source=str(path), reason=str(error).removeprefix(f"{path}: "))
-
-
-def features_for(
-    joints: NDArray[np.floating], fps: float, layout: MotionLayout, face: NDArray[np.floating] | None = None
-) -> tuple[NDArray[np.float32], int]:
-    """Features [T', D] of joints [T, 22 or 52, 3], and what they hold; hands at rest where there are none."""
-    has_hands = joints.shape[1] >= layout.num_joints > BODY_JOINTS
-    if joints.shape[1] < layout.num_joints:
-        joints = with_resting_hands(joints)
-    has_face = face is not None and layout.has("face")
-    present = HANDS * has_hands | FACE * has_face
-    joints = joints[:, : layout.num_joints]
-    return features_of(joints, fps, layout, face=face if has_face else None), present
 
 
 def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped]:

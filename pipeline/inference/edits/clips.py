@@ -17,7 +17,7 @@ from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import FACE, HANDS, UserError
 from motionloom.pipeline.inference.edits.recorded import LEAST_FRAMES, RecordedClip
 
 ENDINGS = (".bvh", ".npz", ".glb")
@@ -65,9 +65,20 @@ def read_seed_motion(path: Path, layout: MotionLayout) -> NDArray[np.float32]:
             f"{path}: a clip has joints, and this model goes on from the rotations of layout {layout.name}; "
             f"leave the seed motion out, or give columns [T, {layout.dim}] in Python"
         )
-    joints = clip.joints if layout.num_joints <= clip.joints.shape[1] else with_resting_hands(clip.joints)
-    face = clip.face if layout.has("face") else None
-    return features_of(joints[:, : layout.num_joints], clip.fps, layout, face=face)
+    return features_for(clip.joints, clip.fps, layout, clip.face)[0]
+
+
+def features_for(
+    joints: NDArray[np.floating], fps: float, layout: MotionLayout, face: NDArray[np.floating] | None = None
+) -> tuple[NDArray[np.float32], int]:
+    """Features [T', D] of joints [T, 22 or 52, 3], and what they hold; hands at rest where there are none."""
+    has_hands = joints.shape[1] >= layout.num_joints > BODY_JOINTS
+    if joints.shape[1] < layout.num_joints:
+        joints = with_resting_hands(joints)
+    has_face = face is not None and layout.has("face")
+    present = HANDS * has_hands | FACE * has_face
+    joints = joints[:, : layout.num_joints]
+    return features_of(joints, fps, layout, face=face if has_face else None), present
 
 
 def _of_bvh(path: Path) -> RecordedClip:
