@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from motionloom.datasets.conditions import Conditions
-from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.words import Encode
 from motionloom.models.gpt.drawing import Drawing, sample_seeds
@@ -23,6 +22,7 @@ from motionloom.models.gpt.tokens import as_codes
 from motionloom.pipeline.contract.generation import FrameFlow, GenerationRequest, TokenFlow
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.inference.generators.frames import Frames
+from motionloom.pipeline.inference.generators.of_tokens import OfTokens
 from motionloom.pipeline.store.networks import (
     LoadedGpt,
     LoadedTma,
@@ -40,7 +40,7 @@ _CANDIDATES_AT_ONCE = 64
 
 
 @dataclass(frozen=True)
-class GptGenerator:
+class GptGenerator(OfTokens):
     """Tokens sampled from a GPT, then decoded: body and hands, or the face's residual codes (B.4)."""
 
     gpt: LoadedGpt
@@ -55,20 +55,8 @@ class GptGenerator:
         return tokenizer
 
     @property
-    def layout(self) -> MotionLayout:
-        return self.tokenizer.layout
-
-    @property
-    def group_tokens(self) -> dict[str, int]:
-        return {stream.name: stream.per_group for stream in self.tokenizer.net.streams}
-
-    @property
     def prepared(self) -> Mapping[str, object]:
         return {"text": self.given.get("text")}
-
-    @property
-    def part(self) -> Part:
-        return self.tokenizer.net.part
 
     @property
     def settings(self) -> frozenset[str]:
@@ -97,10 +85,6 @@ class GptGenerator:
             return latents
 
         return read
-
-    @property
-    def unit_frames(self) -> int:
-        return self.tokenizer.net.group_frames
 
     @property
     def max_frames(self) -> int:

@@ -10,15 +10,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.models.baselines.tm2t.seq2seq import Seq2Seq, draw_tokens
 from motionloom.models.gpt.drawing import Drawing
 from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.inference.generators.of_tokens import OfTokens
 from motionloom.pipeline.store.networks import TrainedTokenizer, device_of
 
 
 @dataclass(frozen=True)
-class Seq2SeqGenerator:
+class Seq2SeqGenerator(OfTokens):
     """Tokens drawn word by word, then decoded."""
 
     net: Seq2Seq
@@ -33,20 +33,8 @@ class Seq2SeqGenerator:
         return tokenizer
 
     @property
-    def layout(self) -> MotionLayout:
-        return self.tokenizer.layout
-
-    @property
-    def part(self) -> Part:
-        return self.tokenizer.net.part
-
-    @property
     def prepared(self) -> Mapping[str, object]:
         return {"text": self.given.get("text")}
-
-    @property
-    def unit_frames(self) -> int:
-        return self.tokenizer.net.group_frames
 
     @property
     def max_frames(self) -> int:

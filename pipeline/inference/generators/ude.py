@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd_streaming import DmdStream
 from motionloom.models.diffusion.sampling import decode_motions
@@ -24,6 +23,7 @@ from motionloom.pipeline.contract.generation import FrameFlow, GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import StageConfig
 from motionloom.pipeline.inference.generators.frames import Frames
+from motionloom.pipeline.inference.generators.of_tokens import OfTokens
 from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
 from motionloom.pipeline.store.networks import LoadedDmd, LoadedUtt, TrainedTokenizer
 
@@ -46,7 +46,7 @@ class UdeConfig(StageConfig):
 
 
 @dataclass(frozen=True)
-class UdeGenerator:
+class UdeGenerator(OfTokens):
     """Motion of text, music or both, of any length."""
 
     utt: LoadedUtt
@@ -61,18 +61,6 @@ class UdeGenerator:
         return tokenizer
 
     @property
-    def layout(self) -> MotionLayout:
-        return self.tokenizer.layout
-
-    @property
-    def group_tokens(self) -> dict[str, int]:
-        return {stream.name: stream.per_group for stream in self.tokenizer.net.streams}
-
-    @property
-    def part(self) -> Part:
-        return self.tokenizer.net.part
-
-    @property
     def prepared(self) -> Mapping[str, object]:
         return {name: self.utt.given.get(name) for name in self.modalities}
 
@@ -84,10 +72,6 @@ class UdeGenerator:
     def settings(self) -> frozenset[str]:
         more = {"sampler", "denoising_steps"} if self.dmd is not None else set()
         return frozenset({"temperature", "top_k", "top_p", "cfg_scale", "guidance"} | more)
-
-    @property
-    def unit_frames(self) -> int:
-        return GROUP_FRAMES
 
     @cached_property
     def timeline(self) -> TokenTimeline:

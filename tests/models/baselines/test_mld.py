@@ -271,7 +271,7 @@ def vae() -> MotionVae:
     net = MotionVae(MotionVaeConfig(**SMALL | {"dim": 32, "ff": 64}, positions=64), 133)
     module = MotionVaeModule(
         net, OPTIM, seed=0, max_steps=250, layout=MotionLayout.named("body133"),
-        mean=np.zeros(133, np.float32), std=np.full(133, 0.05, np.float32),
+        mean=np.zeros(133, np.float32), std=np.full(133, 0.05, np.float32), loss=MotionVaeLossConfig(),
     )  # fmt: skip
     take_steps(module, [batch(motion, kind, torch.randint(48, (16,))) for _ in range(250)])
     return net.eval()

@@ -1,0 +1,33 @@
+"""What the tokenizer says of whatever reads or writes its tokens."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.pipeline.store.networks import TrainedTokenizer
+
+
+class OfTokens(ABC):
+    """A model of one tokenizer's tokens."""
+
+    @property
+    @abstractmethod
+    def tokenizer(self) -> TrainedTokenizer:
+        """What makes motion of its tokens, or tokens of its motion."""
+
+    @property
+    def layout(self) -> MotionLayout:
+        return self.tokenizer.layout
+
+    @property
+    def part(self) -> Part:
+        return self.tokenizer.net.part
+
+    @property
+    def group_tokens(self) -> dict[str, int]:
+        return {stream.name: stream.per_group for stream in self.tokenizer.net.streams}
+
+    @property
+    def unit_frames(self) -> int:
+        return self.tokenizer.net.group_frames
