@@ -13,7 +13,7 @@ from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
-from motionloom.pipeline.inference.generators.motionclip import TextAsLatent
+from motionloom.pipeline.inference.generators.vae import TextAsLatent
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     CaptionStage,
