@@ -7,7 +7,8 @@ Test clips are made here, from the data settings of the recipe, or are BVH files
 taken away and made again: by the model, along straight lines, along splines through all that is kept, and as
 the training clip whose figure is nearest at both ends of the gap, laid between them. Then the model fills the
 same gap with the left wrist pinned in its middle, and goes a bent path with nothing kept, with the pull of
-several strengths and without the last exact step, so that its price shows.
+several strengths and without the last exact step, so that its price shows. And all after the gap's begin does
+what the words of another test clip say, by the rules that judge synthetic clips; beside the clip as it was.
 
 Seeds are those of the drawing; of the training there is one. `--write` makes the record and,
 from the records, the card of a shipped model.
@@ -32,10 +33,12 @@ from motionloom.datasets.motion.canonical import ground, heading, resample
 from motionloom.datasets.motion.features.joints import local_joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
+from motionloom.datasets.synth.measure import agrees
 from motionloom.models.metrics.dance import foot_skating
 from motionloom.models.metrics.editing import accelerations, seam_acceleration
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.edits.clips import read_clip
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.model import MotionModel, edit_clip
@@ -46,9 +49,12 @@ from motionloom.pipeline.runs.recipe import load_recipe
 RECIPE = "humantomato-inbetween"
 TRAINING = 300
 """Training clips among which the nearest is looked for."""
+TRIED = 5
+"""Test clips that were looked at while seams were mended, and are not measured."""
 GAP = (0.3, 0.7)
 SEEDS = (0, 1, 2)
 STRENGTHS = (0.0, 1.0, 5.0)
+OTHER_WORDS = "other words from the gap on"
 CARD = Path(__file__).with_name("edit_card.md")
 COLUMNS = [
     {"title": "from the recording, cm", "figure": "away", "digits": 1, "scale": 1.0},
@@ -57,6 +63,8 @@ COLUMNS = [
     {"title": "feet slide, % of steps", "figure": "skating", "digits": 0, "scale": 100.0},
     {"title": "pin missed by, cm", "figure": "pin", "digits": 1, "scale": 1.0},
     {"title": "path missed by, cm", "figure": "path", "digits": 1, "scale": 1.0},
+    {"title": "other action done, %", "figure": "action", "digits": 0, "scale": 100.0},
+    {"title": "of what the words ask, %", "figure": "words", "digits": 0, "scale": 100.0},
 ]
 Joints = NDArray[np.float64]
 
@@ -135,10 +143,21 @@ def tasks_of(clip: Joints, fps: float, gap: slice) -> tuple[dict[str, object], d
     return {"keep": keep, "pins": [pin]}, {"path": path, "caption": "a person walks forward"}
 
 
-def asked_of(clip: Joints, fps: float, gap: slice) -> dict[str, dict[str, object]]:
+def obeyed(joints: Joints, words: Truth, fps: float, start: int) -> dict[str, float]:
+    """Whether the frames from `start` on do the words' action, and which share of all that these ask."""
+    found = agrees(words.truth or {}, joints[start:], None, fps)
+    return {"action": float(found["action"]), "words": float(np.mean(list(found.values())))}
+
+
+def asked_of(clip: Joints, fps: float, gap: slice, words: Truth) -> dict[str, dict[str, object]]:
     """What the model is asked for, by the row's title."""
     pin, path = tasks_of(clip, fps, gap)
     out = {"**the model**": {"keep": pin["keep"]}}
+    out[OTHER_WORDS] = {
+        "keep": [{"end": gap.start / fps}],
+        "caption": words.caption,
+        "seconds": (gap.start + len(words.joints)) / fps,
+    }
     for strength in STRENGTHS:
         loose = {"strength": strength, "exact": False}
         out[f"pinned, pull {strength:g}"] = pin | loose
@@ -155,7 +174,11 @@ def figures_of(made: EditedMotion, clip: Joints, fps: float, gap: slice) -> dict
 
 
 def rows_of(
-    model: MotionModel, clips: Sequence[RecordedClip], training: Sequence[Joints], console: Console
+    model: MotionModel,
+    clips: Sequence[RecordedClip],
+    words: Sequence[Truth],
+    training: Sequence[Joints],
+    console: Console,
 ) -> list[dict[str, object]]:
     """The rows of the record: of the model one value a seed, its mean over the clips."""
     fps = model.fps
@@ -166,14 +189,20 @@ def rows_of(
         f"nearest of {TRAINING} training clips": lambda clip, gap: nearest(clip, gap, fps, training),
     }
     found: dict[str, dict[int, list[dict[str, float]]]] = {}
-    for number, clip in enumerate(clips, start=1):
+    for number, (clip, others) in enumerate(zip(clips, words, strict=True), start=1):
         gap = slice(*(round(share * len(clip.joints)) for share in GAP))
         for title, rival in rivals.items():
             filled = measured(rival(clip.joints, gap), clip.joints, fps, gap)
+            if title == "recorded":
+                filled |= obeyed(clip.joints, others, fps, gap.start)
             found.setdefault(title, {}).setdefault(SEEDS[0], []).append(filled)
-        for title, task in asked_of(clip.joints, fps, gap).items():
+        for title, task in asked_of(clip.joints, fps, gap, others).items():
             for seed in SEEDS:
-                figures = figures_of(edited(model, clip, seed, task), clip.joints, fps, gap)
+                made = edited(model, clip, seed, task)
+                figures = figures_of(made, clip.joints, fps, gap)
+                if title == OTHER_WORDS:
+                    figures = {"skating": made.report.skating}
+                    figures |= obeyed(made.joints, others, fps, gap.start)
                 found.setdefault(title, {}).setdefault(seed, []).append(figures)
         console.print(f"{number} of {len(clips)}", highlight=False)
     rows: list[dict[str, object]] = []
@@ -229,14 +258,16 @@ def main() -> None:
     args = parser.parse_args()
     model, console = MotionModel(args.model, "cpu"), Console()
     recipe = load_recipe(RECIPE)
-    truths, config = test_clips(recipe, args.clips)
+    wanted = len(args.real) if args.real else args.clips
+    truths, config = test_clips(recipe, TRIED + 2 * wanted)
+    words, truths = truths[TRIED : TRIED + wanted], truths[TRIED + wanted :]
     clips = [RecordedClip(truth.id, truth.joints, model.fps, truth.face) for truth in truths]
     if args.real:
         clips = [read_clip(path) for path in args.real]
     clips = [on_the_floor(clip, model.fps) for clip in clips]
     if not clips:
         raise UserError("no clips to edit")
-    rows = rows_of(model, clips, training_of(config, TRAINING), console)
+    rows = rows_of(model, clips, words, training_of(config, TRAINING), console)
     kind = "recorded clips" if args.real else "synthetic test clips"
     if args.write:
         write(args.name, f"Gaps in {kind}, filled; {recipe.name}", COLUMNS, rows)

@@ -1,7 +1,7 @@
 """Motion that is partly given: diffusion under a mask, pulled towards places and pins.
 
 At every denoising step the predicted clean motion is replaced by the given one where that is known (MDM's
-editing), smoothed with the known part fixed, so that both join [ours], and pulled by the gradient of what it
+editing), led and smoothed so that both join [ours], and pulled by the gradient of what it
 misses by: the root's known places and headings, and pinned joints, recovered in metres (`recovery.py`).
 Networks with `observed` columns are also shown all that is known but the pins.
 
@@ -117,7 +117,7 @@ class Filling:
         self.text = torch.stack([said.text for _, said, _ in rows])
         self.conditioned = torch.tensor([said.conditioned for _, said, _ in rows], device=self.text.device)
         self.seen = torch.stack([self._seen(start) for start in self.starts])
-        self._smoothers = self._smoothers_of()
+        self._joints = self._joints_of()
 
     def __call__(self, seeds: Sequence[int], sampler: Sampler, steps: int) -> Tensor:
         """Motions [n, T, D], normalised, one for each seed; what is known in them is the given to the bit."""
@@ -130,7 +130,7 @@ class Filling:
             x = self.noiser.add_noise(given.motion.expand_as(x), x, begin).to(x)
         with evaluating(self.net):
             made = schedule.denoise(self._predict, x, noise, sampler, steps, skip=skip)
-        return self._replaced(self._joined(self._replaced(made)))
+        return self._replaced(self._joined(made))
 
     def _seen(self, start: int) -> Tensor:
         """What the network is shown of a window [W, 2 D + 6]."""
@@ -143,10 +143,10 @@ class Filling:
         """The network's prediction for motions x [n, T, D], after what is known and asked of it."""
         found = self._blended(x, step)
         if self.net.config.schedule.predicts == "sample":
-            return self._pulled(self._joined(self._replaced(found)))
+            return self._pulled(self._joined(found))
         kept = self.noiser.alphas_cumprod[int(step)].to(x)
         found = (x - (1 - kept).sqrt() * found) / kept.sqrt()
-        clean = self._pulled(self._joined(self._replaced(found)))
+        clean = self._pulled(self._joined(found))
         return (x - kept.sqrt() * clean) / (1 - kept).sqrt()
 
     def _blended(self, x: Tensor, step: Tensor) -> Tensor:
@@ -209,34 +209,40 @@ class Filling:
         return motion
 
     def _joined(self, motion: Tensor) -> Tensor:
-        """Motions whose free values bend no more than they must, also where they meet known ones.
+        """Motions [n, T, D] with what is known in its place, and the free values led to it.
 
-        Small networks tremble, and what they make does not quite begin where the kept part ends. Each column
-        is the nearest to theirs whose second differences are small, with the known values fixed.
+        Networks do not quite begin where the kept part ends, and small ones tremble. By how much they miss
+        what is known is taken from the free values too, less and less away from it and with as little bending
+        as that needs; then each column is the nearest to theirs whose second differences are small.
         """
-        out = motion.clone()
-        for columns, smoother in self._smoothers:
-            out[..., columns] = torch.einsum("ts,nsd->ntd", smoother, motion[..., columns])
+        out = self._replaced(motion)
+        missed = out - motion
+        for columns, leading, smoother in self._joints:
+            led = out[..., columns] + torch.einsum("ts,nsd->ntd", leading, missed[..., columns])
+            out[..., columns] = torch.einsum("ts,nsd->ntd", smoother, led)
         return out
 
-    def _smoothers_of(self) -> list[tuple[Tensor, Tensor]]:
-        """Columns that are known in the same frames, and what smooths them [T, T]."""
-        known = self.given.known
-        frames = len(known)
-        bends = torch.eye(frames, dtype=torch.float64).diff(n=2, dim=0)
-        bending = _STIFFNESS * bends.T @ bends
+    def _joints_of(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Columns that are known in the same frames; what leads them there, and what smooths them: [T, T]."""
+        known, like = self.given.known, self.given.motion
+        one = torch.eye(len(known), dtype=torch.float64)
+        bends = one.diff(n=2, dim=0)
+        bending = bends.T @ bends
         patterns, of = np.unique(known.T.cpu().numpy(), axis=0, return_inverse=True)
         out = []
         for number, pattern in enumerate(patterns):
             free = torch.from_numpy(~pattern)[:, None]
-            smoother = torch.linalg.inv(torch.eye(frames, dtype=torch.float64) + bending * free)
+            leading = torch.linalg.inv(torch.where(free, bending + _LETTING_GO * one, one)) * free
+            smoother = torch.linalg.inv(one + _STIFFNESS * bending * free)
             columns = torch.from_numpy(np.flatnonzero(of.reshape(-1) == number))
-            out.append((columns.to(known.device), smoother.to(self.given.motion)))
+            out.append((columns.to(like.device), leading.to(like), smoother.to(like)))
         return out
 
 
 _STIFFNESS = 1.0
 """Of what is made: 1 halves what goes to and fro 3.3 times a second at 20 frames a second."""
+_LETTING_GO = 3.0**-4
+"""Of what is led: it follows for about three frames."""
 
 
 def _from_window(places: Places, inside: slice) -> Places:

@@ -74,6 +74,8 @@ class EditFrames:
     pins: dict[tuple[int, int], tuple[float, float, float]]
     scale: float
     """Size of the model's figure in that of the clip's."""
+    lift: float
+    """By how much the model's figure, in the clip's size, stands too low for the clip's feet, in metres."""
     origin: complex
     """Where the clip's first root stands in the clip's world, z + i x, and how it is turned there."""
     turn: float
@@ -127,18 +129,16 @@ class EditFrames:
         origin, turned = complex(ground(joints[0, 0])), float(facing(joints[:1])[0])
         own = canonicalize(joints)
         off = _differs(own, layout.skeleton)
-        work = own
+        work, scale, lift = own, 1.0, 0.0
         if off > SAME_BONES:
-            work = canonicalize(retarget(own, layout.skeleton))
+            posed = retarget(own, layout.skeleton)
+            work = canonicalize(posed)
+            scale = float(posed[0, 0, 1] / own[0, 0, 1])
+            lift = float(posed[0, 0, 1] - work[0, 0, 1]) / scale
             remarks.append(
                 f"its bones differ from the model's by {off:.0%}: the model moves its own figure, and what "
                 f"it makes is put back on the clip's bones"
             )
-        scale = (
-            float(np.median(work[:, 0, 1]) / max(float(np.median(own[:, 0, 1])), 1e-6))
-            if off > SAME_BONES
-            else 1.0
-        )
         features = encode(work, layout, face if layout.has("face") else None)
         own = own[: len(features)]
         face = None if face is None else face[: len(features)]
@@ -159,7 +159,7 @@ class EditFrames:
         return EditFrames(
             task, layout, first, own, face if face is None else np.asarray(face[: len(own)], np.float32),
             clip_way, _held(features[: len(own)], layout, first, total), pieces, anchor, way, path, pins,
-            scale, origin, turned, tuple(remarks),
+            scale, lift, origin, turned, tuple(remarks),
         )  # fmt: skip
 
     def model_pins(self) -> list[FramePin]:
@@ -167,7 +167,8 @@ class EditFrames:
         out = []
         for (frame, joint), (x, y, z) in self.pins.items():
             away = (complex(z, x) - self.anchor.place[0]) * np.exp(-1j * self.anchor.heading[0]) * self.scale
-            out.append(FramePin(frame, joint, (float(away.imag), y * self.scale, float(away.real))))
+            height = (y - self.lift) * self.scale
+            out.append(FramePin(frame, joint, (float(away.imag), height, float(away.real))))
         return out
 
     def shares(self) -> list[tuple[str, NDArray[np.float64]]]:

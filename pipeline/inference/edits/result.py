@@ -46,6 +46,7 @@ def finish(asked: EditFrames, made: NDArray[np.float32], face: NDArray[np.float3
         own = layout.skeleton.with_lengths_of(asked.joints).offsets
         joints = retarget(joints, layout.skeleton, own)
         joints = landed(joints, heading, way - ground(joints[:, 0]), np.zeros(len(joints)))[0]
+        joints[..., 1] += asked.lift
 
     rooted, inside = asked.rooted, asked.inside
     aim, aimed = way.copy(), rooted.copy()
