@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.conditions import Condition
+from motionloom.datasets.motion.figure_parts import PIECES
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.baselines.mld.losses import MotionVaeLossConfig
 from motionloom.models.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
@@ -34,6 +35,8 @@ from motionloom.models.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig
 from motionloom.models.baselines.tm2t.seq2seq_module import Seq2SeqModule
 from motionloom.models.diffusion.module import DiffusionModule
 from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.observed import Showing
+from motionloom.models.diffusion.recovery import Recovery
 from motionloom.models.evaluator.module import EvaluatorModule
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.models.gpt.losses import GptLossConfig
@@ -184,6 +187,14 @@ BODY: dict[str, Any] = {
 }  # fmt: skip
 
 
+def observed_diffusion() -> tuple[StageModule, Batches]:
+    layout, columns = BODY["layout"], BODY["layout"].part("all")
+    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2, observed=1.0), 133, TEXT)
+    showing = EndsShown(layout, columns, Recovery(layout, columns, BODY["mean"], BODY["std"]), 1.0)
+    module = UndrawnDiffusion(net, OPTIM, seed=0, max_steps=STEPS, showing=showing)
+    return module.eval(), lambda step: motion(step, 133) | captions(step)
+
+
 def motion_vae() -> tuple[StageModule, Batches]:
     net = MotionVae(MotionVaeConfig(dim=16, ff=16, layers=3, heads=2), 133)
     module = MotionVaeModule(net, OPTIM, seed=0, max_steps=STEPS, loss=MotionVaeLossConfig(), **BODY)
@@ -239,6 +250,16 @@ class Undrawn(StageModule):
 
 class UndrawnDiffusion(Undrawn, DiffusionModule):
     """MDM."""
+
+
+class EndsShown(Showing):
+    """Shows all but the frames 2 to 5, and of clips of an odd length where the root is in these."""
+
+    def _draw(self, length: Tensor, frames: int) -> tuple[Tensor, Tensor]:
+        at = torch.arange(frames)
+        inside, gap = at < length[:, None], (at >= 2) & (at < 6)
+        pieces = (inside & ~gap)[..., None].expand(-1, -1, len(PIECES))
+        return pieces, inside & gap & (length % 2 == 1)[:, None]
 
 
 class UndrawnLatents(Undrawn, LatentDiffusionModule):
@@ -322,6 +343,7 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "gpt, compiled": gpt,
     "gpt, samples": gpt_samples,
     "diffusion": diffusion,
+    "diffusion, observed": observed_diffusion,
     "motion_vae": motion_vae,
     "latent_diffusion": latent_diffusion,
     "motionclip": motionclip,

@@ -188,6 +188,24 @@ def test_likeness_stays_near_and_seeds_differ() -> None:
     assert away[0] > away[1] > away[2]
 
 
+class Aside(MotionDiffusion):
+    """Makes what is given, all of it off by 1."""
+
+    wanted: torch.Tensor
+
+    def forward(self, noisy: torch.Tensor, *more: object, **named: object) -> torch.Tensor:
+        return self.wanted.expand_as(noisy) + 1
+
+
+def test_what_the_network_misses_of_the_kept_part_is_led_off() -> None:
+    net, given = Aside(TINY, len(COLUMNS), 4), task(pinned=False)
+    still = Given(torch.zeros_like(given.motion), given.known)
+    net.wanted = still.motion
+    made = filled(net, still)[0]
+    off = made[8:16, given.known[0] & ~given.known[8]].mean(1)
+    assert off[0] < 0.2 and off[-1] < 0.2  # half a smoothed jump would be left otherwise
+
+
 def test_windows_and_words_share_frames() -> None:
     """Two stretches of words: only the frames of the second change with its words; windows overlap."""
     torch.manual_seed(0)

@@ -27,7 +27,9 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.edits.clips import read_clip, require_clip
+from motionloom.pipeline.inference.edits.frames import EditFrames
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
+from motionloom.pipeline.inference.edits.result import finish
 from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.inference.model import edit_clip
 from motionloom.pipeline.inference.motion import EditedMotion
@@ -181,6 +183,23 @@ def test_other_rates_bones_and_missing_hands_are_said(walk: Walk) -> None:
     np.testing.assert_array_equal(body[kept], made.original.joints[kept, :22])
     bones = np.linalg.norm(body[:, 4] - body[:, 1], axis=-1)  # a thigh
     np.testing.assert_allclose(bones[20:40], bones[0], rtol=0.02)
+
+
+def test_a_figure_on_other_bones_stands_where_the_clip_does(walk: Walk) -> None:
+    """Long shins, so that the share of the feet in its height is not the model's."""
+    long = walk(frames=60, fps=20.0)
+    for side in (7, 8):
+        below = [side, side + 3]
+        shin = long[:, side] - long[:, side - 3]
+        long[:, below] += 0.5 * shin[:, None]
+    long[..., 1] -= long[..., 1].min()
+    layout = MotionLayout.named("wholebody363", fps=20.0)
+    asked = EditFrames.of(EditTask.parse({"keep": ENDS}, "task"), RecordedClip("long", long, 20.0), layout)
+    assert asked.scale != 1.0
+    same = finish(asked, asked.features[:, layout.part("bodyhand")], None)
+    free = slice(20, 40)
+    off = np.linalg.norm(same.joints[free] - asked.to_world(asked.joints)[free], axis=-1)
+    assert off.max() < 0.01
 
 
 def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ stages:
 SIZES = "dim: 16, ff: 16, layers: 1, heads: 2"
 KINDS = {
     "mdm": f"{{kind: diffusion, part: bodyhand, net: {{{SIZES}, norm: post}}}}",
+    "observed": f"{{kind: diffusion, part: bodyhand, net: {{{SIZES}, observed: 0.9}}}}",
     "motiondiffuse": f"{{kind: motiondiffuse, max_frames: 40, net: {{{SIZES}, caption: {{{SIZES}}}}}}}",
 }
 
