@@ -315,8 +315,8 @@ def protocol_of(record: Record) -> str:
     common = {k: v for k, v in next(iter(each.values())).items() if all(p.get(k) == v for p in each.values())}
     parts = [said(common)]
     for title, own in each.items():
-        rest = {k: v for k, v in own.items() if k not in common}
-        parts += [f"{title}: {said(rest)}"] if rest else []
+        rest = said({k: v for k, v in own.items() if k not in common})
+        parts += [f"{title}: {rest}"] if rest else []
     return "\n\n" + "; ".join(part for part in parts if part) + f" ({record['measured']})."
 
 
