@@ -40,7 +40,7 @@ class DiffusionConfig(StackConfig):
     """Enter noisy frames as the best linear guess of the motion in them, which is next to nothing where they
     are next to noise [ours]: small networks take long to learn that. False is MDM's."""
     text_gain: float = Field(default=1.0, gt=0)
-    """What text vectors are multiplied by [ours]. Sentence encoders give vectors of length 1, of which a small
+    """What text vectors are multiplied by [ours]. Sentence encoders give vectors of length 1, of which a
     network hears next to nothing beside the time step; 1 is MDM's, whose CLIP vectors are about 10 long."""
     velocity_weight: float = Field(default=0.0, ge=0)
     """Weight of the same error between frame-to-frame differences, which makes motion smoother; 0 is MDM's

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.models.baselines.tm2t.vq import Tm2tQuantizer
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.body_hand import H2VQ, SeparateVQ
 from motionloom.models.tokenizer.config import (
@@ -11,6 +12,7 @@ from motionloom.models.tokenizer.config import (
     H2VQConfig,
     MqConfig,
     SeparateConfig,
+    Tm2tConfig,
 )
 from motionloom.models.tokenizer.single import FsqTokenizer, MotionQuantizer, SingleTokenizer
 
@@ -23,6 +25,8 @@ def build_tokenizer(config: AnyTokenizerConfig, layout: MotionLayout) -> Tokeniz
         return SeparateVQ(config, layout)
     if isinstance(config, FsqConfig):
         return FsqTokenizer(config, layout)
+    if isinstance(config, Tm2tConfig):
+        return Tm2tQuantizer(config, layout)
     if isinstance(config, MqConfig):
         return MotionQuantizer(config, layout)
     return SingleTokenizer(config, layout)

@@ -152,7 +152,17 @@ class MqConfig(BaseTokenizerConfig):
         )
 
 
-AnyTokenizerConfig = H2VQConfig | VqConfig | RvqConfig | SeparateConfig | FsqConfig | MqConfig
+class Tm2tConfig(MqConfig):
+    """TM2T's tokenizer: its residual blocks are behind the codebook, in the decoder."""
+
+    kind: Literal["tm2t"] = "tm2t"  # type: ignore[assignment]
+    depth: int = Field(default=3, ge=0, le=32)
+    """Residual blocks of the decoder; the encoder has one after each layer that changes the rate."""
+    num_codes: int = Field(default=1024, ge=2)
+    quantizer: Literal["gradient"] = "gradient"
+
+
+AnyTokenizerConfig = H2VQConfig | VqConfig | RvqConfig | SeparateConfig | FsqConfig | MqConfig | Tm2tConfig
 _KINDS: dict[str, type[AnyTokenizerConfig]] = {
     "h2vq": H2VQConfig,
     "vq": VqConfig,
@@ -160,6 +170,7 @@ _KINDS: dict[str, type[AnyTokenizerConfig]] = {
     "separate": SeparateConfig,
     "fsq": FsqConfig,
     "mq": MqConfig,
+    "tm2t": Tm2tConfig,
 }
 
 

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.motion.layout import MotionLayout
@@ -59,10 +59,10 @@ class SingleTokenizer(Tokenizer):
         return total
 
 
-class _OneCodebook(Tokenizer):
+class OneCodebook(Tokenizer):
     """One stream, "code"; subclasses set `encoder`, `quantizer` and `decoder`."""
 
-    encoder: ConvEncoder | StridedEncoder
+    encoder: nn.Module
     quantizer: FsqQuantizer | GradientQuantizer | EmaQuantizer
 
     def codebooks(self) -> dict[str, Codebook]:
@@ -83,7 +83,7 @@ class _OneCodebook(Tokenizer):
         return vectors["code"]
 
 
-class FsqTokenizer(_OneCodebook):
+class FsqTokenizer(OneCodebook):
     """The single tokenizer's convolutions around finite scalar quantization."""
 
     def __init__(self, config: FsqConfig, layout: MotionLayout) -> None:
@@ -99,7 +99,7 @@ class FsqTokenizer(_OneCodebook):
         return functional.layer_norm(super()._latents(x, valid), (self.config.code_dim,))
 
 
-class MotionQuantizer(_OneCodebook):
+class MotionQuantizer(OneCodebook):
     """UDE's motion quantization."""
 
     def __init__(self, config: MqConfig, layout: MotionLayout) -> None:

@@ -147,9 +147,9 @@ def generators_of(run: Path) -> list[Finished]:
     """The finished stages of a run that generate, its default first.
 
     Those that the recipe lists as a stage's inputs come first, in that order, then those that a finished
-    stage such as `generate` has read: a recipe with several says so which it means. Those of other runs are
-    among them where one of these stages reads them. One that another started from is none, unless it is
-    listed or read.
+    stage such as `generate` has read as generators: a recipe with several says so which it means. Those of
+    other runs are among them where one of these stages reads them. One that another started from is none,
+    unless it is listed or read.
     """
     stages = finished_stages(run)
     makers = {stage.folder.resolve(): stage for stage in stages.values() if stage.gives(GENERATOR)}
@@ -157,8 +157,8 @@ def generators_of(run: Path) -> list[Finished]:
         source
         for stage in stages.values()
         if not stage.gives(GENERATOR)
-        for source in stage.inputs.values()
-        if source.gives(GENERATOR)
+        for role, source in stage.inputs.items()
+        if source.gives(GENERATOR) and role.partition(".")[0] == "generators"
     ]
     listed = _listed(run)
     for place in listed:

@@ -179,7 +179,16 @@ class Rows:
     of: int
 
 
-Source = str | Rows | tuple[str, ...]
+@dataclass(frozen=True)
+class Picked:
+    """Some of the `of` rows of a tensor, in this order."""
+
+    name: str
+    rows: tuple[int, ...]
+    of: int
+
+
+Source = str | Rows | Picked | tuple[str, ...]
 """Where a tensor of ours lies in a release: in one of its shape (axes of length 1 aside), in some rows of
 one, or in several of equally many rows, one below the other."""
 
@@ -208,6 +217,8 @@ class Release:
             shape = tuple(own[name].shape)
             if isinstance(source, Rows):
                 shapes[source.name] = (shape[0] * source.of, *shape[1:])
+            elif isinstance(source, Picked):
+                shapes[source.name] = (source.of, *shape[1:])
             elif isinstance(source, tuple):
                 shapes |= dict.fromkeys(source, (shape[0] // len(source), *shape[1:]))
             else:
@@ -219,6 +230,8 @@ class Release:
 def _taken(found: Mapping[str, torch.Tensor], source: Source) -> torch.Tensor:
     if isinstance(source, Rows):
         return found[source.name].chunk(source.of)[source.part]
+    if isinstance(source, Picked):
+        return found[source.name][list(source.rows)]
     return torch.cat([found[name] for name in source]) if isinstance(source, tuple) else found[source]
 
 

@@ -30,9 +30,10 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.tokens import Tokens
 from motionloom.pipeline.store.data import Data, DataPreview, captions_of
 from motionloom.pipeline.store.networks import TrainedTokenizer, require_streams, stream_facts
+from motionloom.pipeline.store.published_captioner import captioner_names, published_words
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, gpt_clips
-from motionloom.pipeline.store.weights import ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts, Release
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -122,7 +123,8 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
         return super().gives(config) | {CAPTIONER}
 
     def facts(self, config: CaptionerStageConfig, inputs: CaptionerInputs) -> ModelFacts:
-        words = _vocabulary(config, inputs.data).words
+        published = config.published
+        words = published_words(published) if published else _vocabulary(config, inputs.data).words
         extra = {"words": list(words), **stream_facts(inputs.tokenizer.net)}
         return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
@@ -131,6 +133,12 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
         require_streams(facts, tokenizer, "captioner")
         config = CaptionerConfig.parse(facts.config, facts.where)
         return Captioner(config, tokenizer.streams, tokenizer.pattern, len(_words(facts)))
+
+    def release(self, net: Captioner) -> Release | None:
+        """TM2T's, of one codebook."""
+        if len(net.names) > 1:
+            return None
+        return Release(captioner_names(net), unread=("trg_word_prj.weight", "*.positional_encoding"))
 
     def module(
         self, config: CaptionerStageConfig, net: Captioner, inputs: CaptionerInputs, seed: int

@@ -1,4 +1,4 @@
-"""Tokenizer stages: H2VQ, VQ, RVQ, FSQ; body-hand, body only or face (HumanTOMATO section 3.2, B.2)."""
+"""Tokenizer stages: H2VQ, VQ, RVQ, FSQ, TM2T's; body-hand, body or face (HumanTOMATO section 3.2, B.2)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
+from motionloom.models.baselines.tm2t.vq import Tm2tQuantizer, tm2t_names
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (
@@ -25,6 +26,7 @@ from motionloom.models.tokenizer.config import (
     MqConfig,
     RvqConfig,
     SeparateConfig,
+    Tm2tConfig,
     VqConfig,
     parse_tokenizer,
 )
@@ -33,7 +35,7 @@ from motionloom.pipeline.contract.stage import Inputs, Stage, filled_by, registe
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import TrainedTokenizer
-from motionloom.pipeline.store.weights import ModelFacts
+from motionloom.pipeline.store.weights import ModelFacts, Release
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 from motionloom.pipeline.training.warm_start import require_same_start, require_start_layout
@@ -120,6 +122,12 @@ class MqStageConfig(TokenizerStageConfig):
     net: MqConfig = MqConfig()
 
 
+class Tm2tStageConfig(TokenizerStageConfig):
+    """TM2T's tokenizer."""
+
+    net: Tm2tConfig = Tm2tConfig()
+
+
 class WindowInputs(Inputs):
     """What a stage takes that trains on windows."""
 
@@ -157,6 +165,10 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
     def network(self, facts: ModelFacts, inputs: TokenizerInputs) -> Tokenizer:
         config = parse_tokenizer(facts.config, f"{facts.where}: config")
         return build_tokenizer(config, facts.layout.layout())
+
+    def release(self, net: Tokenizer) -> Release | None:
+        """TM2T's."""
+        return Release(tm2t_names(net)) if isinstance(net, Tm2tQuantizer) else None
 
     def prepare(self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs) -> None:
         """The coordinates it learns in depend on how features are normalised; or all comes from a start."""
@@ -229,3 +241,4 @@ register(TokenizerStage("rvq", "RVQ tokenizer", RvqStageConfig))
 register(TokenizerStage("separate", "body and hands apart", SeparateStageConfig))
 register(TokenizerStage("fsq", "FSQ tokenizer", FsqStageConfig))
 register(TokenizerStage("mq", "UDE's motion quantization", MqStageConfig))
+register(TokenizerStage("tm2t", "TM2T's tokenizer", Tm2tStageConfig))

@@ -19,6 +19,7 @@ from motionloom.models.tokenizer.config import (
     MqConfig,
     RvqConfig,
     SeparateConfig,
+    Tm2tConfig,
     VqConfig,
 )
 from motionloom.models.tokenizer.streaming import StreamDecoder
@@ -33,6 +34,7 @@ KINDS: dict[str, AnyTokenizerConfig] = {
     "separate": SeparateConfig(**SMALL, depth=2, dilation_growth=3),
     "fsq": FsqConfig(width=8, depth=1, code_dim=6, steps=(4, 4)),
     "mq": MqConfig(**SMALL, depth=2, dilation_growth=3),
+    "tm2t": Tm2tConfig(**SMALL, depth=2, dilation_growth=3),
 }
 
 

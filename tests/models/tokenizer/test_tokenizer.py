@@ -21,6 +21,7 @@ from motionloom.models.tokenizer.config import (
     MqConfig,
     RvqConfig,
     SeparateConfig,
+    Tm2tConfig,
     VqConfig,
     parse_tokenizer,
 )
@@ -36,6 +37,7 @@ CONFIGS = {
     "separate": SeparateConfig(**SMALL),
     "fsq": FsqConfig(width=16, depth=2, code_dim=8, steps=(4, 4)),
     "mq": MqConfig(**SMALL, start="data"),
+    "tm2t": Tm2tConfig(**SMALL, start="data"),
     "mq by moving averages": MqConfig(**SMALL, quantizer="ema"),
 }
 
@@ -110,6 +112,12 @@ def test_sizes_of_udes_quantization() -> None:
     assert isinstance(config, MqConfig)
     assert config.commitment() == 1
     assert (config.codebook_weight, config.commitment_weight) == (1, 1)
+
+
+def test_sizes_of_tm2ts_tokenizer() -> None:
+    net = build_tokenizer(Tm2tConfig(), MotionLayout.named("h3d263"))
+    sizes = [sum(p.numel() for p in part.parameters()) for part in (net.encoder, net.decoder, net.quantizer)]
+    assert sizes == [17_844_224, 23_043_233, 1_048_576]
 
 
 def test_padded_batch_equals_each_clip_alone(tokenizer: Tokenizer) -> None:
