@@ -104,8 +104,8 @@ class Tm2tQuantizer(OneCodebook):
         heard = np.ones(layout.dim, dtype=np.bool_)
         if layout.has("foot_contacts"):
             heard[layout.slice("foot_contacts")] = False
-        heard = torch.from_numpy(np.flatnonzero(heard[self.columns.numpy()]))
-        self.encoder = Tm2tEncoder(heard, config.code_dim, config.width)
+        numbers = torch.from_numpy(np.flatnonzero(heard[self.columns.numpy()]))
+        self.encoder = Tm2tEncoder(numbers, config.code_dim, config.width)
         self.quantizer = GradientQuantizer(config.codebook())
         self.decoder = Tm2tDecoder(config.code_dim, self.dim, **config.conv_sizes())
 
