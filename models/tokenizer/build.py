@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.baselines.tm2t.vq import Tm2tQuantizer
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.body_hand import H2VQ, SeparateVQ
 from motionloom.models.tokenizer.config import (
@@ -15,6 +14,7 @@ from motionloom.models.tokenizer.config import (
     Tm2tConfig,
 )
 from motionloom.models.tokenizer.single import FsqTokenizer, MotionQuantizer, SingleTokenizer
+from motionloom.models.tokenizer.tm2t import Tm2tQuantizer
 
 
 def build_tokenizer(config: AnyTokenizerConfig, layout: MotionLayout) -> Tokenizer:

@@ -15,7 +15,6 @@ from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
-from motionloom.models.baselines.tm2t.vq import Tm2tQuantizer, tm2t_names
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import (
@@ -30,6 +29,7 @@ from motionloom.models.tokenizer.config import (
     VqConfig,
     parse_tokenizer,
 )
+from motionloom.models.tokenizer.tm2t import Tm2tQuantizer, tm2t_names
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Inputs, Stage, filled_by, register
 from motionloom.pipeline.launch.hardware import Hardware
