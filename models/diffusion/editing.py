@@ -151,7 +151,7 @@ class Filling:
 
     def _blended(self, x: Tensor, step: Tensor) -> Tensor:
         """The means of all rows' predictions [n, T, D]."""
-        count, guided = len(x), self.guidance != 1.0
+        count, guided = len(x), self.guidance != 1.0 and bool(self.conditioned.any())
         windows = torch.stack([x[:, start : start + self.size] for start in self.starts], dim=1)
         rows = windows.flatten(0, 1)
 
