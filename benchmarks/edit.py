@@ -199,10 +199,11 @@ def rows_of(
         for title, task in asked_of(clip.joints, fps, gap, others).items():
             for seed in SEEDS:
                 made = edited(model, clip, seed, task)
-                figures = figures_of(made, clip.joints, fps, gap)
                 if title == OTHER_WORDS:
                     figures = {"skating": made.report.skating}
                     figures |= obeyed(made.joints, others, fps, gap.start)
+                else:
+                    figures = figures_of(made, clip.joints, fps, gap)
                 found.setdefault(title, {}).setdefault(seed, []).append(figures)
         console.print(f"{number} of {len(clips)}", highlight=False)
     rows: list[dict[str, object]] = []
