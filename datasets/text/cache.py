@@ -4,7 +4,7 @@
 |------------------|---------|
 | `keys.npy`       | uint8 [n, 32], sha256 of each caption's UTF-8, ascending; row i is the same below |
 | `captions.jsonl` | the captions themselves, one JSON string a line |
-| `sentence.npy`   | float32 [n, E], unit length |
+| `sentence.npy`   | float32 [n, E], of unit length but for CLIP's |
 | `offsets.npy`    | int64 [n + 1]: the tokens of caption i are rows `offsets[i] : offsets[i + 1]` |
 | `tokens.npy`     | float16 [sum, E], without padding |
 | `cache.json`     | encoder name, E, n; written last, so its presence means the rest is whole |
@@ -77,12 +77,15 @@ class TextCache:
         return len(self._keys)
 
     def sentence(self, captions: Sequence[str]) -> NDArray[np.float32]:
-        """Unit-length sentence embeddings, [n, E]."""
+        """Sentence embeddings [n, E], as the encoder gives them."""
         return np.asarray(self._sentence[self._rows(captions)], dtype=np.float32)
 
     def similarity(self, captions: Sequence[str]) -> NDArray[np.float32]:
         """Unit-length embeddings whose cosines say which captions mean the same, [n, S]."""
-        return self.sentence(captions) if self._other is None else self._other.sentence(captions)
+        found = (self._other or self).sentence(captions)
+        length = np.linalg.norm(found, axis=1, keepdims=True)
+        # What has length 1 already stays as it is, to the bit.
+        return np.where(abs(length - 1) < 1e-5, found, found / length.clip(min=1e-12))
 
     def tokens(self, captions: Sequence[str]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Token embeddings [n, S, E], zero padded to the longest, and the mask [n, S] of real tokens."""

