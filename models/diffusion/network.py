@@ -39,9 +39,6 @@ class DiffusionConfig(StackConfig):
     quieted: bool = False
     """Enter noisy frames as the best linear guess of the motion in them, which is next to nothing where they
     are next to noise [ours]: small networks take long to learn that. False is MDM's."""
-    text_gain: float = Field(default=1.0, gt=0)
-    """What text vectors are multiplied by [ours]. Sentence encoders give vectors of length 1, of which a
-    network hears next to nothing beside the time step; 1 is MDM's, whose CLIP vectors are about 10 long."""
     velocity_weight: float = Field(default=0.0, ge=0)
     """Weight of the same error between frame-to-frame differences, which makes motion smoother; 0 is MDM's
     for features."""
@@ -100,7 +97,7 @@ class MotionDiffusion(nn.Module):
                 without such columns take no notice of it.
         """
         time = self.time(waves(step, self.config.dim).to(self.text.weight.dtype))
-        condition = self.text(self.config.text_gain * text * conditioned[:, None]) + time
+        condition = self.text(text * conditioned[:, None]) + time
         if self.config.quieted:
             noisy = noisy * self.share[step][:, None, None].to(noisy.dtype)
         frames = self.enter(noisy)

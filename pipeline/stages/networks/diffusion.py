@@ -66,7 +66,7 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
     def release(self, net: MotionDiffusion) -> Release | None:
         """MDM's `trans_enc`."""
         config = net.config
-        if config.norm == "pre" or config.observed or config.quieted or config.text_gain != 1:
+        if config.norm == "pre" or config.observed or config.quieted:
             return None
         return Release(mdm_names(net), unread=("*.pe", "clip_model.*"))
 
