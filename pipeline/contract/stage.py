@@ -212,6 +212,8 @@ class StageKind(ABC, Generic[C]):
     takes: tuple[str | Every, ...] = ()
     """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`. A role called
     otherwise than what fills it tells that behind a colon: "face_tokenizer?: tokenizer"."""
+    offers: frozenset[str] = frozenset()
+    """Names of what other stages may ask of it, such as "tokenizer" or `GENERATOR`."""
     version: int = 1
     """Raised when the same config makes something else than before."""
     trains: bool = False
@@ -221,8 +223,8 @@ class StageKind(ABC, Generic[C]):
     """Whether all processes of a run take part by `share` before the first of them runs the stage."""
 
     def gives(self, config: C) -> frozenset[str]:
-        """Names of what other stages may ask of this one, such as "tokenizer" or `GENERATOR`."""
-        return frozenset()
+        """`offers`, where the config does not say otherwise."""
+        return self.offers
 
     def roles(self) -> tuple[Role | Every, ...]:
         """`takes`, parsed."""
@@ -312,10 +314,7 @@ class FunctionStage(StageKind):
     version: int = 1
     trains: bool = False
     shares: bool = False
-    given_names: frozenset[str] = field(default_factory=frozenset)
-
-    def gives(self, config: Any) -> frozenset[str]:
-        return self.given_names
+    offers: frozenset[str] = frozenset()
 
     def run(self, context: StageContext) -> None:
         self.function(context)

@@ -113,7 +113,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         return None
 
     def gives(self, config: C) -> frozenset[str]:
-        return frozenset({SHOWING})
+        return self.offers | {SHOWING}
 
     def external(self, config: C) -> object:
         """The checksum of published weights."""

@@ -205,12 +205,9 @@ class PacerStage(TrainedStage[PacerConfig, PacerInputs, Pacer]):
     name = "pacer"
     summary = "motion paced by music"
     config = PacerConfig
+    offers = frozenset({GENERATOR})
     inputs = PacerInputs
     curves = (Curve("pacer_distance"), Curve("critic_margin", "margin of the critic"))
-
-    def gives(self, config: PacerConfig) -> frozenset[str]:
-        """Motion, beside the curves of every trained stage."""
-        return super().gives(config) | {GENERATOR}
 
     def facts(self, config: PacerConfig, inputs: PacerInputs) -> ModelFacts:
         """Written beside the weights: with the stages of `exported`, all that `network` needs."""

@@ -131,11 +131,9 @@ class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt])
     name = "cross_gpt"
     summary = "Bailando: music to codes"
     config = CrossGptStageConfig
+    offers = frozenset({GENERATOR})
     inputs = CrossGptInputs
     curves = tuple(Curve(name) for name in ("loss", "accuracy_up", "accuracy_down"))
-
-    def gives(self, config: CrossGptStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def facts(self, config: CrossGptStageConfig, inputs: CrossGptInputs) -> ModelFacts:
         codes = inputs.dance_vq.config.num_codes
@@ -205,11 +203,9 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
     name = "actor_critic"
     summary = "Bailando: rewards for the beat"
     config = ActorCriticStageConfig
+    offers = frozenset({GENERATOR})
     inputs = ActorCriticInputs
     curves = (Curve("actor_reward"), Curve("critic_loss"))
-
-    def gives(self, config: ActorCriticStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def facts(self, config: ActorCriticStageConfig, inputs: ActorCriticInputs) -> ModelFacts:
         gpt = inputs.cross_gpt

@@ -56,11 +56,9 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
     name = "fact"
     summary = "FACT: music and a start to a dance"
     config = FactStageConfig
+    offers = frozenset({GENERATOR})
     inputs = FactInputs
     curves = (Curve("loss"),)
-
-    def gives(self, config: FactStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def facts(self, config: FactStageConfig, inputs: FactInputs) -> ModelFacts:
         layout = inputs.data.layout

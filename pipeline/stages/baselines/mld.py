@@ -147,11 +147,9 @@ class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffus
     name = "latent_diffusion"
     summary = "diffusion of a motion's latents (MLD)"
     config = LatentDiffusionStageConfig
+    offers = frozenset({GENERATOR})
     inputs = LatentDiffusionInputs
     curves = (Curve("loss"),)
-
-    def gives(self, config: LatentDiffusionStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """It is as wide as the latents, and reads no longer motion than the auto-encoder was trained on."""

@@ -46,11 +46,9 @@ class MotionClipStage(CaptionStage[MotionClipStageConfig, CaptionInputs, MotionC
     name = "motionclip"
     summary = "auto-encoder in the space of texts (MotionCLIP)"
     config = MotionClipStageConfig
+    offers = frozenset({GENERATOR})
     inputs = CaptionInputs
     curves = tuple(Curve(name) for name in ("features", "joints", "text"))
-
-    def gives(self, config: MotionClipStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def facts(self, config: MotionClipStageConfig, inputs: CaptionInputs) -> ModelFacts:
         layout = inputs.data.layout

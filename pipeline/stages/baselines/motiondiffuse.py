@@ -40,11 +40,9 @@ class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, M
     name = "motiondiffuse"
     summary = "MotionDiffuse"
     config = MotionDiffuseStageConfig
+    offers = frozenset({GENERATOR})
     inputs = CaptionInputs
     curves = (Curve("loss"),)
-
-    def gives(self, config: MotionDiffuseStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def facts(self, config: MotionDiffuseStageConfig, inputs: CaptionInputs) -> ModelFacts:
         layout = inputs.data.layout

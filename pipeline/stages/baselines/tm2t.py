@@ -116,11 +116,9 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
     name = "captioner"
     summary = "motion tokens to words"
     config = CaptionerStageConfig
+    offers = frozenset({CAPTIONER})
     inputs = CaptionerInputs
     curves = (Curve("ce"), Curve("accuracy"))
-
-    def gives(self, config: CaptionerStageConfig) -> frozenset[str]:
-        return super().gives(config) | {CAPTIONER}
 
     def facts(self, config: CaptionerStageConfig, inputs: CaptionerInputs) -> ModelFacts:
         published = config.published
@@ -241,11 +239,9 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
     name = "seq2seq"
     summary = "words to motion tokens by a GRU"
     config = Seq2SeqStageConfig
+    offers = frozenset({GENERATOR})
     inputs = Seq2SeqInputs
     curves = (Curve("ce"), Curve("accuracy"), Curve("inverse"))
-
-    def gives(self, config: Seq2SeqStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def facts(self, config: Seq2SeqStageConfig, inputs: Seq2SeqInputs) -> ModelFacts:
         extra = {"text_dim": inputs.text.dim, **stream_facts(inputs.tokenizer.net)}

@@ -49,10 +49,8 @@ class MixStage(StageKind[MixStageConfig]):
     name = "mix"
     summary = "several data stages as one"
     config = MixStageConfig
+    offers = frozenset({"data"})
     takes = (_INPUTS,)
-
-    def gives(self, config: MixStageConfig) -> frozenset[str]:
-        return frozenset({"data"})
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """There must be something to mix, no mixes among it, and weights for nothing else."""

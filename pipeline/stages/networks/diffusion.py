@@ -46,11 +46,9 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
     summary = "motion diffusion"
     version = 2  # MDM's time steps, positions, hidden texts and mean over clips
     config = DiffusionStageConfig
+    offers = frozenset({GENERATOR})
     inputs = CaptionInputs
     curves = (Curve("loss"),)
-
-    def gives(self, config: DiffusionStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def facts(self, config: DiffusionStageConfig, inputs: CaptionInputs) -> ModelFacts:
         layout = inputs.data.layout

@@ -45,11 +45,9 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
     name = "dmd"
     summary = "diffusion decoder of motion tokens"
     config = DmdStageConfig
+    offers = frozenset({"decoder"})
     inputs = DmdInputs
     curves = (Curve("loss"),)
-
-    def gives(self, config: DmdStageConfig) -> frozenset[str]:
-        return super().gives(config) | {"decoder"}
 
     def facts(self, config: DmdStageConfig, inputs: DmdInputs) -> ModelFacts:
         tokenizer = inputs.tokenizer.net

@@ -102,11 +102,9 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     name = "gpt"
     summary = "GPT over motion tokens"
     config = GptStageConfig
+    offers = frozenset({GENERATOR})
     inputs = GptInputs
     curves = (Curve("ce"), Curve("accuracy"), Curve("align"))
-
-    def gives(self, config: GptStageConfig) -> frozenset[str]:
-        return super().gives(config) | {GENERATOR}
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Its TMA must read captions as it does, and a GPT that it starts from must be the same network."""

@@ -41,9 +41,7 @@ class GuoEvaluatorStage(StageKind[GuoEvaluatorConfig]):
     name = "guo_evaluator"
     summary = "the published text-motion evaluator"
     config = GuoEvaluatorConfig
-
-    def gives(self, config: GuoEvaluatorConfig) -> frozenset[str]:
-        return frozenset({"evaluator"})
+    offers = frozenset({"evaluator"})
 
     def external(self, config: GuoEvaluatorConfig) -> dict[str, str]:
         return check_published(config.folder.expanduser()).sha256

@@ -146,12 +146,10 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
 
     inputs = TokenizerInputs
     curves = tuple(Curve(name) for name in ("recon", "perplexity", "usage", "dead", "resets"))
+    offers = frozenset({"tokenizer"})
 
     def __init__(self, name: str, summary: str, config: type[TokenizerStageConfig]) -> None:
         self.name, self.summary, self.config = name, summary, config
-
-    def gives(self, config: TokenizerStageConfig) -> frozenset[str]:
-        return super().gives(config) | {"tokenizer"}
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """A tokenizer that it starts from must be the same network over equally normalised motion."""

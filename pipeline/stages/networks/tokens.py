@@ -56,11 +56,9 @@ class TokensStage(StageKind[TokensConfig]):
     name = "tokens"
     summary = "token export"
     config = TokensConfig
+    offers = frozenset({"tokens", SHOWING})
     takes = ("data", "stats", "tokenizer")
     shares = True
-
-    def gives(self, config: TokensConfig) -> frozenset[str]:
-        return frozenset({"tokens", SHOWING})
 
     def share(self, context: StageContext) -> None:
         for encoded in self._splits(context):

@@ -32,10 +32,8 @@ class UdeStage(StageKind[UdeConfig]):
     name = "ude"
     summary = "text, music or both in turn to motion"
     config = UdeConfig
+    offers = frozenset({GENERATOR})
     takes = ("utt", "dmd?")
-
-    def gives(self, config: UdeConfig) -> frozenset[str]:
-        return frozenset({GENERATOR})
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Both halves must speak of the same tokens, and the context must leave room in a window."""

@@ -76,6 +76,7 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
     name = "utt"
     summary = "conditions to motion tokens"
     config = UttStageConfig
+    offers = frozenset({"token_model"})
     inputs = UttInputs
     curves = tuple(
         Curve(name)
@@ -84,9 +85,6 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
 
     def roles(self) -> tuple[Role | Every, ...]:
         return (*super().roles(), *(Role(name, True, name) for name in MODALITIES))
-
-    def gives(self, config: UttStageConfig) -> frozenset[str]:
-        return super().gives(config) | {"token_model"}
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Each modality needs the stage that prepares it."""

@@ -53,10 +53,8 @@ class EvaluateCaptionsStage(StageKind[EvaluateCaptionsConfig]):
     name = "evaluate_captions"
     summary = "figures of captions"
     config = EvaluateCaptionsConfig
+    offers = frozenset({"figures", SHOWING})
     takes = ("data", "text", "captioner", "tma?")
-
-    def gives(self, config: EvaluateCaptionsConfig) -> frozenset[str]:
-        return frozenset({"figures", SHOWING})
 
     def run(self, context: StageContext) -> None:
         """Write `metrics.json` and print it as a table."""

@@ -35,13 +35,11 @@ class EvaluationStage(StageKind):
     """A kind of stage that writes figures."""
 
     shares = True
+    offers = frozenset({"figures", SHOWING})
 
     @abstractmethod
     def evaluation(self, context: StageContext) -> Evaluation:
         """The evaluation of one run."""
-
-    def gives(self, config: Any) -> frozenset[str]:
-        return frozenset({"figures", SHOWING})
 
     def share(self, context: StageContext) -> None:
         """Make and measure this process's share of the clips."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from pydantic import Field
 
 from motionloom.datasets.base.printable import printable
@@ -49,11 +47,9 @@ class GenerateStage(StageKind):
     name = "generate"
     summary = "motions from captions and music"
     config = GenerateConfig
+    offers = frozenset({"motions"})
     takes = ("data", Every("generators", GENERATOR))
     version = 6  # feet that stand
-
-    def gives(self, config: Any) -> frozenset[str]:
-        return frozenset({"motions"})
 
     def run(self, context: StageContext) -> None:
         from motionloom.pipeline.inference.outputs import page_note, write_motions

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -76,6 +75,7 @@ class ReportStage(StageKind):
     name = "report"
     summary = "the page to watch"
     config = ReportConfig
+    offers = frozenset({"page"})
     takes = (
         "data",
         "tokenizer?",
@@ -84,9 +84,6 @@ class ReportStage(StageKind):
         Every("shown", SHOWING),
     )
     version = 5  # feet that stand
-
-    def gives(self, config: Any) -> frozenset[str]:
-        return frozenset({"page"})
 
     def run(self, context: StageContext) -> None:
         """Write `report.html`; of an unfinished run, what there is of it."""

@@ -50,7 +50,7 @@ def run_duel(context: StageContext) -> None:
 
 
 def register(monkeypatch: pytest.MonkeyPatch) -> None:
-    root = FunctionStage("root", "nothing", StageConfig, lambda _: None, given_names=frozenset({"data"}))
+    root = FunctionStage("root", "nothing", StageConfig, lambda _: None, offers=frozenset({"data"}))
     duel = FunctionStage("duel", "a duel", DuelConfig, run_duel, ("data",), trains=True)
     register_toys(monkeypatch, root, duel)
 

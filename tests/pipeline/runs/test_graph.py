@@ -40,7 +40,7 @@ def kind(
 ) -> Any:
     """A kind of stage that adds up, whatever `run_add` is by then."""
     return FunctionStage(
-        name, "a sum", AddConfig, work or (lambda c: run_add(c)), takes, given_names=NUMBER, **more
+        name, "a sum", AddConfig, work or (lambda c: run_add(c)), takes, offers=NUMBER, **more
     )
 
 

@@ -51,7 +51,7 @@ def add_up(context: StageContext) -> None:
 def kinds(monkeypatch: pytest.MonkeyPatch) -> None:
     def kind(name: str, takes: tuple[str | Every, ...], gives: str, trains: bool = False) -> Loading:
         given = frozenset({gives, name})
-        return Loading(name, "a toy", AddConfig, add_up, takes, trains=trains, given_names=given)
+        return Loading(name, "a toy", AddConfig, add_up, takes, trains=trains, offers=given)
 
     register_toys(
         monkeypatch,
@@ -242,7 +242,7 @@ def test_a_stage_of_another_version_or_with_a_file_missing(
     with pytest.raises(UserError, match=r"value.json is gone or has another size; make it again: motionloom"):
         load_recipe("recipe.yaml")
     (net / "old.json").rename(net / "value.json")
-    root = Loading("root", "a toy", AddConfig, add_up, version=2, given_names=frozenset({"data"}))
+    root = Loading("root", "a toy", AddConfig, add_up, version=2, offers=frozenset({"data"}))
     register_toys(monkeypatch, root)
     text = MINE.replace("start: runs/other/stages/net", "data: runs/other/stages/data")
     Path("recipe.yaml").write_text(text.replace("  data: {kind: root, add: 100}\n", ""))
@@ -268,7 +268,7 @@ def test_one_that_changes_while_a_stage_runs_is_noticed(runs: Path, monkeypatch:
         (runs / "other/stages/net/artifact.json").unlink()
 
     takes = ("data", "start?: net")
-    net = Loading("net", "a toy", AddConfig, meddle, takes, trains=True, given_names=frozenset({GENERATOR}))
+    net = Loading("net", "a toy", AddConfig, meddle, takes, trains=True, offers=frozenset({GENERATOR}))
     register_toys(monkeypatch, net)
     with pytest.raises(UserError, match="was made again while this stage ran; run the recipe again"):
         go(MINE, "runs/mine")

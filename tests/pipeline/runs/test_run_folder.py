@@ -59,9 +59,7 @@ def go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Go:
     """`go("tma.add=2", until="tma", replace=True)`: run into `tmp_path / "run"`; what was printed."""
     for name, inputs in INPUTS.items():
         given = frozenset({GIVES[name]} if name in GIVES else ())
-        kind = FunctionStage(
-            name, "a toy", AddConfig, work, inputs, trains=name in TRAINED, given_names=given
-        )
+        kind = FunctionStage(name, "a toy", AddConfig, work, inputs, trains=name in TRAINED, offers=given)
         register_toys(monkeypatch, kind)
 
     def run(

@@ -33,10 +33,8 @@ def write_value(context: StageContext) -> None:
 @pytest.fixture
 def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A finished run of two stages."""
-    root = FunctionStage("root", "a toy", StageConfig, write_value, given_names=frozenset({"data"}))
-    last = FunctionStage(
-        "sum", "a toy", StageConfig, write_value, ("data",), given_names=frozenset({"figures"})
-    )
+    root = FunctionStage("root", "a toy", StageConfig, write_value, offers=frozenset({"data"}))
+    last = FunctionStage("sum", "a toy", StageConfig, write_value, ("data",), offers=frozenset({"figures"}))
     register_toys(monkeypatch, root, last)
     (tmp_path / "toy.yaml").write_text(TOY)
     return run_recipe(tmp_path / "toy.yaml", tmp_path / "run", console=Console(quiet=True))
