@@ -35,7 +35,7 @@ from motionloom.pipeline.inference.edits.edit import edited, require_editor
 from motionloom.pipeline.inference.edits.frames import EditFrames
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
-from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
+from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion, doubts_of
 from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
@@ -130,7 +130,7 @@ class MotionModel(
                 sampling=SamplingConfig.of(sampling), strict=True,
                 seed_motions=None if seed_motion is None else [seed_motion],
             )  # fmt: skip
-        for remark in remarks_of(motion.prompt for motion in motions):
+        for remark in (*remarks_of(motion.prompt for motion in motions), *doubts_of(motions)):
             warnings.warn(remark, stacklevel=2)
         return motions
 

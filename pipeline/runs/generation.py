@@ -109,6 +109,7 @@ def generate_motions(
     from motionloom.datasets.audio.excerpt import Excerpt
     from motionloom.pipeline.contract.generation import SeededGenerator
     from motionloom.pipeline.inference.bundle import unknown_captions
+    from motionloom.pipeline.inference.motion import doubts_of
     from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
@@ -160,13 +161,14 @@ def generate_motions(
                 )
         said = captions if segments is None else [segment.prompt.text for segment in segments]
         unknown_ones = unknown_captions(bundle, said, face or (), sampling.face_model)
-        for unknown in unknown_ones:
-            _print_note(aside, unknown)
+        doubts = doubts_of(motions)
+        for doubt in (*unknown_ones, *doubts):
+            _print_note(aside, doubt)
         driven = motions if segments is None else segments
         for remark in remarks_of(one.prompt for one in driven):
             _print_note(aside, remark)
         title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
-        note = page_note(len(motions), folder.resolve().name, seed, unknown_ones)
+        note = page_note(len(motions), folder.resolve().name, seed, [*unknown_ones, *doubts])
         named = [Excerpt.named(path).path.stem for path in audio for _ in range(samples)]
         with film_progress(aside) as progress:
             paths = write_motions(

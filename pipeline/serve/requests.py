@@ -21,7 +21,7 @@ from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.motion import GeneratedMotion, doubts_of
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
 from motionloom.pipeline.inference.requests import remarks_of
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
@@ -140,28 +140,31 @@ class Answer:
     file: str = ""
 
 
-def notes_of(model: MotionModel, asked: MotionRequest, sound: Sound | None) -> dict[str, list[str]]:
+def notes_of(
+    model: MotionModel, asked: MotionRequest, sound: Sound | None, motion: GeneratedMotion | None = None
+) -> dict[str, list[str]]:
     """What a person should know of the motion: captions that are unlike all that the model knows, what could
-    be said of the body instead, and that a sound is no music.
+    be said of the body instead, that a sound is no music, and that the motion does something else.
     """
     unknown = model.unknown(asked.captions, asked.faces)
     nearest = [text for one in unknown if one.caption in asked.captions for text in one.nearest]
     remarks = remarks_of([Prompt(asked.caption, sound=sound)])
-    return {"notes": [*(one.what for one in unknown), *remarks], "nearest": nearest}
+    doubts = doubts_of([] if motion is None else [motion])
+    return {"notes": [*(one.what for one in unknown), *remarks, *doubts], "nearest": nearest}
 
 
 def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:
     """The motion that is asked for, in its format."""
     motion = motion_of(model, asked, sound, limits)
     if asked.format in WRITERS:
-        note = (
-            "\n".join(map(str, model.unknown(asked.captions, asked.faces))) if asked.format == "html" else ""
-        )
+        note = ""
+        if asked.format == "html":
+            note = "\n".join(map(str, [*model.unknown(asked.captions, asked.faces), *doubts_of([motion])]))
         return file_answer(motion, asked.format, asked.seed, note)
     facts = {
         **facts_of(motion, asked.request, asked.seed),
         "face": asked.face,
-        **notes_of(model, asked, sound),
+        **notes_of(model, asked, sound, motion),
     }
     if asked.format == "viewer":
         facts["viewer"] = viewer_data([cell_of(clip_of(motion))])

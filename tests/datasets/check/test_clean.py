@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from motionloom.datasets.check.claims import caption_faults, claim_of, verdicts
+from motionloom.datasets.check.claims import caption_faults, claim_of, lacking, verdicts
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.decisions import decide, undo
 from motionloom.datasets.check.faults import motion_faults
@@ -38,6 +38,21 @@ Joints = np.ndarray
 def people() -> list[tuple[Joints, list[str]]]:
     """Joints and captions of people who do basic things on a floor."""
     return [(clip.joints, clip.texts) for clip in (make_clip(k, CONFIG) for k in range(CONFIG.clips))]
+
+
+def test_an_action_of_which_joints_show_nothing_is_named() -> None:
+    done: dict[str, Joints] = {}
+    for k in range(60):
+        clip = make_clip(k, SynthConfig(clips=60, seed=3, actions="all"))
+        done.setdefault(str(clip.truth["action"]), clip.joints)
+    names = ("walk", "turn", "run", "jump", "squat", "kick", "clap", "hop")
+    said = {name: f"a person {name}s" for name in names} | {"punch": "throw a punch"}
+    for name, text in said.items():
+        if name in done:
+            assert lacking(text, done[name], 20.0) is None
+        assert lacking(text, done["wave"], 20.0) == name
+    for text in ("a person waves", "walk and then kick", "he punches while sitting", "one plays chess"):
+        assert lacking(text, done["wave"], 20.0) is None
 
 
 def lifted(by: float) -> Callable[[Joints], Joints]:

@@ -160,15 +160,29 @@ def test_damaged_files_are_named(tmp_path: Path, damage: str) -> None:
 def test_generate_says_so_from_a_run_and_from_an_export(small_run: Any, call: Any, tmp_path: Path) -> None:
     words = ["a person walks forward", "a person plays the violin"]
     said = call("generate", small_run.folder, *words, "-o", tmp_path / "run").err
-    assert said.count("note: ") == 1 and "'a person plays the violin' is unlike" in said
+    assert said.count(" is unlike") == 1 and "'a person plays the violin' is unlike" in said
     assert (tmp_path / "run" / "index.html").read_text().count("'a person plays the violin' is unlike") == 1
     call("export", small_run.folder, "-o", tmp_path / "model")
     said = call("generate", tmp_path / "model", *words, "-o", tmp_path / "model-out", "-f", "npz").err
-    assert said.count("note: ") == 1
+    assert said.count(" is unlike") == 1
     model = MotionModel.from_pretrained(tmp_path / "model", device="cpu")
     with pytest.warns(UserWarning, match="violin.*The nearest it knows"):
         model.generate(words, face=["a person looks happy"] * 2 if model.bundle.faces else None)
     assert 0 < FAR < 1
+
+
+def test_a_motion_without_what_is_said_is_noted(
+    small_run: Any, call: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked = iter([None, "punch", None, "punch"])
+    monkeypatch.setattr("motionloom.pipeline.inference.motion.lacking", lambda *_: next(looked))
+    asked = ["a person punches", "--samples", 2, "--seconds", 1.5]
+    said = call("generate", small_run.folder, *asked, "-o", tmp_path).err
+    assert "note: 'a person punches': its joints show no punch in 1 of 2 motions; try another seed" in said
+    assert "show no punch in 1 of 2" in (tmp_path / "index.html").read_text()
+    model = MotionModel.from_pretrained(small_run.folder, device="cpu")
+    with pytest.warns(UserWarning, match="show no punch in 1 of 2"):
+        model.generate(["a person punches"] * 2, seconds=1.5)
 
 
 def test_a_stream_says_so_when_the_captions_turn_comes(small_run: Any, call: Any, tmp_path: Path) -> None:
