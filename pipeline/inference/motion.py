@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from textwrap import shorten
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.printable import printable
-from motionloom.datasets.check.claims import lacking
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Prompt
@@ -80,22 +76,6 @@ class GeneratedMotion:
     def _repr_html_(self) -> str:
         """The viewer, in a frame of its own that can reach neither the notebook nor the network."""
         return str(import_module(_OUTPUTS).frame_of(self))
-
-
-def doubts_of(motions: Iterable[GeneratedMotion]) -> list[str]:
-    """Captions whose action does not show in the joints of their motions, one sentence for each caption."""
-    made: dict[str, list[str | None]] = {}
-    for motion in motions:
-        if motion.caption.strip() and not motion.segments and motion.seconds >= 1:
-            made.setdefault(motion.caption, []).append(lacking(motion.caption, motion.joints, motion.fps))
-    out = []
-    for caption, actions in made.items():
-        missing = [action for action in actions if action]
-        if missing:
-            share = f" in {len(missing)} of {len(actions)} motions" if len(actions) > 1 else ""
-            said = shorten(printable(caption), 100, placeholder=" …")
-            out.append(f"'{said}': its joints show no {missing[0]}{share}; try another seed or other words")
-    return out
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,10 @@ from motionloom.pipeline.contract.stage import CAPTIONER, GENERATOR, Finished, I
 from motionloom.pipeline.inference.generators.captioner import TokenCaptioner
 from motionloom.pipeline.inference.generators.seq2seq import Seq2SeqGenerator
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.baselines.tm2t_release import captioner_names, published_words
 from motionloom.pipeline.stages.networks.tokens import Tokens
 from motionloom.pipeline.store.data import Data, DataPreview, captions_of
 from motionloom.pipeline.store.networks import TrainedTokenizer, require_streams, stream_facts
-from motionloom.pipeline.store.published_captioner import captioner_names, published_words
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, gpt_clips
 from motionloom.pipeline.store.weights import ModelFacts, Release
