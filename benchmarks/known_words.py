@@ -18,9 +18,9 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.check.claims import doubts_of
 from motionloom.datasets.synth.measure import agrees, measure
 from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
-from motionloom.pipeline.inference.doubts import doubts_of
 from motionloom.pipeline.inference.shipped_models import model_folder
 
 SENTENCES = Path(__file__).with_suffix(".yaml")

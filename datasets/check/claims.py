@@ -8,12 +8,15 @@ only where the motion is recognised as the very action, since people do things i
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from textwrap import shorten
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.printable import printable
 from motionloom.datasets.check.faults import Fault
 from motionloom.datasets.loading.crops import caption_spans
 from motionloom.datasets.schema import Caption
@@ -83,6 +86,37 @@ def lacking(text: str, joints: NDArray[np.floating], fps: float) -> str | None:
     else:
         shown = bool(described(joints, fps, action)["count"])
     return None if shown else action
+
+
+class Captioned(Protocol):
+    """A motion and its caption, as `GeneratedMotion` is."""
+
+    @property
+    def caption(self) -> str: ...
+    @property
+    def joints(self) -> NDArray[np.float64]: ...
+    @property
+    def fps(self) -> float: ...
+    @property
+    def segments(self) -> Sequence[object]:
+        """Of a script, which says several things."""
+        ...
+
+
+def doubts_of(motions: Iterable[Captioned]) -> list[str]:
+    """Captions whose action does not show in the joints of their motions, one sentence for each caption."""
+    made: dict[str, list[str | None]] = {}
+    for motion in motions:
+        if motion.caption.strip() and not motion.segments and len(motion.joints) >= motion.fps:
+            made.setdefault(motion.caption, []).append(lacking(motion.caption, motion.joints, motion.fps))
+    out = []
+    for caption, actions in made.items():
+        missing = [action for action in actions if action]
+        if missing:
+            share = f" in {len(missing)} of {len(actions)} motions" if len(actions) > 1 else ""
+            said = shorten(printable(caption), 100, placeholder=" …")
+            out.append(f"'{said}': its joints show no {missing[0]}{share}; try another seed or other words")
+    return out
 
 
 def claim_of(text: str) -> Record | None:

@@ -23,6 +23,7 @@ from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntry
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
+from motionloom.datasets.check.claims import doubts_of
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import EditTask
@@ -30,7 +31,6 @@ from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
-from motionloom.pipeline.inference.doubts import doubts_of
 from motionloom.pipeline.inference.edits.clips import read_clip, read_seed_motion, require_clip
 from motionloom.pipeline.inference.edits.edit import edited, require_editor
 from motionloom.pipeline.inference.edits.frames import EditFrames

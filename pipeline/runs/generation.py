@@ -107,9 +107,9 @@ def generate_motions(
     of `FigureOptions`.
     """
     from motionloom.datasets.audio.excerpt import Excerpt
+    from motionloom.datasets.check.claims import doubts_of
     from motionloom.pipeline.contract.generation import SeededGenerator
     from motionloom.pipeline.inference.bundle import unknown_captions
-    from motionloom.pipeline.inference.doubts import doubts_of
     from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions

@@ -16,10 +16,10 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
+from motionloom.datasets.check.claims import doubts_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.doubts import doubts_of
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion

@@ -175,7 +175,7 @@ def test_a_motion_without_what_is_said_is_noted(
     small_run: Any, call: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked = iter([None, "punch", None, "punch"])
-    monkeypatch.setattr("motionloom.pipeline.inference.doubts.lacking", lambda *_: next(looked))
+    monkeypatch.setattr("motionloom.datasets.check.claims.lacking", lambda *_: next(looked))
     asked = ["a person punches", "--samples", 2, "--seconds", 1.5]
     said = call("generate", small_run.folder, *asked, "-o", tmp_path).err
     assert "note: 'a person punches': its joints show no punch in 1 of 2 motions; try another seed" in said
