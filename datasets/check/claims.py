@@ -115,7 +115,8 @@ def doubts_of(motions: Iterable[Captioned]) -> list[str]:
         if missing:
             share = f" in {len(missing)} of {len(actions)} motions" if len(actions) > 1 else ""
             said = shorten(printable(caption), 100, placeholder=" …")
-            out.append(f"'{said}': its joints show no {missing[0]}{share}; try another seed or other words")
+            found = f"by its joints the motion shows no {missing[0]}{share}"
+            out.append(f"'{said}': {found}; try another seed or other words")
     return out
 
 

@@ -178,10 +178,10 @@ def test_a_motion_without_what_is_said_is_noted(
     monkeypatch.setattr("motionloom.datasets.check.claims.lacking", lambda *_: next(looked))
     asked = ["a person punches", "--samples", 2, "--seconds", 1.5]
     said = call("generate", small_run.folder, *asked, "-o", tmp_path).err
-    assert "note: 'a person punches': its joints show no punch in 1 of 2 motions; try another seed" in said
-    assert "show no punch in 1 of 2" in (tmp_path / "index.html").read_text()
+    assert "note: 'a person punches': by its joints the motion shows no punch in 1 of 2 motions; try" in said
+    assert "shows no punch in 1 of 2" in (tmp_path / "index.html").read_text()
     model = MotionModel.from_pretrained(small_run.folder, device="cpu")
-    with pytest.warns(UserWarning, match="show no punch in 1 of 2"):
+    with pytest.warns(UserWarning, match="shows no punch in 1 of 2"):
         model.generate(["a person punches"] * 2, seconds=1.5)
 
 
