@@ -55,6 +55,7 @@ from motionloom.models.tokenizer.config import (
     MqConfig,
     RvqConfig,
     SeparateConfig,
+    Tm2tConfig,
 )
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.distributed import rank, world_size
@@ -337,6 +338,7 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "rvq": lambda: tokenizer(RvqConfig(**BOOK)),
     "fsq": lambda: tokenizer(FsqConfig(**SMALL, steps=(5, 4))),
     "mq": lambda: tokenizer(MqConfig(**SMALL, num_codes=12, start="data")),
+    "tm2t": lambda: tokenizer(Tm2tConfig(**SMALL, num_codes=12, start="data")),
     "tma": tma,
     "tma, compiled": tma,
     "gpt": gpt,
