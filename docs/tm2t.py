@@ -3,8 +3,8 @@
     python tm2t.py TM2T OUT
 
 `TM2T` is your copy of the authors' repository with their checkpoints of HumanML3D in it. Nothing of it is
-executed; the pickled word lists are read by a reader that makes plain values only. Needs torch and
-safetensors.
+executed; the pickled word lists are read by a reader that makes plain values only. Needs torch, numpy
+and safetensors.
 """
 
 from __future__ import annotations

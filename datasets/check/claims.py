@@ -37,7 +37,10 @@ _ACTIONS = {
     "squat": r"squat(s|ting)?",
     "clap": r"clap(s|ping)?",
 }
-_OTHERS = r"then|while|after|before|danc\w+|sit\w*|bow\w*|reach\w*|point\w*|crawl\w*|lie|lies|step\w*|not"
+_OTHERS = (
+    r"then|while|after|before|danc\w+|sit\w*|bow\w*|reach\w*|point\w*|crawl\w*|lie|lies|step\w*|not"
+    r"|in place|on the spot|back and forth|to and fro|side to side"
+)
 """Words of captions that are about more than these rules know."""
 _OPPOSITE = {"left": "right", "right": "left", "forward": "backward", "backward": "forward"}
 _HAND = r"(?:the |his |her |their )?(left|right|both) hands?"

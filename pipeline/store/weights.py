@@ -172,15 +172,6 @@ def built(folder: Path, build: Callable[[], N]) -> N:
 
 @dataclass(frozen=True)
 class Rows:
-    """One of `of` equal parts of a tensor's rows, as torch joins the weights of queries, keys and values."""
-
-    name: str
-    part: int
-    of: int
-
-
-@dataclass(frozen=True)
-class Picked:
     """Some of the `of` rows of a tensor, in this order."""
 
     name: str
@@ -188,9 +179,8 @@ class Picked:
     of: int
 
 
-Source = str | Rows | Picked | tuple[str, ...]
-"""Where a tensor of ours lies in a release: in one of its shape (axes of length 1 aside), in some rows of
-one, or in several of equally many rows, one below the other."""
+Source = str | Rows
+"""Where a tensor of ours lies in a release: in one of its shape (axes of length 1 aside), or in some rows."""
 
 
 @dataclass(frozen=True)
@@ -216,11 +206,7 @@ class Release:
         for name, source in self.names.items():
             shape = tuple(own[name].shape)
             if isinstance(source, Rows):
-                shapes[source.name] = (shape[0] * source.of, *shape[1:])
-            elif isinstance(source, Picked):
                 shapes[source.name] = (source.of, *shape[1:])
-            elif isinstance(source, tuple):
-                shapes |= dict.fromkeys(source, (shape[0] // len(source), *shape[1:]))
             else:
                 shapes[source] = shape
         found = exact_tensors(path, shapes, self.fix, self.unread)
@@ -229,10 +215,8 @@ class Release:
 
 def _taken(found: Mapping[str, torch.Tensor], source: Source) -> torch.Tensor:
     if isinstance(source, Rows):
-        return found[source.name].chunk(source.of)[source.part]
-    if isinstance(source, Picked):
         return found[source.name][list(source.rows)]
-    return torch.cat([found[name] for name in source]) if isinstance(source, tuple) else found[source]
+    return found[source]
 
 
 def exact_tensors(

@@ -8,7 +8,7 @@ from safetensors import SafetensorError, safe_open
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.baselines.tm2t.network import Captioner
-from motionloom.pipeline.store.weights import Picked, Source
+from motionloom.pipeline.store.weights import Rows, Source
 
 _LAYER = {
     "own": "slf_attn", "other": "enc_attn", "feed": "pos_ffn", "query": "w_qs", "key": "w_ks",
@@ -30,10 +30,10 @@ def captioner_names(net: Captioner) -> dict[str, Source]:
             out[name] = f"{side}.layer_stack.{number}.{'.'.join(theirs)}"
     [codes] = net.num_codes.values()
     tokens = "encoder.src_word_emb.weight"
-    out["embeddings.0.weight"] = Picked(tokens, (*range(codes), codes + 1), codes + 3)
-    out["start"] = Picked(tokens, (codes,), codes + 3)
+    out["embeddings.0.weight"] = Rows(tokens, (*range(codes), codes + 1), codes + 3)
+    out["start"] = Rows(tokens, (codes,), codes + 3)
     order = (net.words - 1, *range(net.words - 1))
-    return out | {"word_table.weight": Picked("decoder.trg_word_emb.weight", order, net.words)}
+    return out | {"word_table.weight": Rows("decoder.trg_word_emb.weight", order, net.words)}
 
 
 def published_words(path: Path) -> tuple[str, ...]:

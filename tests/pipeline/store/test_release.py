@@ -21,29 +21,29 @@ from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.stages.networks.diffusion import mdm_names
 from motionloom.pipeline.store.weights import Release, Rows
 
-NAMES = Release({"weight": Rows("joined", 1, 3), "bias": ("above", "below")}, unread=("pe", "clip.*"))
+NAMES = Release({"weight": Rows("joined", (7, 4, 5, 6), 12), "bias": "below"}, unread=("pe", "clip.*"))
 
 
 def stored(**changed: Tensor) -> dict[str, Tensor]:
-    fine = {"joined": torch.arange(24.0).reshape(12, 2), "above": torch.ones(2, 1), "below": torch.zeros(2)}
+    fine = {"joined": torch.arange(24.0).reshape(12, 2), "below": torch.arange(4.0)[:, None]}
     return fine | changed
 
 
-def test_parts_are_cut_and_joined(tmp_path: Path) -> None:
+def test_rows_are_picked(tmp_path: Path) -> None:
     net = nn.Linear(2, 4)
     save_file(stored(pe=torch.zeros(7), **{"clip.x": torch.ones(3)}), tmp_path / "theirs")
     NAMES.fill(tmp_path / "theirs", net)
-    assert net.weight.tolist() == torch.arange(8.0, 16.0).reshape(4, 2).tolist()
-    assert net.bias.tolist() == [1, 1, 0, 0]
+    assert net.weight.tolist() == [[14, 15], [8, 9], [10, 11], [12, 13]]
+    assert net.bias.tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(
     ("changed", "says"),
     [
         ({"joined": torch.ones(12, 3)}, r"tensor 'joined' is \[12, 3\], and the published one \[12, 2\]"),
-        ({"above": None}, r"tensor 'above' is no tensor, and the published one \[2\]"),
+        ({"below": None}, r"tensor 'below' is no tensor, and the published one \[4\]"),
         ({"extra": torch.ones(2)}, r"tensor 'extra' is \[2\], and the published one no tensor"),
-        ({"below": torch.full((2,), torch.nan)}, "tensor 'below' holds numbers that are not finite"),
+        ({"below": torch.full((4,), torch.nan)}, "tensor 'below' holds numbers that are not finite"),
     ],
 )
 def test_what_differs_is_refused(changed: dict[str, Any], says: str, tmp_path: Path) -> None:
