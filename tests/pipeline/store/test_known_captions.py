@@ -174,8 +174,8 @@ def test_generate_says_so_from_a_run_and_from_an_export(small_run: Any, call: An
 def test_a_motion_without_what_is_said_is_noted(
     small_run: Any, call: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    looked = iter([None, "punch", None, "punch"])
-    monkeypatch.setattr("motionloom.datasets.check.claims.lacking", lambda *_: next(looked))
+    looked = iter([None, "the motion shows no punch"] * 2)
+    monkeypatch.setattr("motionloom.datasets.check.claims.doubt", lambda *_: next(looked))
     asked = ["a person punches", "--samples", 2, "--seconds", 1.5]
     said = call("generate", small_run.folder, *asked, "-o", tmp_path).err
     assert "note: 'a person punches': by its joints the motion shows no punch in 1 of 2 motions; try" in said
