@@ -287,6 +287,7 @@ def edit_clip(
     require_seed(seed)
     layout, sampling = bundle.layout, bundle.drawing(sampling)
     asked = EditFrames.of(task, clip, layout)
+    asked.require_work()
 
     def encoded(stage: Finished) -> tuple[MotionGenerator, Callable[[str], Conditions]]:
         generator, encoder = bundle.of(stage), bundle.encoder(stage)

@@ -112,7 +112,7 @@ class Clips:
             raise UserError(
                 f"{CLIP} lasts {clip.seconds:.0f} s; this server takes at most {self._config.max_seconds:g} s"
             )
-        seen = EditFrames.of(EditTask(likeness=0.5), clip, self._model.bundle.layout)
+        seen = EditFrames.of(EditTask(), clip, self._model.bundle.layout)
         motion = original_of(seen, clip.caption)
         return self._kept.keep(_name(data), motion), motion, list(seen.remarks)
 

@@ -112,6 +112,20 @@ class EditFrames:
         plane = ground(joints) * np.exp(1j * self.turn) + self.origin
         return np.stack([plane.imag, joints[..., 1], plane.real], axis=-1)
 
+    def require_work(self) -> None:
+        """Refuse a task that leaves nothing to make, and one that takes nothing from the clip."""
+        there = np.isin(np.arange(len(PIECES)), piece_columns(self.layout))
+        if self.pieces[:, there].all():
+            raise UserError(
+                "everything of the clip is kept, so there is nothing to make: keep less of it, or give "
+                "seconds or lead for more"
+            )
+        if not (self.pieces.any() or self.pins or np.isfinite(self.path).any() or self.task.likeness):
+            raise UserError(
+                "nothing of the clip is kept and nothing else is asked: say what to keep, draw a path, pin "
+                "a joint, or set likeness"
+            )
+
     @staticmethod
     def of(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> EditFrames:
         """`UserError` for a task that cannot be done with the clip."""
@@ -154,7 +168,6 @@ class EditFrames:
         path = maker.path(origin, turned)
         maker.require_free(path, pieces[:, LOWER], clip_way)
         pins = maker.pins(pieces, origin, turned)
-        _require_work(task, pieces, layout, path, pins)
         way, anchor = _known_way(clip_way, first, pieces[:, LOWER], path, scale)
         return EditFrames(
             task, layout, first, own, face if face is None else np.asarray(face[: len(own)], np.float32),
@@ -282,27 +295,6 @@ class _Frames:
             place = (complex(z, x) - origin) * np.exp(-1j * turned)
             out[frame, joint] = (float(place.imag), y, float(place.real))
         return out
-
-
-def _require_work(
-    task: EditTask,
-    pieces: NDArray[np.bool_],
-    layout: MotionLayout,
-    path: NDArray[np.complex128],
-    pins: dict[tuple[int, int], tuple[float, float, float]],
-) -> None:
-    """Refuse a task that leaves nothing to make, and one that takes nothing from the clip."""
-    there = np.isin(np.arange(len(PIECES)), piece_columns(layout))
-    if pieces[:, there].all():
-        raise UserError(
-            "everything of the clip is kept, so there is nothing to make: keep less of it, or give seconds "
-            "or lead for more"
-        )
-    if not pieces.any() and not pins and np.isnan(path).all() and not task.likeness:
-        raise UserError(
-            "nothing of the clip is kept and nothing else is asked: say what to keep, draw a path, pin a "
-            "joint, or set likeness"
-        )
 
 
 def _differs(joints: NDArray[np.float64], skeleton: Skeleton) -> float:
