@@ -5,16 +5,18 @@ import { figureTools } from "./figure.js";
 import { HANDLES, History, freshState, mark, missing, paceOf, pin, resize, rowsOf, say, taskOf, walk } from "./task.js";
 
 const one = (id) => document.getElementById(id);
-const panel = one("edit"), go = one("edit-go"), why = one("edit-why"), marks = one("edit-marks"), draw = one("edit-draw");
+const panel = one("edit"), go = one("edit-go"), why = one("edit-why"), marks = one("edit-marks"), draw = one("edit-draw"), joints = one("edit-joint");
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }, PIXELS = 6;
 
 /* The editor of a page. `page` gives `info`, `post(path, body)` and `mount(viewerData, over)`; it is told what can be saved,
    `savable(asked)`, and when the panel is shut, `closed(viewerData, ref)`. */
 export function makeEditor(page) {
   const { info } = page, fps = info.fps, rows = info.edit.possible ? rowsOf(info) : [];
-  let clips = [], history = null, draft = null, chosen = null, viewer = null, mounted = null, busy = false, turn = 0, seen = -1;
+  let clips = [], history = null, draft = null, chosen = null, viewer = null, mounted = null, busy = null, turn = 0, seen = -1; // busy: what stops the request under way
   let results = new Map(); // by the state that they are of
   const state = () => draft || history.now, clipOf = (one) => clips[one.source];
 
+  joints.append(...Object.entries(HANDLES).map(([name, { label }]) => new Option(label, name)));
   const style = () => {
     const of = (name) => getComputedStyle(one("edit-colours")).getPropertyValue(name);
     return { accent: of("color"), card: of("background-color"), ink: of("border-left-color") };
@@ -58,11 +60,11 @@ export function makeEditor(page) {
     lanes.show(now, chosen, viewer.frame);
     viewer.refresh();
     one("edit-name").textContent = clipOf(now).name;
-    go.disabled = busy || Boolean(lack);
-    go.textContent = result ? "Try another" : "Make the change";
+    go.disabled = !busy && Boolean(lack);
+    go.textContent = busy ? "Stop" : result ? "Try another" : "Make the change";
     if (!busy) tell(lack || (result ? result.words : ready(now)));
-    one("edit-undo").disabled = busy || !history.canUndo;
-    one("edit-redo").disabled = busy || !history.canRedo;
+    one("edit-undo").disabled = Boolean(busy) || !history.canUndo;
+    one("edit-redo").disabled = Boolean(busy) || !history.canRedo;
     one("edit-on").hidden = !result;
     page.savable(result ? result.asked : null);
     draw.setAttribute("aria-pressed", String(tools.drawing));
@@ -75,7 +77,7 @@ export function makeEditor(page) {
       if (document.activeElement !== one("edit-say")) one("edit-say").value = said.text;
     }
     marks.replaceChildren(...[...now.pins.map((one) => ({
-      words: `${HANDLES[one.joint].label} at ${(one.frame / fps).toFixed(2)} s`, frame: one.frame,
+      words: `${HANDLES[one.joint].label} at ${(one.frame / fps).toFixed(2)} s`, frame: one.frame, joint: one.joint,
       drop: (next) => { next.pins = next.pins.filter(({ joint, frame }) => joint !== one.joint || frame !== one.frame); },
     })), ...(now.path ? [{ words: pathWords(now), frame: now.path.from, drop: (next) => { next.path = null; } }] : [])].map(chip));
     marks.hidden = !marks.children.length;
@@ -87,10 +89,20 @@ export function makeEditor(page) {
   const ready = (now) => `Ready. What is striped is made anew${now.caption.trim() ? `, as “${now.caption.trim()}” says` : ""}.`;
 
   /* Something that was dragged or drawn: goes to its time, or takes it away. */
-  function chip({ words, frame, drop }) {
+  function chip({ words, frame, joint, drop }) {
     const node = document.createElement("span"), to = document.createElement("button"), off = document.createElement("button");
     to.type = off.type = "button";
     to.textContent = words;
+    if (joint) {
+      to.title = "Arrow keys move it, with Shift in large steps";
+      to.addEventListener("keydown", (event) => {
+        const way = ARROWS[event.key];
+        if (!way) return;
+        event.preventDefault();
+        viewer.setFrame(frame);
+        nudge(joint, ...way.map((v) => v * PIXELS * (event.shiftKey ? 4 : 1)));
+      });
+    }
     off.textContent = "×";
     off.title = `Take away: ${words}`;
     off.setAttribute("aria-label", off.title);
@@ -98,6 +110,13 @@ export function makeEditor(page) {
     off.addEventListener("click", () => change(drop, true));
     node.append(to, off);
     return node;
+  }
+
+  /* Moves a joint at the frame that is shown, and leaves the keys with it. */
+  function nudge(joint, right, down) {
+    tools.nudge(joint, right, down);
+    const at = history.now.pins.findIndex((pin) => pin.joint === joint && pin.frame === viewer.frame);
+    if (at >= 0) marks.children[at].firstChild.focus();
   }
 
   function mount(data) {
@@ -120,8 +139,8 @@ export function makeEditor(page) {
     history = new History(freshState(rows, clip, 0));
     results = new Map();
     draft = chosen = mounted = viewer = null;
-    turn += 1;
-    busy = panel.hidden = false;
+    stop();
+    panel.hidden = false;
     document.body.classList.add("serve-editing");
     window.scrollTo(0, 0);
     update();
@@ -132,7 +151,7 @@ export function makeEditor(page) {
     panel.hidden = true;
     document.body.classList.remove("serve-editing");
     history = viewer = null;
-    turn += 1;
+    stop();
     page.closed({ ...mounted, motions: mounted.motions.slice(-1) }, ref);
   }
   /* Goes on from what was made: a state of its own, so that it can be undone. */
@@ -158,27 +177,34 @@ export function makeEditor(page) {
   }
   const sentence = (words) => `${words[0].toUpperCase()}${words.slice(1)}.`;
 
+  /* Forgets the request under way; the server drops it too, if it has not begun. */
+  function stop() {
+    turn += 1;
+    if (busy) busy.abort();
+    busy = null;
+  }
+
   async function make() {
     const mine = ++turn, now = history.now, before = results.get(now), seed = before ? before.asked.seed + 1 : 0, clip = clipOf(now);
     const asked = { clip: clip.ref, task: taskOf(now, rows, fps, clip.face), seed, format: "viewer", request: `edit-${Date.now()}-${turn}` }, began = performance.now();
-    busy = true;
+    busy = new AbortController();
     update();
     const clock = setInterval(() => tell(`Working… ${Math.round((performance.now() - began) / 1000)} s`), 1000);
     tell("Working…");
     try {
-      const answer = await (await page.post("/api/edit", asked)).json();
+      const answer = await (await page.post("/api/edit", asked, busy.signal)).json();
       if (mine !== turn) return;
       if (answer.request !== asked.request) throw new Error("this answer belongs to another request; try again");
       const took = ((performance.now() - began) / 1000).toFixed(1);
       const result = { asked, answer, words: "" };
       results.set(now, result);
-      busy = false;
+      busy = null;
       update();
       result.words = [`Made in ${took} s.`, history.now === now ? metBy(answer.report, now) : "", ...answer.notes.map(sentence)].filter(Boolean).join(" ");
       update();
     } catch (error) {
       if (mine !== turn) return;
-      busy = false;
+      busy = null;
       update();
       tell(error.message, true);
     } finally {
@@ -186,7 +212,16 @@ export function makeEditor(page) {
     }
   }
 
-  go.addEventListener("click", make);
+  go.addEventListener("click", () => {
+    if (!busy) { make(); return; }
+    stop();
+    update();
+    tell("Stopped.");
+  });
+  joints.addEventListener("change", () => {
+    if (joints.value) nudge(joints.value, 0, 0);
+    joints.value = "";
+  });
   one("edit-close").addEventListener("click", close);
   one("edit-undo").addEventListener("click", () => { history.undo(); update(); });
   one("edit-redo").addEventListener("click", () => { history.redo(); update(); });

@@ -31,6 +31,16 @@ export function figureTools(host) {
   const now = (name) => { const found = pinned(name, frame()); return found ? found.position : placeOf(viewer.joints(0), joint(name)); };
   const pixel = (event) => { const box = viewer.canvas(0).getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   const pointAt = (lens, [x, y], depth) => viewer.rayThrough(lens, x, y).map((v, i) => lens.eye[i] + depth * v);
+  const reached = (at, depth) => {
+    const [x, y, z] = pointAt(viewer.lens(0), at, depth);
+    return [x, Math.min(Math.max(y, viewer.floor(0)), CEILING), z];
+  };
+  /* Moves a joint at the frame that is shown by pixels, as dragging does. */
+  const nudge = (name, right, down) => {
+    const [x, y, depth] = viewer.project(viewer.lens(0), now(name));
+    host.hold();
+    host.drag(name, frame(), reached([x + right, y + down], depth), true);
+  };
   const handleAt = (event) => {
     const [x, y] = pixel(event), lens = viewer.lens(0);
     const far = handles.map((name) => { const p = viewer.project(lens, now(name)); return [Math.hypot(p[0] - x, p[1] - y), name]; }).sort((a, b) => a[0] - b[0])[0];
@@ -72,8 +82,7 @@ export function figureTools(host) {
       if (place) held.points.push(place);
     } else {
       held.moved = true;
-      held.position = pointAt(viewer.lens(0), pixel(event), held.depth);
-      held.position[1] = Math.min(Math.max(held.position[1], viewer.floor(0)), CEILING);
+      held.position = reached(pixel(event), held.depth);
       host.drag(held.name, held.frame, held.position, false);
     }
     viewer.refresh();
@@ -185,5 +194,5 @@ export function figureTools(host) {
     }
   }
 
-  return { attach, draw, over, get drawing() { return Boolean(drawing); } };
+  return { attach, draw, over, nudge, get drawing() { return Boolean(drawing); } };
 }

@@ -30,7 +30,7 @@ async function ask(path, options) {
   return answer;
 }
 
-const post = (path, body) => ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
+const post = (path, body, signal) => ask(path, { signal, method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
 
 /* What the model draws with where nothing is asked for. */
 const usualGuidance = () => info.sampling.cfg_scale || 1;

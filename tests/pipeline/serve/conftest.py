@@ -76,6 +76,7 @@ class QuickModel:
     def edit(self, clip: GeneratedMotion, task: EditTask, *, seed: int = 0) -> list[EditedMotion]:
         """As a `MotionModel` does it."""
         self.edited.append(task)
+        assert self.open.wait(20)
         return MotionModel.edit(self, clip, task, seed=seed)  # type: ignore[arg-type]
 
     def examples(self) -> list[str]:

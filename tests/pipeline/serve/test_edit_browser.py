@@ -102,6 +102,25 @@ def test_a_motion_is_changed(page: Any, until: Any, quick: Any) -> None:
     assert wide[0] <= wide[1], "nothing hangs over the window's side"
 
 
+def test_keys_move_a_joint_and_a_request_is_stopped(page: Any, until: Any, quick: Any) -> None:
+    page.evaluate("__viewer.setFrame(20)")
+    stood = page.evaluate(f"__viewer.joints(0)[{3 * WRIST + 1}]")
+    page.get_by_label("Move a joint by arrow keys").select_option("left hand")
+    for key in ("ArrowUp", "Shift+ArrowUp", "ArrowUp"):
+        page.keyboard.press(key)
+    assert page.evaluate("document.activeElement.textContent") == "left hand at 1.00 s"
+
+    quick.open.clear()
+    page.get_by_role("button", name="Make the change").click()
+    page.get_by_role("button", name="Stop").click()
+    assert why(page) == "Stopped."
+    quick.open.set()
+    page.get_by_role("button", name="Make the change").click()
+    until(page, "document.querySelectorAll('.mlv-cell').length === 2")
+    [pin] = quick.edited[-1].pins
+    assert (pin.joint, pin.at) == ("left_wrist", 1.0) and pin.position[1] > stood + 0.05
+
+
 def test_a_path_is_drawn(page: Any, until: Any, quick: Any) -> None:
     page.evaluate("__viewer.setFrame(0)")
     page.get_by_role("button", name="Draw a path").click()
