@@ -37,6 +37,8 @@ Protocol = Mapping[str, Fact]
 MODEL = ""
 """The row of what is evaluated; all other rows are answers that need no model, and are never ranked."""
 RECORDED = "recorded motion"
+THROUGH = "recorded motion, through the tokenizer"
+"""The best that a generator of its tokens can be."""
 TRAINING = "training clips, as many"
 NEAREST = "nearest training clip"
 OWN_CAPTION = "another caption of the clip, by the rest"
@@ -52,8 +54,8 @@ CHANCE = "chance"
 TableRows = tuple[str, list[str], list[list[str]]]
 """Title, columns and rows of a table."""
 ROWS = (
-    MODEL, RECORDED, NEAREST_WORDS, NEAREST_LABELS, TRAINING, NEAREST, NEAREST_MUSIC, RANDOM_DANCE,
-    OTHER_MUSIC, OWN_CAPTION, COMMON_CAPTION, STILL, MEAN_FACE, CHANCE,
+    MODEL, RECORDED, THROUGH, NEAREST_WORDS, NEAREST_LABELS, TRAINING, NEAREST, NEAREST_MUSIC,
+    RANDOM_DANCE, OTHER_MUSIC, OWN_CAPTION, COMMON_CAPTION, STILL, MEAN_FACE, CHANCE,
 )  # fmt: skip
 """In the order in which they are shown."""
 
