@@ -4,7 +4,7 @@
     python benchmarks/results.py --collect WORK/run  # first makes records of a run of ude_ingredients.py
 
 A record is a table: its title, day, commit, command, protocol, columns, and rows whose cells are values, one
-a seed, or text (`imported`: of the archived journal, which was not measured again). Several values are shown
+a seed, or text (`imported`: of an earlier journal, not measured again). Several values are shown
 as their mean with 95 % by Student's t over seeds. In the words `{{name}}` is the table of a record and
 `{{name: row: column}}` one of its cells, so that no figure is typed by hand.
 """
