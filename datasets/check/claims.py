@@ -63,7 +63,7 @@ _SIGNS: dict[str, Callable[[Signals], bool]] = {
     "turn": lambda s: abs(s.heading[-1] - s.heading[0]) >= TURN,
     "punch": lambda s: s.wrists[:, :, 2].max() >= 0.6,
     "sit": lambda s: s.drop.max() >= 0.15,
-    "bow": lambda s: np.ptp(s.trunk) >= 0.25,
+    "bow": lambda s: bool(np.ptp(s.trunk) >= 0.25),
     "lie": lambda s: s.drop.max() >= 0.4,
     "crawl": lambda s: s.drop.max() >= 0.2,
 }
