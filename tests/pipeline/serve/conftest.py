@@ -80,11 +80,11 @@ class QuickModel:
         return MotionModel.edit(self, clip, task, seed=seed)  # type: ignore[arg-type]
 
     def examples(self) -> list[str]:
-        return ["a person bows"]
+        return ["a person stretches"]
 
     def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
         """All that is said of a violin."""
-        known = ("a person <b>claps</b>", "a person bows")
+        known = ("a person <b>claps</b>", "a person stretches")
         return [Unknown(caption, known) for caption in (*captions, *face) if "violin" in caption]
 
     def generate(

@@ -30,9 +30,9 @@ def status(page: Any) -> str:
 
 def test_what_it_knows_is_offered_before_anything_is_asked(visit: Any, until: Any, quick: Any) -> None:
     page = visit()
-    page.get_by_role("button", name="a person bows").click()
+    page.get_by_role("button", name="a person stretches").click()
     until(page, DRAWN)
-    assert quick.asked == ["a person bows"] and page.locator("#start").is_hidden()
+    assert quick.asked == ["a person stretches"] and page.locator("#start").is_hidden()
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -78,12 +78,15 @@ def test_what_the_model_does_not_know_stands_beside_the_motion(visit: Any, until
     until(page, DRAWN)
     assert note.is_visible() and page.locator("#notes p *").count() == 0, "the words are text, not markup"
     said = str(note.text_content())
-    assert said.startswith("'someone plays the <i>violin' is unlike all captions") and "a person bows" in said
+    assert (
+        said.startswith("'someone plays the <i>violin' is unlike all captions")
+        and "a person stretches" in said
+    )
     above, figure = note.bounding_box(), page.locator("canvas").bounding_box()
     assert above["y"] + above["height"] <= figure["y"] and figure["y"] < SIZES[size][1]
-    note.get_by_role("button", name="a person bows").click()
-    until(page, "document.querySelector('figcaption')?.textContent === 'a person bows'")
-    assert page.locator("#caption").input_value() == "a person bows" and note.is_hidden()
+    note.get_by_role("button", name="a person stretches").click()
+    until(page, "document.querySelector('figcaption')?.textContent === 'a person stretches'")
+    assert page.locator("#caption").input_value() == "a person stretches" and note.is_hidden()
 
 
 def test_guidance_is_the_models_until_it_is_changed(visit: Any, until: Any, quick: Any) -> None:
@@ -110,7 +113,7 @@ def test_what_is_refused_is_said(visit: Any, until: Any, quick: Any) -> None:
 
 def test_saving_asks_for_the_same_motion(visit: Any, until: Any, quick: Any) -> None:
     page = visit()
-    page.get_by_label("What the person does").fill("a person bows")
+    page.get_by_label("What the person does").fill("a person stretches")
     page.get_by_label("Seed").fill("12")
     page.keyboard.press("Enter")
     until(page, DRAWN)
@@ -119,8 +122,8 @@ def test_saving_asks_for_the_same_motion(visit: Any, until: Any, quick: Any) -> 
         page.get_by_role("button", name="npz").click()
     assert found.value.suggested_filename == "12-a-person-bows.npz"
     with np.load(found.value.path(), allow_pickle=False) as file:
-        assert json.loads(str(file["metadata"]))["caption"] == "a person bows"
-    assert quick.asked == ["a person bows"] * 2
+        assert json.loads(str(file["metadata"]))["caption"] == "a person stretches"
+    assert quick.asked == ["a person stretches"] * 2
 
 
 def test_music_is_chosen_and_heard(visit: Any, until: Any, monkeypatch: pytest.MonkeyPatch) -> None:
