@@ -8,11 +8,11 @@ const one = (id) => document.getElementById(id);
 const panel = one("edit"), go = one("edit-go"), why = one("edit-why"), marks = one("edit-marks"), draw = one("edit-draw"), joints = one("edit-joint");
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }, PIXELS = 6;
 
-/* The editor of a page. `page` gives `info`, `post(path, body)` and `mount(viewerData, over)`; it is told what can be saved,
+/* The editor of a page. `page` gives `info`, `post(path, body, signal)` and `mount(viewerData, over)`; it is told what can be saved,
    `savable(asked)`, and when the panel is shut, `closed(viewerData, ref)`. */
 export function makeEditor(page) {
   const { info } = page, fps = info.fps, rows = info.edit.possible ? rowsOf(info) : [];
-  let clips = [], history = null, draft = null, chosen = null, viewer = null, mounted = null, busy = null, turn = 0, seen = -1; // busy: what stops the request under way
+  let clips = [], history = null, draft = null, chosen = null, viewer = null, mounted = null, busy = null, turn = 0, seen = -1;
   let results = new Map(); // by the state that they are of
   const state = () => draft || history.now, clipOf = (one) => clips[one.source];
 
@@ -177,7 +177,7 @@ export function makeEditor(page) {
   }
   const sentence = (words) => `${words[0].toUpperCase()}${words.slice(1)}.`;
 
-  /* Forgets the request under way; the server drops it too, if it has not begun. */
+  /* Forgets the request under way, which `busy` aborts; the server drops it too, if it has not begun. */
   function stop() {
     turn += 1;
     if (busy) busy.abort();
@@ -218,10 +218,7 @@ export function makeEditor(page) {
     update();
     tell("Stopped.");
   });
-  joints.addEventListener("change", () => {
-    if (joints.value) nudge(joints.value, 0, 0);
-    joints.value = "";
-  });
+  one("edit-nudge").addEventListener("click", () => nudge(joints.value, 0, 0));
   one("edit-close").addEventListener("click", close);
   one("edit-undo").addEventListener("click", () => { history.undo(); update(); });
   one("edit-redo").addEventListener("click", () => { history.redo(); update(); });

@@ -165,15 +165,14 @@ class _Evaluation(EvaluationUnits):
                     seed=self.context.seed,
                 )
         self.cases += extreme_cases(
-            "reconstruction", self.shown, [row["mpjpe"] for row in rows],
-            lambda number: self._reconstructed(self.shown[number]),
-        )  # fmt: skip
+            "reconstruction", self.shown, [row["mpjpe"] for row in rows], self._reconstructed
+        )
         return out
 
-    def _reconstructed(self, truth: Truth) -> NDArray[np.float64]:
+    def _reconstructed(self, number: int) -> NDArray[np.float64]:
         """Joints [T, N, 3] of a clip through the tokenizer."""
         assert self.tokenizer is not None
-        return joints_of(reconstruct_truth(self.tokenizer, truth), self.tokenizer.layout)
+        return joints_of(reconstruct_truth(self.tokenizer, self.shown[number]), self.tokenizer.layout)
 
     def by_judges(self, made: Sequence[Arrays]) -> list[Figure]:
         """Figures by the latents of each judge."""
@@ -204,11 +203,11 @@ class _Evaluation(EvaluationUnits):
         clips = {RECORDED: self.truths, **self._nearest_captions}
         answers = {row: [(t.joints, t.face) for t in found] for row, found in clips.items()}
         answers[STILL] = [(joints, None) for joints in self._still]
-        if self.tokenizer is not None:
-            answers[THROUGH] = [(self._reconstructed(t), t.face) for t in self.truths]
         if len(self.others) >= len(self.truths):
             answers[TRAINING] = [(t.joints, None) for t in self.others[: len(self.truths)]]
         rows = {MODEL: [self._rows(some) for some in self._repeats(made)]}
+        if self.shown is self.truths:
+            rows[THROUGH] = [self._rows(list(self.context.units.read("reconstructed", len(self.slices))))]
         for row, motions in answers.items():
             performances = [
                 Performance(joints, t.joints, fps, face, t.truth)

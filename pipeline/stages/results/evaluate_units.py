@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageConfig, StageContext
@@ -194,12 +195,17 @@ class EvaluationUnits(Evaluation):
         return NearestClip(self.train)
 
     def reconstruct(self, truths: Sequence[Truth]) -> Arrays:
-        """Errors of clips through the tokenizer, and of expressions where a tokenizer models them."""
+        """Errors of clips through the tokenizer, whether they still do what is said, and errors of faces where
+        a tokenizer models them.
+        """
         tokenizer = self.tokenizer
         assert tokenizer is not None
         bodies = [reconstruct_truth(tokenizer, truth) for truth in truths]
-        pairs = zip(truths, bodies, strict=True)
+        pairs = list(zip(truths, bodies, strict=True))
         out = as_table([clip_errors(tokenizer, self._nearest, truth, body) for truth, body in pairs], JOINTS)
+        fps, layout = self.dataset.layout.fps, tokenizer.layout
+        shown = [Performance(joints_of(body, layout), t.joints, fps, t.face, t.truth) for t, body in pairs]
+        out |= as_table([measure_clip(CAPTION_METRICS, one) for one in shown], CLIP)
         faces = self.context.given.get("face_tokenizer", tokenizer)
         models_faces = faces.layout.has("face") and faces.net.part in ("face", "all")
         if models_faces:

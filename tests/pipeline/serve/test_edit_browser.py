@@ -105,7 +105,8 @@ def test_a_motion_is_changed(page: Any, until: Any, quick: Any) -> None:
 def test_keys_move_a_joint_and_a_request_is_stopped(page: Any, until: Any, quick: Any) -> None:
     page.evaluate("__viewer.setFrame(20)")
     stood = page.evaluate(f"__viewer.joints(0)[{3 * WRIST + 1}]")
-    page.get_by_label("Move a joint by arrow keys").select_option("left hand")
+    page.get_by_label("Joint to move").select_option("left hand")
+    page.get_by_role("button", name="Move by keys").click()
     for key in ("ArrowUp", "Shift+ArrowUp", "ArrowUp"):
         page.keyboard.press(key)
     assert page.evaluate("document.activeElement.textContent") == "left hand at 1.00 s"
