@@ -195,8 +195,8 @@ class EvaluationUnits(Evaluation):
         return NearestClip(self.train)
 
     def reconstruct(self, truths: Sequence[Truth]) -> Arrays:
-        """Errors of clips through the tokenizer, whether they still do what is said, and errors of faces where
-        a tokenizer models them.
+        """Errors of clips through the tokenizer, whether they still do what is said, and errors of
+        faces where a tokenizer models them.
         """
         tokenizer = self.tokenizer
         assert tokenizer is not None
