@@ -111,6 +111,15 @@ class GenerationRequest:
             raise UserError(f"{who} is conditioned on text, and none was given")
         return text
 
+    def lengths(self, who: str) -> Sequence[int]:
+        """The frames of each motion; `who` makes a length that it is given."""
+        if self.frames is None:
+            raise UserError(
+                f"{who} makes a motion of a length that it is given, and none was; give --seconds, or to "
+                f"evaluate it lengths: recorded"
+            )
+        return self.frames
+
     def pooled_text(self, who: str) -> torch.Tensor:
         """The sentence embeddings [B, E]."""
         pooled = self.text(who).pooled
@@ -163,6 +172,10 @@ class MotionGenerator(Protocol):
     @property
     def max_frames(self) -> int | None:
         """Longest motion; None without a limit."""
+
+    @property
+    def decides_length(self) -> bool:
+        """Whether it can be asked for a motion without a length."""
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """Features of the part in their own units, [T, C] each, in the order of the rows."""

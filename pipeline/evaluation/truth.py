@@ -14,6 +14,7 @@ from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 
@@ -35,6 +36,14 @@ class Truth:
     present: int = PRESENT_ALL
     tokens: tuple[str, ...] = ()
     """`word/POS` tags of the caption, where the source brings them."""
+
+
+def recorded_seconds(truths: Sequence[Truth], generator: MotionGenerator) -> list[float]:
+    """How long each clip was recorded, as far as the generator reaches."""
+    frames = [len(truth.features) for truth in truths]
+    if generator.max_frames is not None:
+        frames = [min(count, generator.max_frames) for count in frames]
+    return [count / generator.layout.fps for count in frames]
 
 
 def truth_of(

@@ -175,6 +175,7 @@ class PacerGenerator:
     settings: frozenset[str] = frozenset()
     unit_frames = 1
     max_frames = None
+    decides_length = False
 
     @property
     def prepared(self) -> dict[str, object]:

@@ -14,7 +14,6 @@ from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
 from motionloom.models.baselines.bailando.gpt import CrossGpt, music_of_codes
 from motionloom.models.baselines.bailando.vq import DanceVq
 from motionloom.pipeline.contract.generation import GenerationRequest
@@ -37,6 +36,7 @@ class BailandoGenerator:
     modalities = frozenset({"audio"})
     settings = frozenset[str]()
     max_frames = None
+    decides_length = False
     part: Part = "bodyhand"
 
     @property
@@ -56,11 +56,8 @@ class BailandoGenerator:
         """Features in their own units; the seed motions are what their codes are decoded to, and without
         them each dance goes on from a kept code, by its seed.
         """
-        if request.frames is None:
-            raise UserError(
-                "Bailando makes a length that it is given, and none was; give music, or --seconds"
-            )
-        count = max(request.frames) // self.unit_frames
+        lengths = request.lengths("Bailando")
+        count = max(lengths) // self.unit_frames
         device, gpt = device_of(self.gpt), self.gpt
         if request.seed_motions is None:
             first = gpt.kept[[seed % len(gpt.kept) for seed in request.seeds]][:, None]
@@ -70,7 +67,7 @@ class BailandoGenerator:
         music = music_of_codes(music_of(request, self.given), self.unit_frames, count)
         codes = gpt.dance(first, music.to(device))
         out = []
-        for row, frames in zip(codes, request.frames, strict=True):
+        for row, frames in zip(codes, lengths, strict=True):
             joints = self.vq.decode(row[None, : frames // self.unit_frames])[0].double().cpu().numpy()
             made = encode(canonicalize(joints), self.layout.without_face())
             # One family has a frame less than its joints.

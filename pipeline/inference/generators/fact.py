@@ -33,6 +33,7 @@ class FactGenerator:
     settings = frozenset[str]()
     unit_frames = 1
     max_frames = None
+    decides_length = False
 
     @property
     def prepared(self) -> Mapping[str, object]:
@@ -44,8 +45,7 @@ class FactGenerator:
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """Features in their own units; without seed motions each goes on from a kept one, by its seed."""
-        if request.frames is None:
-            raise UserError("FACT makes a length that it is given, and none was; give music, or --seconds")
+        lengths = request.lengths("FACT")
         columns, stats = self.layout.part(self.part), self.given["stats"]
         mean, std = stats.mean[columns], stats.std[columns]
         if request.seed_motions is None:
@@ -53,10 +53,10 @@ class FactGenerator:
         else:
             begun = torch.from_numpy((np.stack(list(request.seed_motions)) - mean) / std)
         made = self.net.go_on(
-            begun.to(device_of(self.net), torch.float32), music_of(request, self.given), max(request.frames)
+            begun.to(device_of(self.net), torch.float32), music_of(request, self.given), max(lengths)
         )
         own = np.asarray(made.cpu().numpy() * std + mean, np.float32)
-        return [motion[:count] for motion, count in zip(own, request.frames, strict=True)]
+        return [motion[:count] for motion, count in zip(own, lengths, strict=True)]
 
 
 def music_of(request: GenerationRequest, given: Mapping[str, Any]) -> Tensor:

@@ -11,6 +11,8 @@ from motionloom.pipeline.store.networks import TrainedTokenizer
 class OfTokens(ABC):
     """A model of one tokenizer's tokens."""
 
+    decides_length = True
+
     @property
     @abstractmethod
     def tokenizer(self) -> TrainedTokenizer:

@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import GenerationRequest
 
 
@@ -31,6 +30,7 @@ class WholeMotion(ABC):
     settings: ClassVar[frozenset[str]] = frozenset()
     modalities = frozenset({"text"})
     unit_frames = 1
+    decides_length = False
 
     @property
     def max_frames(self) -> int | None:
@@ -48,11 +48,8 @@ class WholeMotion(ABC):
 
     @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
-        if request.frames is None:
-            raise UserError(
-                f"{self.who} makes a motion of a length that it is given, and none was; give --seconds, or "
-                f"to evaluate it lengths: recorded"
-            )
         columns, stats = self.layout.part(self.part), self.given["stats"]
-        made = (torch.as_tensor(one).cpu().numpy() for one in self.normalised(request, request.frames))
+        made = (
+            torch.as_tensor(one).cpu().numpy() for one in self.normalised(request, request.lengths(self.who))
+        )
         return [np.asarray(stats.denormalize(one, columns), dtype=np.float32) for one in made]

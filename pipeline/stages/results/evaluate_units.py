@@ -27,6 +27,7 @@ from motionloom.pipeline.evaluation.truth import (
     has_caption,
     reconstruct_all,
     reconstruct_truth,
+    recorded_seconds,
     spread_any,
     truth_of,
 )
@@ -227,13 +228,12 @@ class EvaluationUnits(Evaluation):
         """Motions for the captions of some clips, as latents and by whether they do what is said."""
         assert self.bundle is not None
         truths, fps = self.truths[piece], self.dataset.layout.fps
-        most = self.bundle.generator.max_frames
-        recorded = [min(len(t.features), most or len(t.features)) / fps for t in truths]
+        recorded = self.config.lengths == "recorded"
         seed, noise_seed = self.seeds(draw, piece.start)
         motions = self.bundle.generate(
             [t.caption for t in truths],
             face=[t.face_caption for t in truths],
-            seconds=recorded if self.config.lengths == "recorded" else None,
+            seconds=recorded_seconds(truths, self.bundle.generator) if recorded else None,
             seed=seed,
             noise_seed=noise_seed,
             sampling=self.config.sampling,

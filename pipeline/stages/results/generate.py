@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from motionloom.datasets.base.printable import printable
+from motionloom.datasets.check.claims import doubts_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import (
@@ -16,7 +17,7 @@ from motionloom.pipeline.contract.stage import (
     register,
 )
 from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_for, with_music
-from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
+from motionloom.pipeline.evaluation.truth import has_caption, recorded_seconds, spread, truth_of
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions
 from motionloom.pipeline.inference.writers import Format, default_formats
@@ -29,6 +30,8 @@ class GenerateConfig(StageConfig):
 
     captions: list[str] = Field(default_factory=list)
     """Captions to perform; empty takes `count` from the test split."""
+    seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
+    """Length of each; None lets the model decide, or else takes the recorded clip's."""
     count: int = Field(8, ge=0)
     dances: int = Field(4, ge=0)
     """Songs of the test split to dance to, where a generator is conditioned on music; different songs first.
@@ -49,7 +52,7 @@ class GenerateStage(StageKind):
     config = GenerateConfig
     offers = frozenset({"motions"})
     takes = ("data", Every("generators", GENERATOR))
-    version = 6  # feet that stand
+    version = 7  # notes of the joints
 
     def run(self, context: StageContext) -> None:
         from motionloom.pipeline.inference.outputs import page_note, write_motions
@@ -62,12 +65,13 @@ class GenerateStage(StageKind):
                 f"that a generator of this run is conditioned on; give captions"
             )
         motions = [*said, *(motion for motion, _ in danced)]
+        doubts = doubts_of(said)
         write_motions(
             context.folder / "motions",
             motions,
             config.formats,
             title=f"Generated motions of {context.recipe}",
-            note=page_note(len(motions), context.recipe, context.seed),
+            note=page_note(len(motions), context.recipe, context.seed, doubts),
             seed=context.seed,
             scores=[Score()] * len(said) + [clip.score() for _, clip in danced],
             figure=config.figure,
@@ -76,25 +80,32 @@ class GenerateStage(StageKind):
         for motion, title in zip(motions, titles, strict=True):
             line = f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {printable(title)}"
             context.console.print(line, markup=False)
+        for doubt in doubts:
+            context.console.print(f"    {printable(doubt)}", markup=False)
 
 
 def _performed(context: StageContext) -> list[GeneratedMotion]:
     """The captions of the config, or of held-out clips, performed."""
     config: GenerateConfig = context.config
     bundle = bundle_driven_by("text", context.every("generators"), context.stage_cache)
-    captions, faces = list(config.captions), list(config.captions)
+    captions, faces = config.captions, config.captions
+    seconds: float | list[float] | None = config.seconds
+    if bundle is None:
+        if captions:
+            raise UserError(
+                f"stage '{context.name}': captions are given and no generator is conditioned on text"
+            )
+        return []
     if not captions:
         dataset = context.given["data"].held_out(prefer="test")
         chosen = spread(dataset, config.count) if config.count and has_caption(dataset).any() else []
         truths = [truth_of(dataset, i) for i in chosen]
         captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
-        if bundle is None:
-            return []
-    if bundle is None:
-        raise UserError(f"stage '{context.name}': captions are given and no generator is conditioned on text")
+        if seconds is None and not bundle.generator.decides_length:
+            seconds = recorded_seconds(truths, bundle.generator)
     if not captions:
         return []
-    return bundle.generate(captions, face=faces, seed=context.seed, sampling=config.sampling)
+    return bundle.generate(captions, face=faces, seconds=seconds, seed=context.seed, sampling=config.sampling)
 
 
 def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:

@@ -35,6 +35,7 @@ from motionloom.pipeline.evaluation.truth import (
     Truth,
     has_caption,
     reconstruct_all,
+    recorded_seconds,
     spread,
     truth_at,
     truth_of,
@@ -169,6 +170,7 @@ def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion
         generated = bundle.generate(
             [t.caption for t in truths],
             face=[t.face_caption for t in truths],
+            seconds=None if bundle.generator.decides_length else recorded_seconds(truths, bundle.generator),
             seed=context.seed,
             sampling=config.sampling,
         )

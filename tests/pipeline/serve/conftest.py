@@ -37,6 +37,7 @@ class QuickGenerator:
     modalities, settings = frozenset({"text", "audio"}), frozenset({"cfg_scale"})
     prepared: ClassVar[dict[str, object]] = {}
     layout, part, method, unit_frames, max_frames = LAYOUT, "bodyhand", "quick", 1, None
+    decides_length = False
 
     def generate(self, request: Any) -> list[Any]:
         raise NotImplementedError

@@ -34,8 +34,8 @@ stages:
   face_tokenizer: null
   face_tokens: null
   face_gpt: null
-  generate: null
-  report: null
+  generate: {count: 2, formats: [npz]}
+  report: {count: 1}
   evaluate: {repeats: 2, size: 4, lengths: LENGTHS}
 """
 
@@ -62,6 +62,11 @@ def test_temos_generates_and_is_evaluated(tmp_path: Path, call: Callable[..., An
     assert np.isfinite(one.joints).all() and np.abs(one.joints[:30] - two.joints[:30]).max() > 1e-4
     done = call("generate", tmp_path / "run", "a person waves", "-o", tmp_path / "out", "-f", "npz")
     assert done.code == 2 and "give --seconds" in done.err and done.err.count("\n") == 1
+    shown = sorted((tmp_path / "run/stages/generate/motions").glob("*.npz"))
+    assert [len(np.load(path, allow_pickle=False)["joints"]) >= 30 for path in shown] == [True, True], (
+        "as long as the clips"
+    )
+    assert "generated" in (tmp_path / "run/stages/report/report.html").read_text()
     (tmp_path / "recipe.yaml").write_text(RECIPE.replace("LENGTHS", "free"))
     done = call("run", tmp_path / "recipe.yaml", "-o", tmp_path / "run")
     assert done.code == 2 and "lengths: recorded" in done.err
