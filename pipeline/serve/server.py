@@ -85,7 +85,9 @@ def server_of(site: Served, worker: Worker) -> uvicorn.Server:
 
 
 def connection_of(config: ServeConfig) -> type[H11Protocol]:
-    """What reads a connection: so many at a time, and closed where headers do not come in time."""
+    """What reads a connection: so many at a time, and closed where headers do not come in time. One more takes
+    the place of the one that has asked for nothing the longest.
+    """
     most, patience = _most(config), config.patience
 
     class Connection(H11Protocol):
@@ -93,9 +95,15 @@ def connection_of(config: ServeConfig) -> type[H11Protocol]:
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             if len(self.connections) >= most:
-                transport.abort()
-                return
+                idle = [one for one in self.connections if isinstance(one, Connection) and not one._asked()]
+                if not idle:
+                    transport.abort()
+                    return
+                longest = min(idle, key=lambda one: one._since)
+                self.connections.discard(longest)
+                longest.transport.abort()
             super().connection_made(transport)
+            self._since = self.loop.time()
             self._late = self.loop.call_later(patience, self._drop)
 
         def data_received(self, data: bytes) -> None:
