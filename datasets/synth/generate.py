@@ -18,8 +18,9 @@ from pydantic import Field, field_validator, model_validator
 
 from motionloom.datasets.audio.features import VERSION as AUDIO_VERSION
 from motionloom.datasets.audio.lineup import settings_at
-from motionloom.datasets.motion.canonical import canonicalize, facing
+from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.features.smpl75 import smpl75_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Config, Manifest, Split
@@ -27,7 +28,7 @@ from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.actions import arms, floor, legs, locomotion
-from motionloom.datasets.synth.actions.maths import Array, rot_y
+from motionloom.datasets.synth.actions.maths import Array
 from motionloom.datasets.synth.actions.pose import Track
 from motionloom.datasets.synth.actions.truth import (
     ACTIONS,
@@ -50,7 +51,6 @@ from motionloom.datasets.synth.music.performance import render_song, song_featur
 CONVERTER_VERSION = 2  # the face's words are about the body's person
 LICENCE = "CC0-1.0"
 _GOLDEN = 0.6180339887498949
-_SMPL_JOINTS = 24
 _REST_ROOT = Skeleton.named("smpl22").rest_joints[0]
 
 Animator = Callable[[Truth, Span, float, np.random.Generator], Track]
@@ -205,7 +205,7 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
     size = float(np.clip(1 + config.size_spread * shape.standard_normal(), 0.8, 1.2))
     smpl = None
     if layout.name == "smpl75":
-        size, smpl = 1.0, _smpl75(track.rotations(), solved)
+        size, smpl = 1.0, smpl75_of(track.rotations(), solved, _REST_ROOT)
     face = (
         dancing_face(planned.song, begin, track.t, shape) if planned else express(truth.face, track.t, shape)
     )
@@ -230,28 +230,6 @@ def animate(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> T
     if truth.parts is None:
         return ANIMATORS[truth.action](truth, span, fps, rng)
     return animate_in_turn(truth.parts, animate, span, fps, rng)
-
-
-def _smpl75(rotations: Array, joints: Array) -> NDArray[np.float32]:
-    """UDE's 75 SMPL columns [T, 75] (translation 3, 24 axis-angles; section 4.1) of local rotations
-    [T, N >= 22, 3, 3] and the joints [T, N, 3] they pose.
-
-    The rotations are stored as they are, twists included, not fitted to the joints. Canonical: floor at 0,
-    the first root above the origin, the first heading +Z. SMPL's last two joints, the hands, stay at rest
-    [ours].
-    """
-    import roma
-    import torch
-
-    body = joints[:, :BODY_JOINTS]
-    local = rotations[:, :BODY_JOINTS].copy()
-    local[:, 0] = rot_y(-float(facing(body[:1])[0])) @ local[:, 0]
-    turns = roma.rotmat_to_rotvec(torch.from_numpy(np.ascontiguousarray(local))).numpy()
-    out = np.zeros((len(joints), 3 + 3 * _SMPL_JOINTS))
-    # SMPL adds the translation to every joint: the root is at its rest place + translation.
-    out[:, :3] = canonicalize(body)[:, 0] - _REST_ROOT
-    out[:, 3 : 3 + 3 * BODY_JOINTS] = turns.reshape(len(joints), -1)
-    return out.astype(np.float32)
 
 
 def _music_of(

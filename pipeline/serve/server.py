@@ -85,8 +85,8 @@ def server_of(site: Served, worker: Worker) -> uvicorn.Server:
 
 
 def connection_of(config: ServeConfig) -> type[H11Protocol]:
-    """What reads a connection: so many at a time, and closed where headers do not come in time. One more takes
-    the place of the one that has asked for nothing the longest.
+    """What reads a connection: so many at a time, and closed where headers do not come in time. One more
+    takes the place of the one that has asked for nothing the longest.
     """
     most, patience = _most(config), config.patience
 

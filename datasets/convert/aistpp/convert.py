@@ -25,18 +25,13 @@ from motionloom.datasets.convert.aistpp.plan import (
     plan_aistpp,
 )
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
-from motionloom.datasets.convert.common.features import (
-    SMPL_JOINTS,
-    body_of,
-    canonical_smpl75,
-    features_of,
-    require_human,
-)
+from motionloom.datasets.convert.common.features import body_of, canonical_smpl75, features_of, require_human
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.music import cut_of
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.motion.body.smpl import smpl_joints
+from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample

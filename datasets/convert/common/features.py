@@ -9,14 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
-from motionloom.datasets.motion.canonical import (
-    canonicalize,
-    facing,
-    resample,
-    resample_quaternions,
-    retarget,
-)
+from motionloom.datasets.motion.canonical import canonicalize, resample, resample_quaternions, retarget
 from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS, smpl75_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import UserError
 
@@ -83,9 +78,6 @@ def frames_after(frames: int, fps: float, layout: MotionLayout) -> int:
     return int((frames - 1) * layout.fps / fps + 1e-6) + 1 - (layout.family == "h3d")
 
 
-SMPL_JOINTS = 24
-
-
 def canonical_smpl75(
     poses: NDArray[np.floating], trans: NDArray[np.floating], body: BodyModel, fps_in: float, fps_out: float
 ) -> NDArray[np.float32]:
@@ -101,12 +93,7 @@ def canonical_smpl75(
     turns = torch.from_numpy(resample_quaternions(turns, fps_in, fps_out))
     trans = resample(np.asarray(trans, dtype=np.float64), fps_in, fps_out)
     joints = smpl_joints(_rotvecs(turns[:, :BODY_JOINTS]), trans, body)
-    back = roma.rotvec_to_unitquat(torch.tensor([0.0, -float(facing(joints[:1])[0]), 0.0], dtype=turns.dtype))
-    turns[:, 0] = roma.quat_product(back.expand(len(turns), 4), turns[:, 0])
-    out = np.empty((len(turns), 3 + 3 * SMPL_JOINTS))
-    out[:, :3] = canonicalize(joints)[:, 0] - body.rest_joints()[0]  # the root stands at rest pelvis + trans
-    out[:, 3:] = _rotvecs(turns).reshape(len(turns), -1)
-    return out.astype(np.float32)
+    return smpl75_of(roma.unitquat_to_rotmat(turns).numpy(), joints, body.rest_joints()[0])
 
 
 def _rotvecs(turns: torch.Tensor) -> NDArray[np.float64]:

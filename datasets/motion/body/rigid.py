@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.chain_solver import solve_poses
+from motionloom.datasets.motion.canonical import retarget
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
@@ -177,6 +178,16 @@ def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
         turned, root = solve_poses(motion.joints, mean.offsets, mean.parents, motion.rotations, motion.root)
         out.append(RigidMotion.posed(mean, turned, root, motion.joints))
     return out
+
+
+def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
+    """The motion on other bones [N, 3] of its joints, its path scaled with the legs so that feet stay on the
+    floor; the error is against its joints on these bones.
+    """
+    targets = retarget(motion.joints, motion.skeleton, offsets)
+    parents = motion.skeleton.parents
+    turned, root = solve_poses(targets, offsets, parents, motion.rotations, targets[:, 0])
+    return RigidMotion.posed(with_offsets(motion.skeleton, offsets), turned, root, targets)
 
 
 def with_offsets(skeleton: Skeleton, offsets: NDArray[np.floating]) -> Skeleton:

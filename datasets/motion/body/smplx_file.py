@@ -23,11 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
-from motionloom.datasets.motion.body.chain_solver import solve_poses
-from motionloom.datasets.motion.body.rigid import FitError, RigidMotion
+from motionloom.datasets.motion.body.rigid import FitError, RigidMotion, on_bones
 from motionloom.datasets.motion.body.smpl import FINGERS, BodyModel
-from motionloom.datasets.motion.canonical import retarget
-from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import UserError
 
@@ -47,12 +44,8 @@ def smplx_parameters(
     if len(body.skeleton) < count:
         raise UserError(f"the body model has {len(body.skeleton)} joints, the motion {count}: use SMPL-X")
     rest = body.rest_joints()[:count]
-    parents = motion.skeleton.parents
-    offsets = motion.skeleton.bones(rest)
-    targets = retarget(motion.joints, motion.skeleton, offsets)
-    turned, root = solve_poses(targets, offsets, parents, motion.rotations, targets[:, 0])
-    error = FitError.between(forward_kinematics(turned, root, offsets, parents)[0], targets)
-    return _arrays(turned, root, rest[0], fps), error
+    worn = on_bones(motion, motion.skeleton.bones(rest))
+    return _arrays(worn.rotations, worn.root, rest[0], fps), worn.error
 
 
 def write_smplx(path: Path, motion: RigidMotion, fps: float, body: BodyModel | None = None) -> FitError:

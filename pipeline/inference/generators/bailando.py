@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.features.smpl75 import fit_smpl75
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.models.baselines.bailando.gpt import CrossGpt, music_of_codes
 from motionloom.models.baselines.bailando.vq import DanceVq
@@ -69,7 +70,10 @@ class BailandoGenerator:
         out = []
         for row, frames in zip(codes, lengths, strict=True):
             joints = self.vq.decode(row[None, : frames // self.unit_frames])[0].double().cpu().numpy()
-            made = encode(canonicalize(joints), self.layout.without_face())
+            if self.layout.name == "smpl75":
+                made = fit_smpl75(joints)
+            else:
+                made = encode(canonicalize(joints), self.layout.without_face())
             # One family has a frame less than its joints.
             out.append(np.concatenate([made, made[-1:]])[:frames])
         return out

@@ -69,10 +69,10 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
 
     def facts(self, config: DanceVqStageConfig, inputs: DanceVqInputs) -> ModelFacts:
         layout = inputs.data.layout
-        if layout.family == "raw":
+        if layout.family == "raw" and layout.name != "smpl75":
             raise UserError(
-                f"Bailando makes joint positions, and layout {layout.name} of rotations cannot be made of "
-                f"them; take body133, or another layout of positions"
+                f"Bailando makes joint positions, and layout {layout.name} is not made of them; take "
+                f"body133, smpl75, or another layout of positions"
             )
         if config.window % config.net.code_frames:
             raise UserError(

@@ -22,6 +22,7 @@ from motionloom.datasets.motion.canonical import (
     retarget,
     turn,
 )
+from motionloom.datasets.motion.features.smpl75 import fit_smpl75
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
@@ -232,6 +233,19 @@ def test_frames_between_source_frames_keep_the_bones() -> None:
     away = np.abs(joints[::5] - whole[::12])
     assert np.ptp(joints[::5, 0, 1] - whole[::12, 0, 1]) < 1e-5  # the floor may differ by the lowest frame
     assert away[..., [0, 2]].max() < 1e-5
+
+
+@pytest.mark.parametrize("body", [NEUTRAL, MODEL], ids=["neutral", "model"])
+def test_joints_alone_are_posed_by_the_neutral_body(body: BodyModel) -> None:
+    """Its own motion to a millimetre; another body's as far as its proportions let, feet on the floor."""
+    poses, trans = dance()
+    joints = smpl_joints(poses[:, :22], trans, body)
+    columns = fit_smpl75(joints)
+    assert columns.shape == (len(joints), 75) and columns.dtype == np.float32
+    assert not columns[:, 3 + 66 :].any(), "nothing is known of the hands"
+    posed, wanted = joints_of_columns(columns, NEUTRAL), canonicalize(joints)
+    assert np.linalg.norm(posed - wanted, axis=-1).mean() < (1e-3 if body is NEUTRAL else 0.1)
+    assert abs(posed[..., 1].min()) < 1e-5
 
 
 WHOLE = Skeleton.named("smplx52")

@@ -149,6 +149,23 @@ def test_a_seed_motion_that_nothing_goes_on_from_is_refused(ude_run: Any) -> Non
         bundle.generate(["a person walks"], seed_motions=[motion])
 
 
+def test_bailando_dances_in_smpls_parameters(tmp_path: Path) -> None:
+    """UDE's own format: its joints are posed by the neutral body."""
+    _, _, own = RECIPE.partition("  dance_vq:")
+    shorter = own.replace(
+        "  of_fact: {kind: evaluate_dances, clips: 4, repeats: 1, inputs: {generators: [fact]}}\n", ""
+    )
+    rest = "".join(f"  {name}: null\n" for name in ("text", "tma", "tokenizer", "utt", "dmd", "ude"))
+    data = "  data: {clips: 24, max_seconds: 5.0, dances: {songs: 6, song_seconds: 6.0}}\n"
+    head = "extends: ude-tiny-smpl75\nname: smpl\nstages:\n"
+    (tmp_path / "smpl.yaml").write_text(f"{head}{data}{rest}  dance_vq:{shorter}")
+    run = run_recipe(tmp_path / "smpl.yaml", tmp_path / "run", console=Console(quiet=True))
+    assert FigureFile.read(run / "stages/of_bailando/metrics.json").figures
+    [only] = [one for one in Bundle.open(run).stages if one.name == "actor_critic"]
+    [made] = Bundle([only], StageCache()).generate(sounds=[song(3.0)])
+    assert made.features.shape == (60, 75) and np.isfinite(made.joints).all()
+
+
 def test_dry_run_counts_their_parameters(run: Path, call: Callable[..., Any]) -> None:
     done = call("run", run.parent / "dances.yaml", "--dry-run")
     assert done.code == 0, done.err

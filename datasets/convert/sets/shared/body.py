@@ -15,7 +15,6 @@ from motionloom.datasets.audio.sound import sound_seconds
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.common.features import (
-    SMPL_JOINTS,
     body_of,
     canonical_smpl75,
     features_of,
@@ -34,6 +33,7 @@ from motionloom.datasets.convert.sets.shared.release import (
     note_broken,
 )
 from motionloom.datasets.motion.body.smpl import SkeletonName, smpl_joints
+from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample

@@ -1,0 +1,49 @@
+"""The columns of layout `smpl75`, UDE's SMPL parameters: translation 3, then 24 axis-angles (section 4.1).
+
+Canonical: the floor at 0, the first root above the origin, the first heading +Z.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.body.rigid import fit_rigid, on_bones
+from motionloom.datasets.motion.body.smpl import BodyModel
+from motionloom.datasets.motion.canonical import canonicalize, facing
+from motionloom.datasets.motion.layout import BODY_JOINTS
+
+SMPL_JOINTS = 24
+
+
+def smpl75_of(
+    rotations: NDArray[np.floating], joints: NDArray[np.floating], rest_root: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Columns [T, 75] of local rotations [T, N, 3, 3] and the joints [T, M, 3] that they pose, N and M 22 or
+    more, in any place.
+
+    Rotations are stored as they are, twists included. Of those beyond SMPL's none are, and SMPL's last two,
+    the hands, stay at rest where there are none [ours]. `rest_root` [3] is the root of the body at rest:
+    SMPL adds the translation to every joint.
+    """
+    import roma
+    import torch
+
+    local = rotations[:, :SMPL_JOINTS].astype(np.float64)
+    angle = -float(facing(joints[:1])[0])
+    local[:, 0] = (
+        roma.rotvec_to_rotmat(torch.tensor([0.0, angle, 0.0], dtype=torch.float64)).numpy() @ local[:, 0]
+    )
+    turns = roma.rotmat_to_rotvec(torch.from_numpy(np.ascontiguousarray(local))).numpy()
+    out = np.zeros((len(joints), 3 + 3 * SMPL_JOINTS))
+    out[:, :3] = canonicalize(joints[:, :BODY_JOINTS])[:, 0] - rest_root
+    out[:, 3 : 3 + 3 * turns.shape[1]] = turns.reshape(len(joints), -1)
+    return out.astype(np.float32)
+
+
+def fit_smpl75(joints: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Columns [T, 75] of joints [T, N >= 22, 3] in metres alone: the neutral body, as near as it poses."""
+    body = BodyModel.neutral("smpl22")
+    rest = body.rest_joints()
+    motion = on_bones(fit_rigid(joints[:, :BODY_JOINTS], body.skeleton), body.skeleton.bones(rest))
+    return smpl75_of(motion.rotations, motion.joints, rest[0])
