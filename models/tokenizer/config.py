@@ -12,7 +12,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.models.quantize.base import QuantizerConfig
 from motionloom.models.quantize.gradient import GradientQuantizerConfig, Start
 
-Recon = Literal["l2", "smooth_l1"]
+Recon = Literal["l1", "l2", "smooth_l1"]
 
 
 class ConvSizes(TypedDict):
@@ -156,6 +156,7 @@ class Tm2tConfig(MqConfig):
     """TM2T's tokenizer: its residual blocks are behind the codebook, in the decoder."""
 
     kind: Literal["tm2t"] = "tm2t"  # type: ignore[assignment]
+    recon: Recon = "l1"
     depth: int = Field(default=3, ge=0, le=32)
     """Residual blocks of the decoder; the encoder has one after each layer that changes the rate."""
     num_codes: int = Field(default=1024, ge=2)

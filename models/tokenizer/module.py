@@ -6,10 +6,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.models.tokenizer.base import Tokenizer, TokenizerOutput
 from motionloom.models.tokenizer.config import Recon
 from motionloom.models.training.distributed import masked_mean
 from motionloom.models.training.stage_module import Batch, StageModule
+
+_ERRORS = {"l1": functional.l1_loss, "l2": functional.mse_loss, "smooth_l1": functional.smooth_l1_loss}
 
 
 def reconstruction_loss(
@@ -17,13 +19,11 @@ def reconstruction_loss(
 ) -> Tensor:
     """Mean error of [B, T, D] over the first `length` [B] frames of each clip and over the columns it holds.
 
-    `kind`: "l2" squared error; "smooth_l1" Huber with threshold 1. `present` bool [B, D]; None = all.
+    `kind`: "l1" absolute error; "l2" squared error; "smooth_l1" Huber with threshold 1. `present` bool
+    [B, D]; None = all.
     """
     recon, target = recon.float(), target.float()
-    if kind == "l2":
-        error = functional.mse_loss(recon, target, reduction="none")
-    else:
-        error = functional.smooth_l1_loss(recon, target, reduction="none")
+    error = _ERRORS[kind](recon, target, reduction="none")
     if length is None and present is None:
         return error.mean()
     position = torch.arange(error.shape[1], device=error.device)
@@ -39,24 +39,30 @@ def velocity_loss(
     return reconstruction_loss(recon.float().diff(dim=1), target.float().diff(dim=1), shorter, kind, present)
 
 
+def tokenizer_losses(net: Tokenizer, batch: Batch) -> tuple[dict[str, Tensor], TokenizerOutput]:
+    """Losses of {"motion" [B, W, dim], "length" [B], "present" bool [B, dim] (optional: all)}, and what they
+    are of; what is weighed how is in the network's own config.
+
+    Entries: loss = recon + velocity_weight * velocity + commitment * commit; recon, commit, velocity if it
+    has a weight, and per stream `perplexity_<stream>`, `usage_`, `dead_`, `resets_`, `penalty_`.
+    """
+    motion, length, present = batch["motion"], batch["length"], batch.get("present")
+    config, out = net.config, net(motion, length, present)
+    made, target = out.reconstruction, out.input
+    recon = reconstruction_loss(made, target, length, config.recon, present)
+    terms = {"recon": recon, "commit": out.penalty}
+    loss = recon + config.commitment() * out.penalty
+    if config.velocity_weight > 0:
+        terms["velocity"] = velocity_loss(made, target, length, config.recon, present)
+        loss = loss + config.velocity_weight * terms["velocity"]
+    return {"loss": loss, **terms, **out.metrics}, out
+
+
 class TokenizerModule(StageModule):
-    """LightningModule around a `Tokenizer`; what is weighed how is in the network's own config."""
+    """LightningModule around a `Tokenizer`."""
 
     net: Tokenizer
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Losses of {"motion" [B, W, dim], "length" [B], "present" bool [B, dim] (optional: all)}.
-
-        Entries: loss = recon + velocity_weight * velocity + commitment * commit; recon, commit, velocity if
-        it has a weight, and per stream `perplexity_<stream>`, `usage_`, `dead_`, `resets_`, `penalty_`.
-        """
-        motion, length, present = batch["motion"], batch["length"], batch.get("present")
-        config, out = self.net.config, self.net(motion, length, present)
-        made, target = out.reconstruction, out.input
-        recon = reconstruction_loss(made, target, length, config.recon, present)
-        terms = {"recon": recon, "commit": out.penalty}
-        loss = recon + config.commitment() * out.penalty
-        if config.velocity_weight > 0:
-            terms["velocity"] = velocity_loss(made, target, length, config.recon, present)
-            loss = loss + config.velocity_weight * terms["velocity"]
-        return {"loss": loss, **terms, **out.metrics}
+        """As `tokenizer_losses` has them."""
+        return tokenizer_losses(self.net, batch)[0]

@@ -2,7 +2,7 @@
 
 Two strided convolutions, each with a residual block behind it, read all columns but the foot contacts; the
 decoder has its residual blocks at the latents' rate. The codebook is learnt by gradient, as UDE's, which
-follows it. The adversarial loss of the release is not built in. Padding is masked as in `layers/conv.py`.
+follows it. Its critic is in `baselines/tm2t/critic.py`. Padding is masked as in `layers/conv.py`.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class Tm2tQuantizer(OneCodebook):
         heard = np.ones(layout.dim, dtype=np.bool_)
         if layout.has("foot_contacts"):
             heard[layout.slice("foot_contacts")] = False
-        numbers = torch.from_numpy(np.flatnonzero(heard[self.columns.numpy()]))
+        numbers = torch.from_numpy(np.flatnonzero(heard[layout.part(config.part)]))
         self.encoder = Tm2tEncoder(numbers, config.code_dim, config.width)
         self.quantizer = GradientQuantizer(config.codebook())
         self.decoder = Tm2tDecoder(config.code_dim, self.dim, **config.conv_sizes())

@@ -51,6 +51,16 @@ def sum_over_ranks(x: Tensor) -> Tensor:
     return x
 
 
+def sum_over_ranks_with_grad(x: Tensor) -> Tensor:
+    """Sum of `x` over ranks, for losses that differ from rank to rank: the backward pass sums gradients."""
+    if not is_distributed():
+        return x
+    from torch.distributed.nn.functional import all_reduce
+
+    summed: Tensor = all_reduce(x)  # type: ignore[no-untyped-call]
+    return summed
+
+
 def masked_mean(values: Tensor, mask: Tensor, present: Tensor | None = None) -> Tensor:
     """Mean of `values` where `mask` is True; over several ranks a share, whose mean over ranks is that mean.
 

@@ -1,5 +1,5 @@
-"""Small trainings on random motion of UDE's three networks (MQ, UTT with its critic, DMD) and of the models
-of dances that it is compared with (FACT, Bailando's three).
+"""Small trainings on random motion of UDE's three networks (MQ, UTT with its critic, DMD) and of what it is
+compared with: TM2T's tokenizer with its critic, FACT, Bailando's three.
 
 Nothing draws per process: without dropout and z, and the DMD's noise is that of the whole batch, of which a
 rank takes its rows. So two ranks and one process can be compared.
@@ -29,13 +29,15 @@ from motionloom.models.baselines.bailando.vq import DanceVq, DanceVqConfig
 from motionloom.models.baselines.bailando.vq_module import DanceVqModule
 from motionloom.models.baselines.fact.module import FactModule
 from motionloom.models.baselines.fact.network import Fact, FactConfig
+from motionloom.models.baselines.tm2t.critic import CriticConfig, CriticisedModule
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import DmdModule
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import MqConfig
+from motionloom.models.tokenizer.config import MqConfig, Tm2tConfig
 from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.tokenizer.tm2t import Tm2tQuantizer
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
@@ -48,7 +50,7 @@ from motionloom.pipeline.training.trainer import fit
 LAYOUT = MotionLayout.named("smpl75")
 MQ = MqConfig(width=8, depth=1, code_dim=8, num_codes=9, quantizer="gradient", start="data")
 OPTIM = OptimConfig(optimizer="adam", lr=3e-3, warmup_steps=3)
-NAMES = ("mq", "utt", "dmd", "fact", "dance_vq", "cross_gpt", "actor_critic")
+NAMES = ("mq", "tm2t", "utt", "dmd", "fact", "dance_vq", "cross_gpt", "actor_critic")
 
 
 class Clips(Dataset[dict[str, Any]]):
@@ -159,10 +161,13 @@ def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
     """The module of one network; `dropout` also turns on what else is drawn."""
     given: dict[str, Any] = {"seed": 3, "max_steps": steps}
     torch.manual_seed(0)
-    if name not in ("mq", "utt", "dmd"):
+    if name not in ("mq", "tm2t", "utt", "dmd"):
         return dances(name, given, dropout)
     if name == "mq":
         return TokenizerModule(build_tokenizer(MQ, LAYOUT), OPTIM, **given)
+    if name == "tm2t":
+        net = Tm2tQuantizer(Tm2tConfig(**{**MQ.dump(), "kind": "tm2t", "recon": "l1"}), LAYOUT)
+        return CriticisedModule(net, OPTIM, critic=CriticConfig(start=4, width=8), **given)
     if name == "dmd":
         small = DmdConfig(
             dim=8, ff=8, encoder_layers=1, decoder_layers=1, heads=2, dropout=dropout, attention_dropout=0.0

@@ -25,23 +25,21 @@ from motionloom.models.tokenizer.config import (
     MqConfig,
     RvqConfig,
     SeparateConfig,
-    Tm2tConfig,
     VqConfig,
     parse_tokenizer,
 )
-from motionloom.models.tokenizer.tm2t import Tm2tQuantizer, tm2t_names
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Inputs, Stage, filled_by, register
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import TrainedTokenizer
-from motionloom.pipeline.store.weights import ModelFacts, Release
+from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 from motionloom.pipeline.training.warm_start import require_same_start, require_start_layout
 
 if TYPE_CHECKING:
-    from motionloom.models.tokenizer.module import TokenizerModule
+    from motionloom.models.training.stage_module import StageModule
 
 _FREE = frozenset(
     {
@@ -122,12 +120,6 @@ class MqStageConfig(TokenizerStageConfig):
     net: MqConfig = MqConfig()
 
 
-class Tm2tStageConfig(TokenizerStageConfig):
-    """TM2T's tokenizer."""
-
-    net: Tm2tConfig = Tm2tConfig()
-
-
 class WindowInputs(Inputs):
     """What a stage takes that trains on windows."""
 
@@ -164,10 +156,6 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
         config = parse_tokenizer(facts.config, f"{facts.where}: config")
         return build_tokenizer(config, facts.layout.layout())
 
-    def release(self, net: Tokenizer) -> Release | None:
-        """TM2T's."""
-        return Release(tm2t_names(net)) if isinstance(net, Tm2tQuantizer) else None
-
     def prepare(self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs) -> None:
         """The coordinates it learns in depend on how features are normalised; or all comes from a start."""
         if inputs.start is not None:
@@ -178,7 +166,7 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
 
     def module(
         self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, seed: int
-    ) -> TokenizerModule:
+    ) -> StageModule:
         from motionloom.models.tokenizer.module import TokenizerModule
 
         steps = config.train.steps
@@ -239,4 +227,3 @@ register(TokenizerStage("rvq", "RVQ tokenizer", RvqStageConfig))
 register(TokenizerStage("separate", "body and hands apart", SeparateStageConfig))
 register(TokenizerStage("fsq", "FSQ tokenizer", FsqStageConfig))
 register(TokenizerStage("mq", "UDE's motion quantization", MqStageConfig))
-register(TokenizerStage("tm2t", "TM2T's tokenizer", Tm2tStageConfig))
