@@ -214,7 +214,7 @@ def stream_motion(
     `out` is a file, None is standard output. What is said to people goes to `console`.
     """
     from motionloom.pipeline.inference.script import Script, read_music
-    from motionloom.pipeline.inference.stream import MotionStream, stream_of
+    from motionloom.pipeline.inference.stream import MotionStream, doubted, stream_of
     from motionloom.pipeline.inference.stream_lines import frame_lines, heading
 
     _require_driver(captions, face, audio, script, seconds)
@@ -264,7 +264,7 @@ def stream_motion(
         file.flush()
         started, first, frames = time.perf_counter(), math.nan, 0
         try:
-            for chunk in stream:
+            for chunk in doubted(stream, notice):
                 for line in frame_lines(chunk):
                     file.write(line)
                 file.flush()

@@ -25,7 +25,7 @@ from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
 from motionloom.pipeline.inference.requests import remarks_of
-from motionloom.pipeline.inference.stream import MotionStream, stream_of
+from motionloom.pipeline.inference.stream import MotionStream, doubted, stream_of
 from motionloom.pipeline.inference.stream_lines import frame_lines, heading, rounded
 from motionloom.pipeline.inference.writers import WRITERS, cell_of
 from motionloom.pipeline.render.viewer import viewer_data
@@ -215,11 +215,16 @@ def stream(
 def lines(
     stream: MotionStream, asked: MotionRequest, model: str, notes: Mapping[str, list[str]]
 ) -> Iterator[str]:
-    """JSON lines of a stream, whose first one names the request and says what there is to note."""
+    """JSON lines of a stream, whose first one names the request and says what there is to note, and whose
+    last what the joints do not show, if that is anything.
+    """
     facts = json.loads(heading(stream.layout, asked.seed, model))
     yield json.dumps({"request": asked.request, **facts, **notes}) + "\n"
-    for chunk in stream:
+    doubts: list[str] = []
+    for chunk in doubted(stream, lambda doubt: doubts.append(str(doubt))):
         yield "".join(frame_lines(chunk))
+    if doubts:
+        yield json.dumps({"notes": doubts}) + "\n"
 
 
 def facts_of(motion: GeneratedMotion, request: str, seed: int) -> dict[str, object]:
