@@ -126,7 +126,7 @@ class Mate(nn.Module):
             for name, size, end in zip(self.widths, sizes, ends, strict=True)
             if size and name in self.timed
         ]
-        size = max((part.shape[1] for part in found), default=0)
+        size = max([0, *(part.shape[1] for part in found)])
         out: Tensor | None = None
         for part in found:
             padded = nn.functional.pad(part, (0, 0, 0, size - part.shape[1]))

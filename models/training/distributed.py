@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -51,13 +52,19 @@ def sum_over_ranks(x: Tensor) -> Tensor:
     return x
 
 
+class _Summed(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        return sum_over_ranks(x)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return sum_over_ranks(grad)
+
+
 def sum_over_ranks_with_grad(x: Tensor) -> Tensor:
     """Sum of `x` over ranks, for losses that differ from rank to rank: the backward pass sums gradients."""
-    if not is_distributed():
-        return x
-    from torch.distributed.nn.functional import all_reduce
-
-    summed: Tensor = all_reduce(x)  # type: ignore[no-untyped-call]
+    summed: Tensor = _Summed.apply(x) if is_distributed() else x  # type: ignore[no-untyped-call]
     return summed
 
 

@@ -12,8 +12,11 @@ Notable choices [ours]:
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 from torch import Tensor
+from torch.optim import Optimizer
 
 from motionloom.models.condition.mate import Encoded, drop_conditions
 from motionloom.models.discriminator.losses import discriminator_loss, generator_loss
@@ -24,7 +27,7 @@ from motionloom.models.gpt.tokens import TokenSequence, interleave
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
-from motionloom.models.training.stage_module import Batch
+from motionloom.models.training.stage_module import Batch, Execution
 from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.network import ConditionedUtt
 
@@ -33,6 +36,7 @@ class UttModule(PlayersModule):
     """Trains a `ConditionedUtt` on `ConditionBatches`; the tokenizer is only looked through."""
 
     net: ConditionedUtt
+    pull: Tensor
 
     def __init__(
         self,
@@ -52,6 +56,25 @@ class UttModule(PlayersModule):
             self.discriminator = PatchDiscriminator(
                 self.loss_config.discriminator, tokenizer.dim, net.mate.config.dim
             )
+
+        self.register_buffer("pull", torch.zeros(()), persistent=False)
+        self.judged = False
+        """Whether the adversarial term is on. It and its weight, `pull`, are set outside of what is compiled,
+        which a number that changes with every step would have compiled anew in each."""
+        self._weigh()
+
+    def _weigh(self) -> None:
+        weight = self.loss_config.weight(self.step)
+        self.judged = weight > 0
+        self.pull.fill_(weight)
+
+    def take_step(self, parts: Iterable[Batch], optimizers: list[Optimizer], how: Execution) -> Tensor:
+        self._weigh()
+        return super().take_step(parts, optimizers, how)
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        self._weigh()
+        return super().losses(batch)
 
     def players(self) -> list[Player]:
         """The token model, then the discriminator of what it has made."""
@@ -104,8 +127,7 @@ class UttModule(PlayersModule):
         values = {"loss": ce, "ce": ce}
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind)
-        weight = self.loss_config.weight(self.step)
-        if self.discriminator is None or (weight == 0 and self.training):
+        if self.discriminator is None or (self.training and not self.judged):
             return values
         how = self.loss_config.adversarial
         fake, length = soft_motion(
@@ -120,7 +142,7 @@ class UttModule(PlayersModule):
         )
         shared |= {"motion": fake, "length": length, "glob": encoded.glob}
         values["adversarial"] = generator_loss(self.discriminator(fake, encoded.glob, length))
-        values["loss"] = ce + weight * values["adversarial"]
+        values["loss"] = ce + self.pull * values["adversarial"]
         return values
 
     def _critic(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -115,8 +115,8 @@ class GenerationRequest:
         """The frames of each motion; `who` makes a length that it is given."""
         if self.frames is None:
             raise UserError(
-                f"{who} makes a motion of a length that it is given, and none was; give --seconds, or to "
-                f"evaluate it lengths: recorded"
+                f"{who} makes a motion of a length that it is given, and none was; give --seconds, in a "
+                f"recipe seconds, or to evaluate it lengths: recorded"
             )
         return self.frames
 

@@ -61,7 +61,7 @@ class ServeConfig(Config):
     patience: float = Field(20.0, gt=0)
     """Seconds in which a request must have arrived, its headers first."""
     connections: int = Field(256, ge=1)
-    """Connections at a time; more are closed as they come."""
+    """Connections at a time; one more takes the place of one that asks for nothing, or is closed."""
 
 
 def known_answer(name: str) -> str:

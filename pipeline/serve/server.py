@@ -95,7 +95,7 @@ def connection_of(config: ServeConfig) -> type[H11Protocol]:
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             if len(self.connections) >= most:
-                idle = [one for one in self.connections if isinstance(one, Connection) and not one._asked()]
+                idle = [one for one in self.connections if isinstance(one, Connection) and one._idle()]
                 if not idle:
                     transport.abort()
                     return
@@ -105,6 +105,10 @@ def connection_of(config: ServeConfig) -> type[H11Protocol]:
             super().connection_made(transport)
             self._since = self.loop.time()
             self._late = self.loop.call_later(patience, self._drop)
+
+        def on_response_complete(self) -> None:
+            super().on_response_complete()
+            self._since = self.loop.time()
 
         def data_received(self, data: bytes) -> None:
             if self._late is None and not self._asked():
@@ -123,6 +127,10 @@ def connection_of(config: ServeConfig) -> type[H11Protocol]:
         def _asked(self) -> bool:
             """Whether a request's headers are here, and it is being answered."""
             return self.cycle is not None and not self.cycle.response_complete
+
+        def _idle(self) -> bool:
+            """Whether nothing is asked, and all that was answered has gone out."""
+            return not self._asked() and not self.transport.get_write_buffer_size()
 
         def _drop(self) -> None:
             self._late = None

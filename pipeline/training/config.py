@@ -38,9 +38,9 @@ class TrainConfig(Config):
     """Parts the batch of a step is cut into, to need less memory; the gradient is the mean of theirs.
 
     Equal to the whole batch where a loss is a mean over samples and the parts hold equally many real frames
-    or tokens. Two things cannot be: a contrastive loss sees the negatives of its own part only, and a learnt
-    codebook is updated with every part (an average and resets over smaller batches). More processes instead
-    of more parts change neither.
+    or tokens. Three things cannot be: a contrastive loss sees the negatives of its own part only, a learnt
+    codebook is updated with every part (an average and resets over smaller batches), and so is the batch
+    normalisation of `tm2t`'s critic. More processes instead of more parts change none.
     """
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
     strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)

@@ -22,14 +22,15 @@ def smpl75_of(
     """Columns [T, 75] of local rotations [T, N, 3, 3] and the joints [T, M, 3] that they pose, N and M 22 or
     more, in any place.
 
-    Rotations are stored as they are, twists included. Of those beyond SMPL's none are, and SMPL's last two,
-    the hands, stay at rest where there are none [ours]. `rest_root` [3] is the root of the body at rest:
+    Rotations are stored as they are, twists included: SMPL's 24, or of any other number the body's 22, with
+    SMPL's last two, the hands, at rest [ours]. `rest_root` [3] is the root of the body at rest:
     SMPL adds the translation to every joint.
     """
     import roma
     import torch
 
-    local = rotations[:, :SMPL_JOINTS].astype(np.float64)
+    count = SMPL_JOINTS if rotations.shape[1] == SMPL_JOINTS else BODY_JOINTS
+    local = rotations[:, :count].astype(np.float64)
     angle = -float(facing(joints[:1])[0])
     local[:, 0] = (
         roma.rotvec_to_rotmat(torch.tensor([0.0, angle, 0.0], dtype=torch.float64)).numpy() @ local[:, 0]

@@ -11,21 +11,24 @@ Legend: B batch, T frames, D motion features, C channels.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import pairwise
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.optim import Optimizer
 
 from motionloom.datasets.schema import Config
 from motionloom.models.layers.strided import SLOPE
+from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.module import tokenizer_losses
 from motionloom.models.tokenizer.tm2t import Tm2tQuantizer
 from motionloom.models.training.distributed import sum_over_ranks, sum_over_ranks_with_grad
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
-from motionloom.models.training.stage_module import Batch
+from motionloom.models.training.stage_module import Batch, Execution
 
 
 class CriticConfig(Config):
@@ -85,7 +88,7 @@ class Critic(nn.Module):
 
 
 class CriticisedModule(PlayersModule):
-    """Trains TM2T's tokenizer, and the critic of what it makes. Padding is 0 in both, and judged alike."""
+    """Trains TM2T's tokenizer, and the critic of what it makes. What a clip lacks is 0 in both."""
 
     net: Tm2tQuantizer
 
@@ -95,6 +98,12 @@ class CriticisedModule(PlayersModule):
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
         self.critic_config = critic
         self.critic = Critic(net.dim, critic.width)
+        self.judged = critic.start == 0
+        """Whether the critic plays; no number, by which every step would be compiled anew."""
+
+    def take_step(self, parts: Iterable[Batch], optimizers: list[Optimizer], how: Execution) -> Tensor:
+        self.judged = self.step >= self.critic_config.start
+        return super().take_step(parts, optimizers, how)
 
     def players(self) -> list[Player]:
         """The tokenizer, then the critic of what it has made."""
@@ -112,9 +121,12 @@ class CriticisedModule(PlayersModule):
             accuracy = ((real > 0).float().mean() + (made < 0).float().mean()) / 2
             return {"loss": (terms["real"] + terms["made"]) / 2, **terms, "accuracy": accuracy}
         values, out = tokenizer_losses(self.net, batch)
-        shared |= {"motion": out.input, "made": out.reconstruction}
-        if self.training and self.step < self.critic_config.start:
+        there = length_mask(batch["length"], out.input.shape[1])[..., None]
+        if "present" in batch:
+            there = there & batch["present"][:, None]
+        shared |= {"motion": out.input * there, "made": out.reconstruction * there}
+        if self.training and not self.judged:
             return values
-        values["adversarial"] = -self.critic(out.reconstruction).mean()
+        values["adversarial"] = -self.critic(shared["made"]).mean()
         values["loss"] = values["loss"] + self.critic_config.weight * values["adversarial"]
         return values

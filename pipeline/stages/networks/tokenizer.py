@@ -1,4 +1,4 @@
-"""Tokenizer stages: H2VQ, VQ, RVQ, FSQ, TM2T's; body-hand, body or face (HumanTOMATO section 3.2, B.2)."""
+"""Tokenizer stages: H2VQ, VQ, RVQ, FSQ, UDE's; body-hand, body or face (HumanTOMATO section 3.2, B.2)."""
 
 from __future__ import annotations
 

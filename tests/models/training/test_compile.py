@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from batch_rows import rows_of
 from rank_cases import CASES, Undrawn, drawing_diffusion
+from ude_training import train
 
 pytestmark = pytest.mark.slow
 
@@ -48,3 +51,14 @@ def test_many_stages_compile_in_one_process(monkeypatch: pytest.MonkeyPatch) -> 
             for mode in (True, False):
                 module.train(mode)
                 assert module.losses(rows_of(batches(0), slice(size)))["loss"] > 0
+
+
+@pytest.mark.parametrize("name", ["tm2t", "utt"])
+def test_no_step_of_players_is_compiled_anew(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over more steps than there may be graphs, while a critic begins and its weight rises."""
+    compiler = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda f, **options: compiler(f, backend="eager", **options))
+    module = train(name, tmp_path, compile=True)
+    assert module.step == 16 > torch._dynamo.config.recompile_limit

@@ -174,6 +174,27 @@ def test_idle_connections_make_room_and_lock_nobody_out(run_server: Callable[...
             raw.close()
 
 
+def test_who_was_answered_last_stays(run_server: Callable[..., Any], quick: Any) -> None:
+    def asked(one: http.client.HTTPConnection) -> int:
+        one.request("GET", "/api/info")
+        answer = one.getresponse()
+        answer.read()
+        return answer.status
+
+    with run_server(quick, connections=2) as served:
+        first, second, third = (
+            http.client.HTTPConnection("127.0.0.1", served.port, timeout=20) for _ in range(3)
+        )
+        first.connect()
+        assert asked(second) == asked(first) == asked(third) == 200
+        with contextlib.suppress(ConnectionResetError):
+            assert second.sock.recv(1) == b""
+        kept = first.sock
+        assert asked(first) == 200 and first.sock is kept
+        for one in (first, second, third):
+            one.close()
+
+
 def test_names_that_no_header_can_carry(served: Any) -> None:
     got = served.post("/api/generate", {**WAVE, "request": " mine "})
     assert got.status == 200 and got.headers["x-request"] == "mine"
