@@ -24,7 +24,9 @@ from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
 from motionloom.pipeline.inference.generators.bailando import BailandoGenerator
+from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.baselines.dances import dance_batches, spread_dances
+from motionloom.pipeline.stages.networks.tokenizer import require_uses
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.weights import ModelFacts, load_facts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
@@ -50,6 +52,12 @@ class DanceVqStageConfig(TrainedStageConfig):
     train: TrainConfig = TrainConfig(steps=150_000, batch_size=32)
     window: int = Field(240, ge=4)
     """Frames of a training window; shorter clips are left out."""
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """As for a tokenizer; the published sizes have 1.9 times the vectors."""
+        super().require_fit(hardware)
+        vectors = self.train.batch_size // self.train.accumulate * self.window // self.net.code_frames
+        require_uses(vectors, self.net.num_codes, self.net.reset_below, times=1.5)
 
 
 class DanceVqInputs(Inputs):

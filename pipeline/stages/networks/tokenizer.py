@@ -74,14 +74,17 @@ class TokenizerStageConfig(WindowStageConfig):
         if isinstance(net, MqConfig) and net.quantizer != "ema":
             return  # codes learnt by gradient are never reset
         vectors = self.train.batch_size // self.train.accumulate * self.window // GROUP_FRAMES
-        needed = 2 * net.num_codes * net.reset_below
-        if vectors < needed:
-            raise UserError(
-                f"a codebook of {net.num_codes} codes gets {vectors} vectors an update and resets codes "
-                f"used less than {net.reset_below:g} times: it would replace codes for ever. Set "
-                f"net.reset_below to {vectors / net.num_codes / 4:.2g} or less, or raise "
-                "train.batch_size"
-            )
+        require_uses(vectors, net.num_codes, net.reset_below)
+
+
+def require_uses(vectors: int, codes: int, reset_below: float, *, times: float = 2.0) -> None:
+    """A codebook must get `times` the vectors of an update that it resets codes below."""
+    if vectors < times * codes * reset_below:
+        raise UserError(
+            f"a codebook of {codes} codes gets {vectors} vectors an update and resets codes used less than "
+            f"{reset_below:g} times: it would replace codes for ever. Set net.reset_below to "
+            f"{vectors / codes / 4:.2g} or less, or raise train.batch_size"
+        )
 
 
 class H2VQStageConfig(TokenizerStageConfig):
