@@ -232,7 +232,7 @@ def main() -> None:
     console.print(table)
     figures = {
         "name": args.name or before.get("name", args.model.resolve().name),
-        "description": f"{recipe.description}; it knows {', '.join(data.action_names)}",
+        "description": f"{recipe.description}; it knows {known(data)}",
         "recipe": args.recipe or before.get("recipe", RECIPE),
         "settings": settings,
         "clips": len(truths),
@@ -256,6 +256,12 @@ def main() -> None:
         console.print(str(model / "README.md"), soft_wrap=True)
     else:
         console.print(compared(before, figures), soft_wrap=True)
+
+
+def known(data: SynthConfig) -> str:
+    """The actions in words; "then" is none of its own."""
+    names = [name for name in data.action_names if name != "then"]
+    return ", ".join(names) + (", and two in turn" if "then" in data.action_names else "")
 
 
 def apart(truth: Truth, hold_out: Sequence[Mapping[str, Any]]) -> bool:
@@ -344,7 +350,7 @@ def card_of(
         fps=bundle.layout.fps,
         bytes=size,
         clips=f"{sum(split_of(k, data) == 'train' for k in range(data.clips)):,}",
-        actions="Actions: " + ", ".join(data.action_names),
+        actions="Actions: " + known(data),
         hands=", ".join(data.hand_shapes or HANDS[1:]),
         faces=", ".join(FACES),
         count=figures["clips"],

@@ -49,9 +49,9 @@ if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
 
 
-GUIDANCE = 2.0
-"""At which `synthetic` walks on for ten minutes as fast as in the first ten seconds; at the 1.25 that it
-recommends for single clips it loses a quarter of its speed, and `dance` at its 1.5 comes to a stand."""
+GUIDANCE = 3.0
+"""At which each of ten minutes of `synthetic`'s walk is 0.88 to 1.15 times as fast as its first ten seconds
+(two seeds); at 2 it loses a third of its speed, and `dance` at the 1.5 of single clips comes to a stand."""
 
 
 @dataclass(frozen=True)
