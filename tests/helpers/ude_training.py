@@ -29,7 +29,8 @@ from motionloom.models.baselines.bailando.vq import DanceVq, DanceVqConfig
 from motionloom.models.baselines.bailando.vq_module import DanceVqModule
 from motionloom.models.baselines.fact.module import FactModule
 from motionloom.models.baselines.fact.network import Fact, FactConfig
-from motionloom.models.baselines.tm2t.critic import CriticConfig, CriticisedModule
+from motionloom.models.baselines.tm2t.critic import CriticisedModule
+from motionloom.models.baselines.tm2t.losses import CriticConfig
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import DmdModule

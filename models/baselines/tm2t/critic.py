@@ -15,12 +15,11 @@ from collections.abc import Iterable
 from itertools import pairwise
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim import Optimizer
 
-from motionloom.datasets.schema import Config
+from motionloom.models.baselines.tm2t.losses import CriticConfig
 from motionloom.models.layers.strided import SLOPE
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.module import tokenizer_losses
@@ -29,17 +28,6 @@ from motionloom.models.training.distributed import sum_over_ranks, sum_over_rank
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.players import Player, PlayersModule
 from motionloom.models.training.stage_module import Batch, Execution
-
-
-class CriticConfig(Config):
-    """The adversarial term."""
-
-    weight: float = Field(0.5, gt=0)
-    """Of the term in the tokenizer's loss."""
-    start: int = Field(10_000, ge=0)
-    """First step with the term, and the critic's first step; the release begins with its tenth epoch."""
-    width: int = Field(512, ge=2, multiple_of=2)
-    """Channels of the first convolution; the second has half."""
 
 
 class RankNorm(nn.Module):

@@ -1,4 +1,4 @@
-"""Loss terms of TM2T: words counted or averaged, teacher forcing, ends of clips that are hidden."""
+"""Loss terms of TM2T: words counted or averaged, teacher forcing, hidden ends of clips, the critic."""
 
 from __future__ import annotations
 
@@ -10,6 +10,17 @@ from torch.nn import functional
 from motionloom.datasets.schema import Config
 from motionloom.models.baselines.tm2t.vocabulary import PAD
 from motionloom.models.training.distributed import masked_mean, sum_over_ranks
+
+
+class CriticConfig(Config):
+    """The adversarial term."""
+
+    weight: float = Field(0.5, gt=0)
+    """Of the term in the tokenizer's loss."""
+    start: int = Field(10_000, ge=0)
+    """First step with the term, and the critic's first step; the release begins with its tenth epoch."""
+    width: int = Field(512, ge=2, multiple_of=2)
+    """Channels of the first convolution; the second has half."""
 
 
 class CaptionLossConfig(Config):

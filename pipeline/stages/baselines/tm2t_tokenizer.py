@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from motionloom.models.baselines.tm2t.critic import CriticConfig
+from motionloom.models.baselines.tm2t.losses import CriticConfig
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.config import Tm2tConfig
 from motionloom.models.tokenizer.tm2t import Tm2tQuantizer, tm2t_names

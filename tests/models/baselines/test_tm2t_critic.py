@@ -7,7 +7,8 @@ from torch import nn
 from torch.nn import functional
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.baselines.tm2t.critic import Critic, CriticConfig, CriticisedModule, RankNorm
+from motionloom.models.baselines.tm2t.critic import Critic, CriticisedModule, RankNorm
+from motionloom.models.baselines.tm2t.losses import CriticConfig
 from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import Tm2tConfig
 from motionloom.models.tokenizer.tm2t import Tm2tQuantizer
