@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.check.claims import doubts_of
 from motionloom.datasets.motion.features.joints import JointFlow
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
@@ -103,37 +102,6 @@ def joined(chunks: Sequence[MotionChunk], seed: int | None = None) -> GeneratedM
         tuple(spans) if several else (),
         seed=seed,
     )
-
-
-LOOKED_AT = 6.0
-"""Seconds of a caption after which what the joints show of it is looked at: a few of its rounds."""
-
-
-def doubted(
-    chunks: Iterable[MotionChunk], notice: Callable[[Unknown | str], object]
-) -> Iterator[MotionChunk]:
-    """The chunks; `notice` is given what the joints do not show of a caption, when it ends or after its first
-    seconds. What comes after those is not looked at.
-    """
-    shown: list[MotionChunk] = []
-
-    def look() -> None:
-        for doubt in doubts_of([joined(shown)] if shown else []):
-            notice(doubt)
-        shown.clear()
-
-    last, looked = None, False
-    for chunk in chunks:
-        if chunk.prompt is not last:
-            look()
-            last, looked = chunk.prompt, False
-        if not looked:
-            shown.append(chunk)
-            if sum(len(one.joints) for one in shown) >= LOOKED_AT * chunk.fps:
-                look()
-                looked = True
-        yield chunk
-    look()
 
 
 class MotionStream(Iterator[MotionChunk]):

@@ -214,8 +214,8 @@ def stream_motion(
     `out` is a file, None is standard output. What is said to people goes to `console`.
     """
     from motionloom.pipeline.inference.script import Script, read_music
-    from motionloom.pipeline.inference.stream import MotionStream, doubted, stream_of
-    from motionloom.pipeline.inference.stream_lines import frame_lines, heading
+    from motionloom.pipeline.inference.stream import MotionStream, stream_of
+    from motionloom.pipeline.inference.stream_lines import doubted, frame_lines, heading
 
     _require_driver(captions, face, audio, script, seconds)
     if len(captions) > 1 and (seconds is None or STDIN in captions or audio or face):
