@@ -150,7 +150,9 @@ def test_accuracy_among_candidates() -> None:
     twins = torch.cat([text, text])
     equal = torch.eye(80, dtype=torch.bool).repeat(2, 2)
     assert accuracy_among(twins, twins, candidates=150, same=equal)["top-1"] == 1
-    assert accuracy_among(twins, twins, candidates=150)["top-1"] < 1
+    # One equal rival ties, which is right, or by rounding goes before; two are before on any machine.
+    triplets = torch.cat([text] * 3)
+    assert accuracy_among(triplets, triplets, candidates=240)["top-1"] < 0.9
 
 
 # Physics of motions whose answers are known.
