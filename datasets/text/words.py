@@ -10,8 +10,9 @@ nothing. A word that is none, one slip of a letter away from one of training's, 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -32,7 +33,8 @@ put puts putting go goes going get gets getting give gives giving make makes mak
 moves moving do does doing
 """
 _DECIDE = """
-no not never nobody none nor without stop stops refuses zero many two three four five six seven eight nine ten
+no not never nobody none nor nothing nowhere without instead stop stops refuse refuses avoid avoids
+zero many two three four five six seven eight nine ten
 eleven twelve twenty thirty forty fifty sixty seventy eighty ninety hundred thousand dozen then after
 afterwards before
 """
@@ -41,6 +43,7 @@ happy happily sad sadly unhappy angry angrily surprised calm calmly neutral glad
 """
 MOODS = frozenset(_MOODS.split())
 """Words of faces that a body's caption may have; how someone feels changes no action of a model of both."""
+_IN_TURN = r",?\s*(?:\b(?:and|but)\b)?\s*\b(?:then|afterwards|after (?:that|this|which)|finally)\b,?"
 _SAME = {"twice": "two", "thrice": "three", "2": "two", "3": "three", "4": "four", "5": "five"}
 _ENDINGS = ("s", "es", "d", "ed", "ing")
 _WORD = r"[\w']+"
@@ -57,6 +60,11 @@ def words_of(captions: Collection[str]) -> frozenset[str]:
     return frozenset(word for caption in captions for word in _split(caption))
 
 
+def counted(captions: Collection[str]) -> Mapping[str, int]:
+    """How often captions have each of their words, in small letters."""
+    return Counter(word for caption in captions for word in _split(caption))
+
+
 def _split(caption: str) -> list[str]:
     return re.findall(_WORD, caption.lower())
 
@@ -68,6 +76,8 @@ class HeardWords:
     words: frozenset[str]
     encode: Encode
     pieces: Pieces
+    often: Mapping[str, int] = field(default_factory=dict)
+    """How often training had a word, as far as it is known; of two slips the likelier word is meant."""
 
     def spelt(self, caption: str) -> str:
         """A caption whose misspelt words are those of training that they are meant to be."""
@@ -77,7 +87,8 @@ class HeardWords:
         small = word.lower()
         if small in self.words or small in _SMALL | _EXACT:
             return word
-        near = sorted(known for known in self.words if one_slip(small, known))
+        near = [known for known in self.words if one_slip(small, known)]
+        near.sort(key=lambda known: (-self.often.get(known, 0), known))
         return near[0] if near and not self._english(small) else word
 
     def _english(self, word: str) -> bool:
@@ -116,6 +127,12 @@ def deciding(caption: str) -> frozenset[str]:
     """The words of a caption that decide by themselves, one spelling for each number."""
     words = (_SAME.get(word, word) for word in _split(caption))
     return frozenset(word for word in words if decides(word))
+
+
+def in_turn(caption: str) -> list[str]:
+    """The parts of a caption that puts one action after another."""
+    parts = (part.strip(" ,.") for part in re.split(_IN_TURN, caption, flags=re.IGNORECASE))
+    return [part for part in parts if part]
 
 
 def _stem(word: str) -> str:

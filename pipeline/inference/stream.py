@@ -29,9 +29,10 @@ from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.generation import Prompt, StreamingGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
-from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.standing import Standing
 from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.notes import unknown_captions
 from motionloom.pipeline.inference.requests import (
     require_driven,
     require_seed,

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.check.claims import doubts_of
+from motionloom.datasets.check.claims import Understood, by_words, doubts_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.inference.stream import MotionChunk, joined
 from motionloom.pipeline.store.known_captions import Unknown
@@ -62,7 +62,9 @@ LOOKED_AT = 6.0
 
 
 def doubted(
-    chunks: Iterable[MotionChunk], notice: Callable[[Unknown | str], object]
+    chunks: Iterable[MotionChunk],
+    notice: Callable[[Unknown | str], object],
+    understand: Callable[[str], Understood] = by_words,
 ) -> Iterator[MotionChunk]:
     """The chunks; `notice` is given what the joints do not show of a caption, when it ends or after its first
     seconds. What comes after those is not looked at.
@@ -70,7 +72,7 @@ def doubted(
     shown: list[MotionChunk] = []
 
     def look() -> None:
-        for doubt in doubts_of([joined(shown)] if shown else []):
+        for doubt in doubts_of([joined(shown)] if shown else [], understand):
             notice(doubt)
         shown.clear()
 

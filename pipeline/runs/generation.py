@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -107,9 +108,8 @@ def generate_motions(
     of `FigureOptions`.
     """
     from motionloom.datasets.audio.excerpt import Excerpt
-    from motionloom.datasets.check.claims import doubts_of
     from motionloom.pipeline.contract.generation import SeededGenerator
-    from motionloom.pipeline.inference.bundle import unknown_captions
+    from motionloom.pipeline.inference.notes import doubts, unknown_captions
     from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
@@ -160,15 +160,14 @@ def generate_motions(
                     f"the first {start:.2g} s are of a training dance; --seed-motion takes a clip of yours",
                 )
         said = captions if segments is None else [segment.prompt.text for segment in segments]
-        unknown_ones = unknown_captions(bundle, said, face or (), sampling.face_model)
-        doubts = doubts_of(motions)
-        for doubt in (*unknown_ones, *doubts):
-            _print_note(aside, doubt)
+        notes = [*unknown_captions(bundle, said, face or (), sampling.face_model), *doubts(bundle, motions)]
+        for note in notes:
+            _print_note(aside, note)
         driven = motions if segments is None else segments
         for remark in remarks_of(one.prompt for one in driven):
             _print_note(aside, remark)
         title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
-        note = page_note(len(motions), folder.resolve().name, seed, [*unknown_ones, *doubts])
+        note = page_note(len(motions), folder.resolve().name, seed, notes)
         named = [Excerpt.named(path).path.stem for path in audio for _ in range(samples)]
         with film_progress(aside) as progress:
             paths = write_motions(
@@ -213,6 +212,7 @@ def stream_motion(
     and frames come no faster than they are watched.
     `out` is a file, None is standard output. What is said to people goes to `console`.
     """
+    from motionloom.pipeline.inference.notes import understood
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.stream import MotionStream, stream_of
     from motionloom.pipeline.inference.stream_lines import doubted, frame_lines, heading
@@ -264,7 +264,7 @@ def stream_motion(
         file.flush()
         started, first, frames = time.perf_counter(), math.nan, 0
         try:
-            for chunk in doubted(stream, notice):
+            for chunk in doubted(stream, notice, partial(understood, bundle)):
                 for line in frame_lines(chunk):
                     file.write(line)
                 file.flush()

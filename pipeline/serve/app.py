@@ -23,16 +23,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, change, received, why_not
 from motionloom.pipeline.serve.guard import BROKEN, guarded, read_body
-from motionloom.pipeline.serve.requests import (
-    Answer,
-    MotionRequest,
-    ServeConfig,
-    Sounds,
-    lines,
-    make,
-    notes_of,
-    stream,
-)
+from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
 T = TypeVar("T")
@@ -123,8 +114,7 @@ class Site:
 
         def work() -> None:
             try:
-                made = stream(self.model, asked, sound, self.config)
-                for piece in lines(made, asked, self.name, notes_of(self.model, asked, sound)):
+                for piece in lines(self.model, self.name, asked, sound, self.config):
                     loop.call_soon_threadsafe(pieces.put_nowait, piece)
                     if gone or self.worker.stopped:
                         break

@@ -9,6 +9,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Generic, TypeVar
 
@@ -16,13 +17,13 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
-from motionloom.datasets.check.claims import doubts_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.notes import doubts, understood
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
 from motionloom.pipeline.inference.requests import remarks_of
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
@@ -150,8 +151,8 @@ def notes_of(
     unknown = model.unknown(asked.captions, asked.faces)
     nearest = [text for one in unknown if one.caption in asked.captions for text in one.nearest]
     remarks = remarks_of([Prompt(asked.caption, sound=sound)])
-    doubts = doubts_of([] if motion is None else [motion])
-    return {"notes": [*(one.what for one in unknown), *remarks, *doubts], "nearest": nearest}
+    seen = doubts(model.bundle, [] if motion is None else [motion])
+    return {"notes": [*(one.what for one in unknown), *remarks, *seen], "nearest": nearest}
 
 
 def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:
@@ -160,7 +161,8 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
     if asked.format in WRITERS:
         note = ""
         if asked.format == "html":
-            note = "\n".join(map(str, [*model.unknown(asked.captions, asked.faces), *doubts_of([motion])]))
+            seen = doubts(model.bundle, [motion])
+            note = "\n".join(map(str, [*model.unknown(asked.captions, asked.faces), *seen]))
         return file_answer(motion, asked.format, asked.seed, note)
     facts = {
         **facts_of(motion, asked.request, asked.seed),
@@ -213,18 +215,19 @@ def stream(
 
 
 def lines(
-    stream: MotionStream, asked: MotionRequest, model: str, notes: Mapping[str, list[str]]
+    model: MotionModel, name: str, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
 ) -> Iterator[str]:
-    """JSON lines of a stream, whose first one names the request and says what there is to note, and whose
-    last what the joints do not show, if that is anything.
+    """JSON lines of a stream of the model of this name, whose first one names the request and says what there
+    is to note, and whose last what the joints do not show, if that is anything.
     """
-    facts = json.loads(heading(stream.layout, asked.seed, model))
+    made, notes = stream(model, asked, sound, limits), notes_of(model, asked, sound)
+    facts = json.loads(heading(made.layout, asked.seed, name))
     yield json.dumps({"request": asked.request, **facts, **notes}) + "\n"
-    doubts: list[str] = []
-    for chunk in doubted(stream, lambda doubt: doubts.append(str(doubt))):
+    seen: list[str] = []
+    for chunk in doubted(made, lambda doubt: seen.append(str(doubt)), partial(understood, model.bundle)):
         yield "".join(frame_lines(chunk))
-    if doubts:
-        yield json.dumps({"notes": doubts}) + "\n"
+    if seen:
+        yield json.dumps({"notes": seen}) + "\n"
 
 
 def facts_of(motion: GeneratedMotion, request: str, seed: int) -> dict[str, object]:

@@ -7,11 +7,15 @@ Embeddings are MiniLM's, which comes with the installation, whatever encoder the
 
 A caption is known if it has no word that training had nothing like, and if a caption of the training is near
 it, both as a sentence and as the model itself reads the two, and has the words that decide by themselves.
+Where it is very near, other words that training had nothing like change nothing.
+
+Where it is known what the motions of these captions do, as of synthetic clips, the nearest say what a new one
+asks for, and its motion can be compared with that.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
@@ -23,8 +27,9 @@ from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.printable import printable
+from motionloom.datasets.check.claims import Acts
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.text.words import Encode, HeardWords, deciding, words_of
+from motionloom.datasets.text.words import Encode, HeardWords, decides, deciding, in_turn, words_of
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 
@@ -45,12 +50,21 @@ NEAREST, AT_ONCE = 128, 32
 """Known captions that the model reads beside a new one at most, and how many at a time."""
 
 
+SURE = 1.45
+"""The same from which words that were never heard change nothing, unless they decide."""
+LIKE_IT, AS_NEAR = 3, 0.05
+"""Known captions whose motions say what a new one may ask for, at most, and by how much less near than the
+nearest; chosen on the same sentences."""
+
+
 class _Texts(Config):
     """`known.json`."""
 
     body: tuple[str, ...]
     face: tuple[str, ...]
     words: tuple[str, ...] = ()
+    acts: tuple[Acts, ...] = ()
+    """What the motions of the body's captions do, in their order."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +101,32 @@ class KnownCaptions:
     embeddings: NDArray[np.float32]
     words: frozenset[str] = frozenset()
     """All words of the training's captions; empty where they were not kept."""
+    acts: tuple[Acts, ...] = ()
+    """What the motion of each caption does; empty where that is not known."""
+
+    def asked(self, caption: str, encode: Encode, read: Encode | None = None) -> list[Acts]:
+        """What a caption may ask for, likeliest first: what the motions of those captions do that are about
+        as near to it as the nearest. One that puts an action after another is looked at part by part.
+        """
+        if not self.acts:
+            return []
+        parts = in_turn(caption)
+        if len(parts) != 2:
+            return self._asked(caption, range(len(self.acts)), encode, read)
+        alone = [k for k, acts in enumerate(self.acts) if len(acts) == 1]
+        first, second = (self._asked(part, alone, encode, read) for part in parts)
+        return [one + other for one in first for other in second]
+
+    def _asked(self, caption: str, among: Sequence[int], encode: Encode, read: Encode | None) -> list[Acts]:
+        near = self.embeddings[among] @ np.asarray(encode([caption]), np.float32)[0]
+        nearest = np.argsort(-near, kind="stable")[:AT_ONCE]
+        near = near[nearest]
+        if read is not None:
+            readings = read([caption, *(self.captions[among[k]] for k in nearest)])
+            near = near + readings[1:] @ readings[0]
+        order = np.argsort(-near, kind="stable")[:LIKE_IT]
+        found = [self.acts[among[nearest[k]]] for k in order if near[k] >= near[order[0]] - AS_NEAR]
+        return list(dict.fromkeys(found)) if all(found) else []
 
     def unknown(
         self, captions: Sequence[str], heard: HeardWords, read: Encode | None = None, count: int = 3
@@ -107,26 +147,40 @@ class KnownCaptions:
         for said, caption, row in zip(captions, meant, cosines, strict=True):
             order = np.argsort(-row, kind="stable")
             nearest = [self.captions[k] for k in order]
-            strange = bool(self.words and heard.unheard(caption))
-            if strange or not _near(caption, nearest, row[order], read):
+            asked = {act for acts in self.asked(caption, heard.encode, read) for act in acts}
+            alike = [not asked or not asked.isdisjoint(self.acts[k]) for k in order]
+            strange = heard.unheard(caption)
+            enough = SURE if strange else NEAR
+            near = _is_near(caption, nearest, row[order], np.array(alike), read, enough)
+            if not near or any(map(decides, strange)):
                 found.setdefault(said, Unknown(said, tuple(nearest[:count])))
             elif caption != said:
                 found.setdefault(said, Unknown(said, (), caption))
         return list(found.values())
 
 
-def _near(caption: str, nearest: Sequence[str], cosines: NDArray[np.float32], read: Encode | None) -> bool:
-    """Whether captions of the training are near one, and together have its words that decide."""
+def _is_near(
+    caption: str,
+    nearest: Sequence[str],
+    cosines: NDArray[np.float32],
+    alike: NDArray[np.bool_],
+    read: Encode | None,
+    enough: float,
+) -> bool:
+    """Whether a caption of the training is near one by `enough`, and those `alike` together have its words
+    that decide. Without a reading, from `FAR` on one is near by `NEAR`.
+    """
     missing, found = set(deciding(caption)), False
     for first in range(0, min(NEAREST, len(nearest)), AT_ONCE):
-        texts, near = nearest[first : first + AT_ONCE], cosines[first : first + AT_ONCE]
+        block = slice(first, first + AT_ONCE)
+        texts, near = nearest[block], cosines[block]
         if read is None:
-            enough = beside = near >= FAR
+            near = np.where(near >= FAR, NEAR, 0.0)
         else:
             readings = read([caption, *texts])
-            both = near + readings[1:] @ readings[0]
-            enough, beside = both >= NEAR, both >= BESIDE
-        found = found or bool(enough.any())
+            near = near + readings[1:] @ readings[0]
+        found = found or bool((near >= enough).any())
+        beside = (near >= BESIDE) & alike[block]
         missing.difference_update(*(deciding(text) for text, yes in zip(texts, beside, strict=True) if yes))
         if found and not missing:
             return True
@@ -134,9 +188,13 @@ def _near(caption: str, nearest: Sequence[str], cosines: NDArray[np.float32], re
 
 
 def representatives(
-    captions: Sequence[str], embeddings: NDArray[np.float32], count: int = COUNT
+    captions: Sequence[str],
+    embeddings: NDArray[np.float32],
+    count: int = COUNT,
+    acts: Mapping[str, Acts] | None = None,
 ) -> KnownCaptions:
-    """At most `count` of `captions`, embeddings [n, E], chosen so that none is far from a chosen one.
+    """At most `count` of `captions`, embeddings [n, E], chosen so that none is far from a chosen one; `acts`
+    is what the motions of all captions do, where it is known.
 
     The first is the one nearest to the mean, each next one the farthest from all before (Gonzalez 1985: at
     most twice as far as the best choice of as many).
@@ -152,7 +210,9 @@ def representatives(
         chosen.append(int(nearest.argmin()))
         nearest = np.maximum(nearest, vectors @ vectors[chosen[-1]])
         nearest[chosen[-1]] = np.inf
-    return KnownCaptions(tuple(texts[k] for k in chosen), vectors[chosen], words_of(texts))
+    known = tuple(texts[k] for k in chosen)
+    done = tuple(acts.get(text, ()) for text in known) if acts else ()
+    return KnownCaptions(known, vectors[chosen], words_of(texts), done if any(done) else ())
 
 
 def save_known(folder: Path, body: KnownCaptions, face: KnownCaptions) -> None:
@@ -160,7 +220,8 @@ def save_known(folder: Path, body: KnownCaptions, face: KnownCaptions) -> None:
     kinds = {"body": body, "face": face}
     with atomic_path(folder / KNOWN_FILES[1]) as path:
         save_file({name: known.embeddings.astype(np.float16) for name, known in kinds.items()}, path)
-    texts = _Texts(body=body.captions, face=face.captions, words=tuple(sorted(body.words)))
+    words = tuple(sorted(body.words))
+    texts = _Texts(body=body.captions, face=face.captions, words=words, acts=body.acts)
     write_json(folder / KNOWN_FILES[0], texts.dump())
 
 
@@ -184,6 +245,8 @@ def load_known(folder: Path) -> dict[str, KnownCaptions]:
             raise UserError(
                 f"{embeddings}: '{name}' does not go with {texts.name}; delete both, or copy them again"
             )
-        words = frozenset(said.words if name == "body" else ())
-        out[name] = KnownCaptions(captions, vectors.astype(np.float32), words)
+        words, acts = (frozenset(said.words), said.acts) if name == "body" else (frozenset(), ())
+        if acts and len(acts) != len(captions):
+            raise UserError(f"{texts}: acts does not go with body; delete it, or copy the file again")
+        out[name] = KnownCaptions(captions, vectors.astype(np.float32), words, acts)
     return out

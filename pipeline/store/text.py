@@ -16,10 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.places import hub_is_away
+from motionloom.datasets.check.claims import Understood
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.datasets.text.words import MOODS, Encode, HeardWords, words_of
+from motionloom.datasets.text.words import MOODS, Encode, HeardWords, counted, words_of
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
 from motionloom.pipeline.store.known_captions import KNOWN_FILES, KnownCaptions, Unknown, load_known
 
@@ -119,6 +120,14 @@ class TextSource:
         known = self.known.get("face" if face else "body")
         return known.unknown(captions, self._heard, read) if known and captions else []
 
+    def understood(self, caption: str, read: Encode | None = None) -> Understood:
+        """A caption of a body as it is read, and what it may ask for."""
+        known = self.known.get("body")
+        if known is None or not known.acts:
+            return caption, ()
+        meant = self.spelt(caption)
+        return meant, known.asked(meant, self._heard.encode, read)
+
     def spelt(self, caption: str) -> str:
         """A caption as it is read: misspelt words of the training set right."""
         return self._heard.spelt(caption)
@@ -138,6 +147,7 @@ class TextSource:
             else frozenset(),
             lambda texts: self._sentences.encode(texts).sentence,
             pieces,
+            counted(known.captions if known else ()),
         )
 
     @cached_property

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -37,6 +38,8 @@ T = TypeVar("T")
 
 _CANDIDATES_AT_ONCE = 64
 """Motions sampled together where several are drawn for each text."""
+_READINGS = 4096
+"""Captions whose readings are kept at most."""
 
 
 @dataclass(frozen=True)
@@ -70,19 +73,27 @@ class GptGenerator(OfTokens):
         tma: LoadedTma | None = self.given.get("tma") if self.gpt.prior == "tma" else None
         return tma if tma is not None and tma.part == self.part else None
 
-    @property
+    @cached_property
     def read(self) -> Encode | None:
-        """How it reads captions, where they reach it by way of TMA: unit-length latents [n, Z]."""
+        """How it reads captions, where they reach it by way of TMA: unit-length latents [n, Z]. What was read
+        is kept: notes compare every caption with the same known ones.
+        """
         tma = self.reranker
         text: TextSource | None = self.given.get("text")
         if tma is None or text is None:
             return None
 
+        kept = dict[str, NDArray[np.float32]]()
+
         def read(captions: Sequence[str]) -> NDArray[np.float32]:
-            latents: NDArray[np.float32] = F.normalize(
-                tma.embed_captions(list(captions), text), dim=-1
-            ).numpy()
-            return latents
+            new = [caption for caption in dict.fromkeys(captions) if caption not in kept]
+            if new:
+                latents = F.normalize(tma.embed_captions(new, text), dim=-1).numpy()
+                kept.update(zip(new, latents, strict=True))
+            out = np.stack([kept[caption] for caption in captions])
+            if len(kept) > _READINGS:
+                kept.clear()
+            return out
 
         return read
 

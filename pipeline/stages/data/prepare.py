@@ -8,6 +8,7 @@ import torch
 from pydantic import Field, model_validator
 
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.check.claims import Acts, acts_of
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import in_order
@@ -119,13 +120,17 @@ class TextStage(StageKind[TextConfig]):
     def run(self, context: StageContext) -> None:
         keep_place(context.config.encoder, context.folder)
         data, captions, trained = context.given["data"], set[str](), {False: set[str](), True: set[str]()}
+        done = dict[str, Acts]()
         for split in data.splits:
             dataset = data.split(split)
-            for index in in_order(dataset, "texts.json", "face_texts.json"):
+            for index in in_order(dataset, "meta.json", "texts.json", "face_texts.json"):
                 for face in (False, True):
                     said = {caption.text for caption in captions_of(dataset, index, face=face)}
                     captions |= said
                     trained[face] |= said if split == "train" else set()
+                    if split == "train" and not face:
+                        acts = acts_of(dataset.meta(index).truth)
+                        done |= {text: acts if done.get(text, acts) == acts else () for text in said}
         cache = build_text_cache(
             context.folder / "cache",
             captions,
@@ -142,7 +147,7 @@ class TextStage(StageKind[TextConfig]):
             body, face_captions = (sorted(trained[face]) for face in (False, True))
             save_known(
                 context.folder,
-                representatives(body, cache.similarity(body)),
+                representatives(body, cache.similarity(body), acts=done),
                 representatives(face_captions, cache.similarity(face_captions)),
             )
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from motionloom.datasets.check.claims import caption_faults, claim_of, doubt, verdicts
+from motionloom.datasets.check.claims import acts_of, caption_faults, claim_of, doubt, verdicts
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.decisions import decide, undo
 from motionloom.datasets.check.faults import motion_faults
@@ -65,6 +65,45 @@ def test_what_joints_do_not_show_of_a_caption_is_named() -> None:
     twice = np.concatenate([done["squat"], canonicalize(done["squat"])])
     count = described(twice, 20.0, "squat")["count"]
     assert doubt("one squats once", twice, 20.0) == f"the count is {count}, not 1"
+
+
+@pytest.mark.parametrize(
+    ("said", "asked", "seen"),
+    [
+        ("a person waves", [("wave",)], "the motion shows no wave"),  # a walk
+        ("off you go", [("run",), ("walk",)], None),
+        ("wave, then walk", [("wave", "walk"), ("wave", "run")], "no wave and then walk nor wave and"),
+        ("go quickly", [("walk",)], "the speed is another, not quickly"),
+        ("walk on", [("walk",)], None),
+        ("go back to the wall slowly", [("walk",)], None),
+    ],
+)
+def test_what_is_asked_for_is_to_be_seen(said: str, asked: list[tuple[str, ...]], seen: str | None) -> None:
+    """Where it is known what the captions that are like a new one ask for."""
+    config = SynthConfig(clips=200, seed=3, actions="all")
+    walks = (make_clip(k, config) for k in range(config.clips))
+    slow = "slowly" if "slowly" in said else None
+    walk = next(c for c in walks if c.truth["action"] == "walk" and c.truth.get("speed") == slow)
+    found = doubt(said, walk.joints, config.motion_layout.fps, asked)
+    assert found is None if seen is None else found is not None and seen in found
+
+
+def test_hands_that_are_said_are_both() -> None:
+    config = SynthConfig(clips=2000, seed=3, actions="all")
+    for side in ("left", "both"):
+        clips = (make_clip(k, config) for k in range(config.clips))
+        up = next(c for c in clips if c.truth["action"] == "raise" and c.truth["side"] == side).joints
+        found = doubt("hands up", up, config.motion_layout.fps, [("raise",)])
+        assert found == (None if side == "both" else f"the side is {side}, not both")
+
+
+def test_acts_of_a_truth() -> None:
+    config = SynthConfig(clips=80, seed=3, actions="all")
+    truths = [make_clip(k, config).truth for k in range(config.clips)]
+    turns = next(truth for truth in truths if truth["action"] == "then")
+    assert acts_of(turns) == tuple(part["action"] for part in turns["parts"]) and len(acts_of(turns)) == 2
+    assert acts_of({"action": "wave", "side": "left"}) == ("wave",)
+    assert acts_of(None) == acts_of({"song": 3}) == ()
 
 
 def lifted(by: float) -> Callable[[Joints], Joints]:

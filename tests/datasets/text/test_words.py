@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.text.clean import clean_caption, emotion_of, usable_caption
 from motionloom.datasets.text.encoder import load_text_encoder
-from motionloom.datasets.text.words import HeardWords, one_slip, words_of
+from motionloom.datasets.text.words import HeardWords, counted, in_turn, one_slip, words_of
 
 TRAINED = ("A boy bends the knee twice.", "someone kicks with the left leg, and waves")
 
@@ -62,6 +63,27 @@ def test_a_misspelt_word_is_read_as_the_one_that_is_meant(said: str, read: str) 
 def test_nothing_is_missed_where_words_were_not_kept() -> None:
     words = HeardWords(frozenset(), lambda _: pytest.fail("compared"), lambda _: pytest.fail("cut"))
     assert words.unheard("a violin") == [] and words.spelt("a vilin") == "a vilin"
+
+
+def test_of_two_slips_the_word_that_training_had_more_often_is_meant() -> None:
+    words = heard(("race ahead", "raise the arm", "raise a hand"))
+    often = counted(("race ahead", "raise the arm", "raise a hand"))
+    assert words.spelt("rase the arm") == "race the arm"
+    assert replace(words, often=often).spelt("rase the arm") == "raise the arm"
+
+
+@pytest.mark.parametrize(
+    ("said", "parts"),
+    [
+        ("wave and then kick", ["wave", "kick"]),
+        ("She bows. Then, she turns", ["She bows", "she turns"]),
+        ("he sits down after that", ["he sits down"]),
+        ("walk, afterwards hop", ["walk", "hop"]),
+        ("a person waves", ["a person waves"]),
+    ],
+)
+def test_parts_of_a_caption_in_turn(said: str, parts: list[str]) -> None:
+    assert in_turn(said) == parts
 
 
 def test_one_slip() -> None:

@@ -13,7 +13,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import Drawing
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.sampling import generate
-from motionloom.models.gpt.streaming import TokenStream
+from motionloom.models.gpt.streaming import OPENING, TokenStream
 from motionloom.models.tokenizer.base import Stream
 
 PATTERN = ("body", "body", "hand")
@@ -63,6 +63,8 @@ def slow(
     numbers = np.random.Generator(np.random.Philox(key=seed)).random(len(texts) * len(PATTERN))
     out: list[list[int]] = []
     begin, start, before = 0, 0, None
+    opening: list[list[int]] = []
+    place = 0
 
     def token(group: list[int], now: Tensor, number: int, end: int) -> int:
         """Of the codes and, where `end` is 1, of End."""
@@ -81,12 +83,18 @@ def slow(
     for number, now in enumerate(texts):
         if number - begin == gpt.max_groups or (before is not None and now is not before):
             begin, start = max(begin, number - context), number
+            opening, place = ([], OPENING) if now is not before else (opening, place)
+            place = 0 if begin == number else place
         if number > start and token([], now, number, 1) == gpt.num_codes["body"]:
             begin = start = number  # the clip is over: the text alone
-        before, group = now, list[int]()
+            place = 0
+        before, group = now, list(opening[place]) if place < len(opening) else list[int]()
         while len(group) < len(PATTERN):
             group.append(token(group, now, number, 0))
         out.append(group)
+        if place == len(opening) < OPENING:
+            opening.append(group)
+        place += 1
     return out
 
 
@@ -125,6 +133,24 @@ def test_a_clip_that_is_over_begins_anew() -> None:
     for _ in range(5):
         drawn(stream, 1)
         assert stream._block.shape[1] == len(PATTERN)
+
+
+@pytest.mark.parametrize("before", [0, 3])
+def test_clips_of_a_text_begin_alike(before: int) -> None:
+    """So that what it leaves open stays: from its second clip on where another text came before."""
+    stream, clips = TokenStream(ending(0.5), how=HOW, context=2, seed=5), list[list[list[int]]]()
+    if before:
+        stream.condition(text(1))
+        drawn(stream, before)
+    stream.condition(text(0))
+    while len(clips) < 40:
+        [group] = drawn(stream, 1)
+        if not clips or stream._block.shape[1] == len(PATTERN):
+            clips.append([])
+        clips[-1].append(group)
+    alike = [tuple(map(tuple, clip[:OPENING])) for clip in clips[bool(before) : -1] if len(clip) >= OPENING]
+    assert len(alike) > 2 and len(set(alike)) == 1
+    assert len({tuple(map(tuple, clip)) for clip in clips}) > 1, "they go on as they are drawn"
 
 
 def test_memory_is_one_block(gpt: InterleavedGPT) -> None:
