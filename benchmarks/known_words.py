@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.synth.measure import agrees, measure
-from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.notes import doubts, unknown_captions
+from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
+from motionloom.pipeline.inference.notes import doubts
 from motionloom.pipeline.inference.shipped_models import model_folder
 
 SENTENCES = Path(__file__).with_suffix(".yaml")

@@ -44,8 +44,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.evaluation.answers import most_alike, nearest_texts
 from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
 from motionloom.pipeline.evaluation.truth import Truth
-from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.notes import unknown_captions
+from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from motionloom.pipeline.contract.stage import StageKind, register
     from motionloom.pipeline.inference.captioning import captions
     from motionloom.pipeline.inference.model import MotionModel
-    from motionloom.pipeline.inference.motion import GeneratedMotion
+    from motionloom.pipeline.inference.motion import GeneratedMotion, MotionChunk, joined
     from motionloom.pipeline.inference.outputs import write_motions
-    from motionloom.pipeline.inference.stream import MotionChunk, MotionStream, joined
+    from motionloom.pipeline.inference.stream import MotionStream
     from motionloom.pipeline.results.compare.command import compare_runs
     from motionloom.pipeline.results.paper.compare import compare_with_paper
     from motionloom.pipeline.runs.api import evaluate_run, export_run, report_run, run_recipe
@@ -54,7 +54,7 @@ __all__ = [
 
 _HOMES = {
     "GeneratedMotion": "pipeline.inference.motion",
-    "MotionChunk": "pipeline.inference.stream",
+    "MotionChunk": "pipeline.inference.motion",
     "MotionModel": "pipeline.inference.model",
     "MotionStream": "pipeline.inference.stream",
     "Prompt": "pipeline.contract.generation",
@@ -70,7 +70,7 @@ _HOMES = {
     "compare_with_paper": "pipeline.results.paper.compare",
     "evaluate_run": "pipeline.runs.api",
     "export_run": "pipeline.runs.api",
-    "joined": "pipeline.inference.stream",
+    "joined": "pipeline.inference.motion",
     "load_recipe": "pipeline.runs.recipe",
     "register": "pipeline.contract.stage",
     "report_run": "pipeline.runs.api",

@@ -24,11 +24,8 @@ from motionloom.datasets.synth.actions.truth import SIDES, Record
 from motionloom.datasets.synth.hands import hand_shape
 from motionloom.datasets.synth.measure import TURN, agrees, described, measure
 from motionloom.datasets.synth.signals import Signals, signals_of
+from motionloom.datasets.text.words import Acts, Understood, by_words
 
-Acts = tuple[str, ...]
-"""An action of the synthetic clips (`truth.ACTIONS`), or two in turn."""
-Understood = tuple[str, Sequence[Acts]]
-"""A caption as it is read, its words spelt right, and what it may ask for; empty where that is not known."""
 _ACTIONS = {
     "turn": r"turn(s|ing)?",
     "walk": r"walk(s|ing)?",
@@ -163,11 +160,6 @@ class Captioned(Protocol):
     def segments(self) -> Sequence[object]:
         """Of a script, which says several things."""
         ...
-
-
-def by_words(caption: str) -> Understood:
-    """How captions are understood where it is not known what those of the training ask for."""
-    return caption, ()
 
 
 def doubts_of(motions: Iterable[Captioned], understand: Callable[[str], Understood] = by_words) -> list[str]:

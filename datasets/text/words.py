@@ -49,6 +49,10 @@ _ENDINGS = ("s", "es", "d", "ed", "ing")
 _WORD = r"[\w']+"
 _SMALL, _EXACT = frozenset(_NOTHING_ALONE.split()), frozenset(_DECIDE.split())
 
+Acts = tuple[str, ...]
+"""What a motion does: an action of the synthetic clips (`truth.ACTIONS`), or two in turn."""
+Understood = tuple[str, Sequence[Acts]]
+"""A caption as it is read, its words spelt right, and what it may ask for; empty where that is not known."""
 Encode = Callable[[Sequence[str]], NDArray[np.float32]]
 """Captions or words to unit-length embeddings [n, E]."""
 Pieces = Callable[[Sequence[str]], NDArray[np.int64]]
@@ -127,6 +131,11 @@ def deciding(caption: str) -> frozenset[str]:
     """The words of a caption that decide by themselves, one spelling for each number."""
     words = (_SAME.get(word, word) for word in _split(caption))
     return frozenset(word for word in words if decides(word))
+
+
+def by_words(caption: str) -> Understood:
+    """How captions are understood where it is not known what those of the training ask for."""
+    return caption, ()
 
 
 def in_turn(caption: str) -> list[str]:

@@ -24,8 +24,8 @@ from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.layers.transformer import KVCache
 
 OPENING = 2
-"""Groups that a text's clips have in common: of ten minutes of `synthetic`'s walk each is then 0.97 to 1.04
-times as fast as the first ten seconds, without them 0.88 to 1.15."""
+"""Groups that a text's clips have in common: of ten minutes of `synthetic`'s walk each is then 0.93 to 1.04
+times as fast as the first ten seconds (three seeds), without them 0.88 to 1.15."""
 
 
 class TokenStream:

@@ -55,7 +55,9 @@ from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, 
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model, say_model
 from motionloom.pipeline.render.score import Segment
 from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, owner_of
+from motionloom.pipeline.store.text import TextSource
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -379,3 +381,20 @@ class Bundle:
             replace(one, beats=() if one.prompt.stands else tuple(t for t in own if t < one.seconds))
             for one, own in zip(made, ticks, strict=True)
         ]
+
+
+def unknown_captions(
+    bundle: Bundle, captions: Sequence[str], face: Sequence[str] = (), face_model: str | None = None
+) -> list[Unknown]:
+    """Captions that are far from all that the model was trained on, and what it knows nearest to each.
+
+    Empty for models without text, and for those whose run or export does not say what it knows.
+    """
+    out: list[Unknown] = []
+    for stage, given in ((bundle.main, captions), (bundle.choose_face(face_model), face)):
+        part = None if stage is None else bundle.of(stage)
+        source = None if part is None else part.prepared.get("text")
+        if isinstance(source, TextSource):
+            said, read = [caption for caption in given if caption.strip()], getattr(part, "read", None)
+            out += source.unknown(said, face=given is face, read=read)
+    return out

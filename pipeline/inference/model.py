@@ -29,14 +29,14 @@ from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
-from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.edits.clips import read_clip, read_seed_motion, require_clip
 from motionloom.pipeline.inference.edits.edit import edited, require_editor
 from motionloom.pipeline.inference.edits.frames import EditFrames
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
-from motionloom.pipeline.inference.notes import doubts, unknown_captions
+from motionloom.pipeline.inference.notes import doubts
 from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model

@@ -1,31 +1,19 @@
-"""What there is to note of a motion: words that its model does not know, joints that show other things."""
+"""What there is to note of a motion whose joints show something else than its caption asks for."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from typing import TYPE_CHECKING
 
-from motionloom.datasets.check.claims import Captioned, Understood, by_words, doubts_of
-from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.store.known_captions import Unknown
+from motionloom.datasets.check.claims import doubts_of
+from motionloom.datasets.text.words import Understood, by_words
+from motionloom.pipeline.inference.motion import GeneratedMotion, MotionChunk, joined
 from motionloom.pipeline.store.text import TextSource
 
-
-def unknown_captions(
-    bundle: Bundle, captions: Sequence[str], face: Sequence[str] = (), face_model: str | None = None
-) -> list[Unknown]:
-    """Captions that are far from all that the model was trained on, and what it knows nearest to each.
-
-    Empty for models without text, and for those whose run or export does not say what it knows.
-    """
-    out: list[Unknown] = []
-    for stage, given in ((bundle.main, captions), (bundle.choose_face(face_model), face)):
-        part = None if stage is None else bundle.of(stage)
-        source = None if part is None else part.prepared.get("text")
-        if isinstance(source, TextSource):
-            said, read = [caption for caption in given if caption.strip()], getattr(part, "read", None)
-            out += source.unknown(said, face=given is face, read=read)
-    return out
+if TYPE_CHECKING:
+    from motionloom.pipeline.inference.bundle import Bundle
+    from motionloom.pipeline.store.known_captions import Unknown
 
 
 def understood(bundle: Bundle, caption: str) -> Understood:
@@ -36,6 +24,39 @@ def understood(bundle: Bundle, caption: str) -> Understood:
     return source.understood(caption, getattr(bundle.generator, "read", None))
 
 
-def doubts(bundle: Bundle, motions: Iterable[Captioned]) -> list[str]:
+def doubts(bundle: Bundle, motions: Iterable[GeneratedMotion]) -> list[str]:
     """Captions of which the joints of their motions show something else, one sentence for each."""
     return doubts_of(motions, partial(understood, bundle))
+
+
+LOOKED_AT = 6.0
+"""Seconds of a caption after which what the joints show of it is looked at: a few of its rounds."""
+
+
+def doubted(
+    chunks: Iterable[MotionChunk],
+    notice: Callable[[Unknown | str], object],
+    understand: Callable[[str], Understood] = by_words,
+) -> Iterator[MotionChunk]:
+    """The chunks; `notice` is given what the joints do not show of a caption, when it ends or after its first
+    seconds. What comes after those is not looked at.
+    """
+    shown: list[MotionChunk] = []
+
+    def look() -> None:
+        for doubt in doubts_of([joined(shown)] if shown else [], understand):
+            notice(doubt)
+        shown.clear()
+
+    last, looked = None, False
+    for chunk in chunks:
+        if chunk.prompt is not last:
+            look()
+            last, looked = chunk.prompt, False
+        if not looked:
+            shown.append(chunk)
+            if sum(len(one.joints) for one in shown) >= LOOKED_AT * chunk.fps:
+                look()
+                looked = True
+        yield chunk
+    look()

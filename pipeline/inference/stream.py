@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,16 +22,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.features.joints import JointFlow
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.generation import Prompt, StreamingGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
-from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.generators.standing import Standing
-from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.notes import unknown_captions
+from motionloom.pipeline.inference.motion import MotionChunk
 from motionloom.pipeline.inference.requests import (
     require_driven,
     require_seed,
@@ -42,7 +39,6 @@ from motionloom.pipeline.inference.requests import (
 )
 from motionloom.pipeline.inference.script import DrivenSegment, Script, segment_frames
 from motionloom.pipeline.launch.hardware import threads_for
-from motionloom.pipeline.render.score import Driver, Segment
 from motionloom.pipeline.store.known_captions import Unknown
 
 if TYPE_CHECKING:
@@ -50,59 +46,8 @@ if TYPE_CHECKING:
 
 
 GUIDANCE = 3.0
-"""At which each of ten minutes of `synthetic`'s walk is 0.88 to 1.15 times as fast as its first ten seconds
-(two seeds); at 2 it loses a third of its speed, and `dance` at the 1.5 of single clips comes to a stand."""
-
-
-@dataclass(frozen=True)
-class MotionChunk:
-    """Some frames of a stream, final, all driven by one caption."""
-
-    start: int
-    """Number of its first frame, counted from the stream's."""
-    prompt: Prompt
-    features: NDArray[np.float32]
-    """Body-hand features [T, D]."""
-    joints: NDArray[np.float64]
-    """Positions [T, N, 3] in metres; they go on where the chunk before ends."""
-    face: NDArray[np.float32] | None
-    """Expression [T, 50], or None where the model makes no face."""
-    layout: MotionLayout
-
-    @property
-    def caption(self) -> str:
-        return self.prompt.text
-
-    @property
-    def fps(self) -> float:
-        return self.layout.fps
-
-
-def joined(chunks: Sequence[MotionChunk], seed: int | None = None) -> GeneratedMotion:
-    """Chunks that follow each other as one motion."""
-    if not chunks:
-        raise UserError("no chunks to join; take at least one from the stream")
-    spans: list[Segment] = []
-    begin = chunks[0].start
-    for chunk in chunks:
-        at = (chunk.start - begin) / chunk.fps
-        end = at + len(chunk.joints) / chunk.fps
-        kind: Driver = "text" if chunk.prompt.sound is None else "music"
-        if spans and spans[-1].label == chunk.caption:
-            spans[-1] = Segment(spans[-1].start, end, chunk.caption, kind)
-        else:
-            spans.append(Segment(at, end, chunk.caption, kind))
-    several = len(spans) > 1
-    faces = [chunk.face for chunk in chunks if chunk.face is not None]
-    return GeneratedMotion(
-        Prompt("; ".join(span.label for span in spans)) if several else chunks[0].prompt,
-        np.concatenate([chunk.features for chunk in chunks]),
-        np.concatenate([chunk.joints for chunk in chunks]),
-        np.concatenate(faces) if len(faces) == len(chunks) else None,
-        chunks[0].layout,
-        tuple(spans) if several else (),
-        seed=seed,
-    )
+"""At 2 `synthetic`'s walk loses a third of its speed in ten minutes, and `dance` at the 1.5 of single clips
+comes to a stand."""
 
 
 class MotionStream(Iterator[MotionChunk]):

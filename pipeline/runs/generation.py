@@ -109,7 +109,8 @@ def generate_motions(
     """
     from motionloom.datasets.audio.excerpt import Excerpt
     from motionloom.pipeline.contract.generation import SeededGenerator
-    from motionloom.pipeline.inference.notes import doubts, unknown_captions
+    from motionloom.pipeline.inference.bundle import unknown_captions
+    from motionloom.pipeline.inference.notes import doubts
     from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
@@ -205,17 +206,17 @@ def stream_motion(
     console: Console,
     given: TextIO | None = None,
 ) -> None:
-    """Write JSON lines (`inference/stream_lines.py`) as frames come; ends with the last segment or Ctrl-C.
+    """Write JSON lines (`inference/writers.py`) as frames come; ends with the last segment or Ctrl-C.
 
     Several captions follow each other, each `seconds` long. The caption "-" is the lines of `given`, by
     default standard input: with `seconds` each lasts so long, without each takes over from the one before,
     and frames come no faster than they are watched.
     `out` is a file, None is standard output. What is said to people goes to `console`.
     """
-    from motionloom.pipeline.inference.notes import understood
+    from motionloom.pipeline.inference.notes import doubted, understood
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.stream import MotionStream, stream_of
-    from motionloom.pipeline.inference.stream_lines import doubted, frame_lines, heading
+    from motionloom.pipeline.inference.writers import frame_lines, heading
 
     _require_driver(captions, face, audio, script, seconds)
     if len(captions) > 1 and (seconds is None or STDIN in captions or audio or face):

@@ -23,12 +23,11 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.notes import doubts, understood
+from motionloom.pipeline.inference.notes import doubted, doubts, understood
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
 from motionloom.pipeline.inference.requests import remarks_of
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
-from motionloom.pipeline.inference.stream_lines import doubted, frame_lines, heading, rounded
-from motionloom.pipeline.inference.writers import WRITERS, cell_of
+from motionloom.pipeline.inference.writers import WRITERS, cell_of, frame_lines, heading, rounded
 from motionloom.pipeline.render.viewer import viewer_data
 
 

@@ -27,9 +27,8 @@ from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.check.claims import Acts
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.text.words import Encode, HeardWords, decides, deciding, in_turn, words_of
+from motionloom.datasets.text.words import Acts, Encode, HeardWords, decides, deciding, in_turn, words_of
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 

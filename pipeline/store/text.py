@@ -16,11 +16,10 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.places import hub_is_away
-from motionloom.datasets.check.claims import Understood
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.datasets.text.words import MOODS, Encode, HeardWords, counted, words_of
+from motionloom.datasets.text.words import MOODS, Encode, HeardWords, Understood, counted, words_of
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
 from motionloom.pipeline.store.known_captions import KNOWN_FILES, KnownCaptions, Unknown, load_known
 

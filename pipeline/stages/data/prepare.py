@@ -8,11 +8,12 @@ import torch
 from pydantic import Field, model_validator
 
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.check.claims import Acts, acts_of
+from motionloom.datasets.check.claims import acts_of
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
+from motionloom.datasets.text.words import Acts
 from motionloom.pipeline.contract.stage import (
     CPU,
     RUNTIME,

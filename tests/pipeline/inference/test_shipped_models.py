@@ -19,8 +19,8 @@ from motionloom.pipeline.cli.info import info
 from motionloom.pipeline.inference import shipped_models as module
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.motion import joined
 from motionloom.pipeline.inference.shipped_models import model_folder, say_model, shipped_models
-from motionloom.pipeline.inference.stream import joined
 from motionloom.pipeline.store.artifact import Artifact
 
 CAPTION = "a person waves with the left hand"

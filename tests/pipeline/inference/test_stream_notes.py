@@ -10,8 +10,8 @@ import numpy as np
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.inference.stream import MotionChunk
-from motionloom.pipeline.inference.stream_lines import LOOKED_AT, doubted
+from motionloom.pipeline.inference.motion import MotionChunk
+from motionloom.pipeline.inference.notes import LOOKED_AT, doubted
 
 LAYOUT = MotionLayout.named("wholebody363", fps=20.0)
 REST = Skeleton.named("smplx52").rest_joints

@@ -17,8 +17,8 @@ from rich.console import Console
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.motion import MotionChunk, joined
 from motionloom.pipeline.inference.script import Script, ScriptSegment
-from motionloom.pipeline.inference.stream import MotionChunk, joined
 from motionloom.pipeline.runs.generation import stream_motion
 
 pytestmark = pytest.mark.slow
