@@ -28,6 +28,7 @@ from safetensors.numpy import load_file, save_file
 from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.synth.actions.truth import ACTIONS
 from motionloom.datasets.text.words import Acts, Encode, HeardWords, decides, deciding, in_turn, words_of
 
 KNOWN_FILES = ("known.json", "known.safetensors")
@@ -113,6 +114,8 @@ class KnownCaptions:
         if len(parts) != 2:
             return self._asked(caption, range(len(self.acts)), encode, read)
         alone = [k for k, acts in enumerate(self.acts) if len(acts) == 1]
+        if not alone:
+            return []
         first, second = (self._asked(part, alone, encode, read) for part in parts)
         return [one + other for one in first for other in second]
 
@@ -186,6 +189,11 @@ def _is_near(
     return False
 
 
+def _known(acts: Acts) -> bool:
+    """Whether acts are nothing, an action, or two in turn."""
+    return len(acts) <= 2 and not set(acts) - set(ACTIONS)
+
+
 def representatives(
     captions: Sequence[str],
     embeddings: NDArray[np.float32],
@@ -245,7 +253,7 @@ def load_known(folder: Path) -> dict[str, KnownCaptions]:
                 f"{embeddings}: '{name}' does not go with {texts.name}; delete both, or copy them again"
             )
         words, acts = (frozenset(said.words), said.acts) if name == "body" else (frozenset(), ())
-        if acts and len(acts) != len(captions):
+        if acts and (len(acts) != len(captions) or not all(map(_known, acts))):
             raise UserError(f"{texts}: acts does not go with body; delete it, or copy the file again")
         out[name] = KnownCaptions(captions, vectors.astype(np.float32), words, acts)
     return out

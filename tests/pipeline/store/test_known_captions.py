@@ -143,6 +143,8 @@ def test_the_nearest_say_what_a_caption_asks_for(said: str, acts: list[tuple[str
     embedded = words(load_text_encoder("minilm")).encode
     assert KnownCaptions(TRAINED, embedded(TRAINED), acts=ACTS).asked(said, embedded) == acts
     assert KnownCaptions(TRAINED, embedded(TRAINED)).asked(said, embedded) == []
+    turns = KnownCaptions(TRAINED, embedded(TRAINED), acts=(("wave", "kick"),) * len(TRAINED))
+    assert turns.asked("wave, then kick", embedded) == [], "which knows no action alone"
     partly = KnownCaptions(TRAINED, embedded(TRAINED), acts=((),) * len(TRAINED))
     assert partly.asked(said, embedded) == [], "of captions of which it is not known"
 
@@ -215,8 +217,11 @@ def test_files_come_back(tmp_path: Path) -> None:
     assert load_known(tmp_path / "none") == {}
 
 
-def test_acts_of_other_captions_are_refused(tmp_path: Path) -> None:
-    body = KnownCaptions(("a", "b"), unit(2, 8, 4), acts=(("wave",),))
+@pytest.mark.parametrize(
+    "acts", [(("wave",),), (("wave",), ("fly\x1b[31m",)), (("wave",), ("wave", "walk", "kick"))]
+)
+def test_acts_that_cannot_be_are_refused(tmp_path: Path, acts: tuple[tuple[str, ...], ...]) -> None:
+    body = KnownCaptions(("a", "b"), unit(2, 8, 4), acts=acts)
     save_known(tmp_path, body, KnownCaptions((), np.zeros((0, 8), np.float32)))
     with pytest.raises(UserError, match=r"known\.json: acts does not go with body"):
         load_known(tmp_path)
