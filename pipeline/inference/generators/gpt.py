@@ -86,14 +86,14 @@ class GptGenerator(OfTokens):
         kept = dict[str, NDArray[np.float32]]()
 
         def read(captions: Sequence[str]) -> NDArray[np.float32]:
-            new = [caption for caption in dict.fromkeys(captions) if caption not in kept]
+            found = {caption: kept[caption] for caption in captions if caption in kept}
+            new = [caption for caption in dict.fromkeys(captions) if caption not in found]
             if new:
                 latents = F.normalize(tma.embed_captions(new, text), dim=-1).numpy()
-                kept.update(zip(new, latents, strict=True))
-            out = np.stack([kept[caption] for caption in captions])
-            if len(kept) > _READINGS:
-                kept.clear()
-            return out
+                found.update(zip(new, latents, strict=True))
+                if len(kept) < _READINGS:
+                    kept.update(found)
+            return np.stack([found[caption] for caption in captions])
 
         return read
 
