@@ -5,8 +5,8 @@
 
 One motion is made for every sentence of `known_words.yaml` and measured on its joints: does it do what is
 said? Beside it whether there was a note, because the model does not know the caption or because the joints
-show something else; the latter by rules that judge here too. 300 sentences are for development; another
-hundred is held out: the rules of notes are decided without it.
+show something else; the latter by rules that judge here too. 1,200 sentences are for development; another 200
+are held out: the rules of notes are decided without them.
 """
 
 from __future__ import annotations

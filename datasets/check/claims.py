@@ -24,40 +24,9 @@ from motionloom.datasets.synth.actions.truth import SIDES, Record
 from motionloom.datasets.synth.hands import hand_shape
 from motionloom.datasets.synth.measure import TURN, agrees, described, measure
 from motionloom.datasets.synth.signals import Signals, signals_of
-from motionloom.datasets.text.words import Acts, Understood, by_words
+from motionloom.datasets.text.said import HANDS, Acts, action_of, asked_of, claim_of, without_hands
+from motionloom.datasets.text.words import Understood, by_words
 
-_ACTIONS = {
-    "turn": r"turn(s|ing)?",
-    "walk": r"walk(s|ing)?",
-    "run": r"(run|jog|dash)(s|es|ning|ging|ing)?",
-    "wave": r"wav(e|es|ing)",
-    "raise": r"(rais|lift)(e|es|s|ing)?",
-    "kick": r"kick(s|ing)?",
-    "punch": r"punch(es|ing)?",
-    "hop": r"hop(s|ping)?",
-    "jump": r"(jump|leap)(s|ing)?",
-    "squat": r"squat(s|ting)?",
-    "clap": r"clap(s|ping)?",
-    "sit": r"(sit|sits|sitting)",
-    "bow": r"bow(s|ing)?",
-    "lie": r"(lie|lies|lying)",
-    "crawl": r"crawl(s|ing)?",
-}
-_OTHERS = (
-    r"then|while|after|before|danc\w+|reach\w*|point\w*|step\w*|not"
-    r"|in place|on the spot|back and forth|to and fro|side to side"
-)
-"""Words of captions that are about more than these rules know."""
-_OPPOSITE = {"left": "right", "right": "left", "forward": "backward", "backward": "forward"}
-_HAND = r"(?:the |his |her |their )?(left|right|both) hands?"
-_HANDS = {
-    "fist": rf"fists? (?:with|of) {_HAND}|{_HAND} in(?:to)? (?:a )?fists?",
-    "point": rf"pointing (?:the index finger of|with) {_HAND}",
-    "spread": rf"spread\w* the fingers of {_HAND}|the fingers of {_HAND} spread",
-    "pinch": rf"pinch\w*(?: thumb and index finger)? (?:with|of) {_HAND}",
-    "wave_fingers": rf"(?:wiggling|waving) the fingers of {_HAND}",
-}
-"""What is said of fingers, by the shapes of `truth.HANDS`."""
 _SIGNS: dict[str, Callable[[Signals], bool]] = {
     "walk": lambda s: abs(s.travel[-1]) >= 0.3,
     "run": lambda s: abs(s.travel[-1]) >= 0.3,
@@ -69,25 +38,8 @@ _SIGNS: dict[str, Callable[[Signals], bool]] = {
     "crawl": lambda s: s.drop.max() >= 0.2,
 }
 """The least (metres, radians, arm lengths) that whoever does these shows; other actions are counted."""
+_OPPOSITE = {"left": "right", "right": "left", "forward": "backward", "backward": "forward"}
 _NOUNS = {"lie": "lying down", "sit": "sitting"}
-_SPEEDS = {
-    "slowly": r"slow(ly)?|unhurried(ly)?|leisurely",
-    "quickly": r"quick(ly)?|fast|rapid(ly)?|brisk(ly)?|hurried(ly)?",
-}
-_TIMES = {"once": 1, "one time": 1, "twice": 2, "two times": 2, "three times": 3, "thrice": 3}
-_TIMES |= {"four times": 4, "five times": 5} | {f"{n} times": n for n in range(2, 6)}
-
-
-def _says(text: str, pattern: str) -> bool:
-    return re.search(rf"\b({pattern})\b", text.lower()) is not None
-
-
-def action_of(text: str) -> str | None:
-    """The one action that a caption is about; None where it is about more, or about another."""
-    found = [name for name, pattern in _ACTIONS.items() if _says(text, pattern)]
-    if found == ["turn", "walk"]:
-        found = ["turn"]
-    return None if len(found) != 1 or _says(text, _OTHERS) else found[0]
 
 
 def doubt(text: str, joints: NDArray[np.floating], fps: float, asked: Sequence[Acts] = ()) -> str | None:
@@ -109,16 +61,12 @@ def _doubt_of_acts(text: str, joints: NDArray[np.floating], fps: float, asked: S
         return f"the motion shows no {' nor '.join(acts)}"
     if len(shown[0]) > 1:
         return None
-    does, text = described(joints, fps, shown[0][0]), _without_hands(text)
-    said = _said_of(text, shown[0][0])
-    if shown[0][0] in ("wave", "raise") and "side" not in said and _says(text, "hands|arms"):
-        said["side"] = "both"
-    speeds = [speed for speed, words in _SPEEDS.items() if _says(text, words)]
-    if len(speeds) == 1 and "speed" in does:
-        said["speed"] = speeds[0]
-    for what, wanted in said.items():
-        if does.get(what) != wanted:
-            return f"the {what} is {does.get(what) or 'another'}, not {wanted}"
+    does = described(joints, fps, shown[0][0])
+    for what, wanted in asked_of(text, shown[0][0]).items():
+        if what not in does:
+            return f"it does not show whether it is done {wanted}"
+        if does[what] != wanted:
+            return f"the {what} is {does[what] or 'another'}, not {wanted}"
     return None
 
 
@@ -179,41 +127,6 @@ def doubts_of(motions: Iterable[Captioned], understand: Callable[[str], Understo
     return out
 
 
-def claim_of(text: str) -> Record | None:
-    """What a caption says of one action: `action` and any of `side`, `direction`, `count`; None otherwise."""
-    action = action_of(text)
-    said = {} if action is None else _said_of(text, action)
-    return {"action": action} | said if said else None
-
-
-def _said_of(text: str, action: str) -> Record:
-    """What a caption says of an action."""
-
-    def says(pattern: str) -> bool:
-        return _says(text, pattern)
-
-    out: Record = {}
-    sides = [side for side in ("left", "right", "both") if says(side)]
-    ways = [way for way in ("forward", "backward") if says(f"{way}s?")]
-    if len(sides) == 1 and action in ("wave", "raise", "kick", "punch", "hop"):
-        out["side"] = sides[0]
-    if action == "turn" and len(sides) == 1 and sides != ["both"]:
-        out["direction"] = sides[0]
-    if action in ("walk", "run") and len(ways) == 1 and not sides and not says(r"circles?|back"):
-        out["direction"] = ways[0]
-    counts = {times for words, times in _TIMES.items() if says(words)}
-    if len(counts) == 1 and action in ("kick", "punch", "hop", "jump", "squat", "clap"):
-        out["count"] = counts.pop()
-    return out
-
-
-def _without_hands(text: str) -> str:
-    """A caption in small letters without what it says of fingers, whose side is not that of the action."""
-    for pattern in _HANDS.values():
-        text = re.sub(pattern, " ", text.lower())
-    return text
-
-
 @dataclass(frozen=True)
 class Verdict:
     """What a caption says of one thing, and what the motion shows of it."""
@@ -234,14 +147,14 @@ class Verdict:
 def verdicts(text: str, joints: NDArray[np.floating], fps: float) -> list[Verdict]:
     """What a caption claims of joints [T, N >= 22, 3], T >= 4; of fingers where N is 52."""
     out = []
-    for shape, pattern in _HANDS.items():
+    for shape, pattern in HANDS.items():
         for found in re.finditer(pattern, text.lower()):
             said = next(side for side in found.groups() if side)
             for number, side in enumerate(SIDES if joints.shape[1] >= 52 else ()):
                 if said in (side, "both"):
                     seen = hand_shape(joints, number, fps)
                     out.append(Verdict(f"{side}_hand", shape, seen, seen == shape))
-    claim = claim_of(_without_hands(text))
+    claim = claim_of(without_hands(text))
     if claim is None:
         return out
     action = str(claim["action"])

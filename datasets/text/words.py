@@ -18,6 +18,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.text.other_actions import OTHER_ACTIONS
+from motionloom.datasets.text.said import Acts
+
 LIKE = 0.75
 """Cosine of single words' embeddings from which they mean nearly the same: "knees" and "knee" have 0.87,
 "hello" and "greeting" 0.76, "leaps" and "stepping" 0.65. Chosen on the development part of
@@ -32,8 +35,12 @@ adult player athlete fighter boxer dancer actor student teacher friend somebody 
 put puts putting go goes going get gets getting give gives giving make makes making take takes taking move
 moves moving do does doing
 """
+_TAKE_BACK = """
+no not never none nor nothing nowhere without instead except anything
+dont doesnt didnt isnt arent wasnt wont cant
+stop stops stopped refuse refuses refused avoid avoids avoided
+"""
 _DECIDE = """
-no not never nobody none nor nothing nowhere without instead stop stops refuse refuses avoid avoids
 zero many two three four five six seven eight nine ten
 eleven twelve twenty thirty forty fifty sixty seventy eighty ninety hundred thousand dozen then after
 afterwards before
@@ -47,10 +54,9 @@ _IN_TURN = r",?\s*(?:\b(?:and|but)\b)?\s*\b(?:then|afterwards|after (?:that|this
 _SAME = {"twice": "two", "thrice": "three", "2": "two", "3": "three", "4": "four", "5": "five"}
 _ENDINGS = ("s", "es", "d", "ed", "ing")
 _WORD = r"[\w']+"
-_SMALL, _EXACT = frozenset(_NOTHING_ALONE.split()), frozenset(_DECIDE.split())
+_SMALL, _BACK = frozenset(_NOTHING_ALONE.split()), frozenset([*_TAKE_BACK.split(), "nobody"])
+_EXACT = _BACK | frozenset(_DECIDE.split())
 
-Acts = tuple[str, ...]
-"""What a motion does: an action of the synthetic clips (`truth.ACTIONS`), or two in turn."""
 Understood = tuple[str, Sequence[Acts]]
 """A caption as it is read, its words spelt right, and what it may ask for; empty where that is not known."""
 Encode = Callable[[Sequence[str]], NDArray[np.float32]]
@@ -61,15 +67,16 @@ Pieces = Callable[[Sequence[str]], NDArray[np.int64]]
 
 def words_of(captions: Collection[str]) -> frozenset[str]:
     """The different words of captions, in small letters."""
-    return frozenset(word for caption in captions for word in _split(caption))
+    return frozenset(word for caption in captions for word in words_in(caption))
 
 
 def counted(captions: Collection[str]) -> Mapping[str, int]:
     """How often captions have each of their words, in small letters."""
-    return Counter(word for caption in captions for word in _split(caption))
+    return Counter(word for caption in captions for word in words_in(caption))
 
 
-def _split(caption: str) -> list[str]:
+def words_in(caption: str) -> list[str]:
+    """The words of a caption in their order, in small letters."""
     return re.findall(_WORD, caption.lower())
 
 
@@ -102,7 +109,7 @@ class HeardWords:
 
     def unheard(self, caption: str) -> list[str]:
         """Words of a caption that training had nothing like; empty where its words are not known."""
-        return [word for word in _split(caption) if not self._heard(word)] if self.words else []
+        return [word for word in words_in(caption) if not self._heard(word)] if self.words else []
 
     def _heard(self, word: str) -> bool:
         if word in self.words or word in _SMALL:
@@ -118,6 +125,11 @@ class HeardWords:
         )
 
     @cached_property
+    def others(self) -> NDArray[np.float32]:
+        """Embeddings of what no training of synthetic clips has [n, E]."""
+        return self.encode(OTHER_ACTIONS)
+
+    @cached_property
     def _embeddings(self) -> NDArray[np.float32]:
         return self.encode(sorted(self.words))
 
@@ -127,9 +139,15 @@ def decides(word: str) -> bool:
     return word in _EXACT or "n't" in word or any(letter.isdigit() for letter in word)
 
 
+def taken_back(caption: str) -> bool:
+    """Whether a caption says that something is not done; who dances like nobody is watching dances."""
+    words = words_in(caption)
+    return words[:1] == ["nobody"] or any("n't" in word or word in _BACK - {"nobody"} for word in words)
+
+
 def deciding(caption: str) -> frozenset[str]:
     """The words of a caption that decide by themselves, one spelling for each number."""
-    words = (_SAME.get(word, word) for word in _split(caption))
+    words = (_SAME.get(word, word) for word in words_in(caption))
     return frozenset(word for word in words if decides(word))
 
 

@@ -29,7 +29,16 @@ from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.synth.actions.truth import ACTIONS
-from motionloom.datasets.text.words import Acts, Encode, HeardWords, decides, deciding, in_turn, words_of
+from motionloom.datasets.text.said import Acts, acts_said, meant_by
+from motionloom.datasets.text.words import (
+    Encode,
+    HeardWords,
+    decides,
+    deciding,
+    in_turn,
+    taken_back,
+    words_of,
+)
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 
@@ -41,7 +50,7 @@ FAR = 0.5
 """Cosine of sentence embeddings below which a caption is far from another, where nothing else is known; like
 `NEAR` chosen on the development part of `benchmarks/known_words.yaml`."""
 
-NEAR = 1.25
+NEAR = 1.2
 """Sum of that cosine and of the cosine of the model's own readings from which a caption is near another."""
 BESIDE = 1.05
 """The same for a caption that has a word that decides: it may have other hands."""
@@ -50,7 +59,10 @@ NEAREST, AT_ONCE = 128, 32
 """Known captions that the model reads beside a new one at most, and how many at a time."""
 
 
-SURE = 1.45
+OTHERWISE = 0.1
+"""By how much a caption may be nearer, as a sentence, to an action that is none of the training's
+(`OTHER_ACTIONS`)."""
+SURE = 1.4
 """The same from which words that were never heard change nothing, unless they decide."""
 LIKE_IT, AS_NEAR = 3, 0.05
 """Known captions whose motions say what a new one may ask for, at most, and by how much less near than the
@@ -110,6 +122,9 @@ class KnownCaptions:
         """
         if not self.acts:
             return []
+        said = self.said(caption)
+        if said:
+            return meant_by(caption, said) if _known(said) else []
         parts = in_turn(caption)
         if len(parts) != 2:
             return self._asked(caption, range(len(self.acts)), encode, read)
@@ -119,16 +134,43 @@ class KnownCaptions:
         first, second = (self._asked(part, alone, encode, read) for part in parts)
         return [one + other for one in first for other in second]
 
+    def said(self, caption: str) -> Acts:
+        """What a caption asks for by its words, if the training has that; else empty."""
+        done = {act for acts in self.acts for act in acts}
+        parts = [acts_said(part) for part in in_turn(caption)]
+        acts = tuple(act for part in parts for act in part)
+        plain = len(parts) == 1 or all(len(part) == 1 for part in parts)
+        return acts if plain and done.issuperset(acts) else ()
+
     def _asked(self, caption: str, among: Sequence[int], encode: Encode, read: Encode | None) -> list[Acts]:
+        nearest, near = self._nearest(caption, among, encode, read)
+        order = np.argsort(-near, kind="stable")[:LIKE_IT]
+        found = [self.acts[among[nearest[k]]] for k in order if near[k] >= near[order[0]] - AS_NEAR]
+        return list(dict.fromkeys(found)) if all(found) else []
+
+    def _nearest(
+        self, caption: str, among: Sequence[int], encode: Encode, read: Encode | None
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Of `among` those nearest as sentences, and how near they are, with the model's reading."""
         near = self.embeddings[among] @ np.asarray(encode([caption]), np.float32)[0]
         nearest = np.argsort(-near, kind="stable")[:AT_ONCE]
         near = near[nearest]
         if read is not None:
             readings = read([caption, *(self.captions[among[k]] for k in nearest)])
             near = near + readings[1:] @ readings[0]
-        order = np.argsort(-near, kind="stable")[:LIKE_IT]
-        found = [self.acts[among[nearest[k]]] for k in order if near[k] >= near[order[0]] - AS_NEAR]
-        return list(dict.fromkeys(found)) if all(found) else []
+        return nearest, near
+
+    def _otherwise(self, caption: str, said: Acts, heard: HeardWords) -> bool:
+        """Whether a caption, even if it names actions of the training, asks for something else: it takes them
+        back, does too much, or is nearer to another action.
+        """
+        if not self.acts:
+            return False
+        if not _known(said) or (said and taken_back(caption)):
+            return True
+        same = [k for k, acts in enumerate(self.acts) if not said or set(acts) <= set(said)]
+        vector = np.asarray(heard.encode([caption]), np.float32)[0]
+        return bool((self.embeddings[same] @ vector).max() < (heard.others @ vector).max() - OTHERWISE)
 
     def unknown(
         self, captions: Sequence[str], heard: HeardWords, read: Encode | None = None, count: int = 3
@@ -148,45 +190,48 @@ class KnownCaptions:
         cosines = np.asarray(heard.encode(meant), dtype=np.float32) @ self.embeddings.T
         for said, caption, row in zip(captions, meant, cosines, strict=True):
             order = np.argsort(-row, kind="stable")
-            nearest = [self.captions[k] for k in order]
-            asked = {act for acts in self.asked(caption, heard.encode, read) for act in acts}
-            alike = [not asked or not asked.isdisjoint(self.acts[k]) for k in order]
-            strange = heard.unheard(caption)
-            enough = SURE if strange else NEAR
-            near = _is_near(caption, nearest, row[order], np.array(alike), read, enough)
-            if not near or any(map(decides, strange)):
-                found.setdefault(said, Unknown(said, tuple(nearest[:count])))
+            named = self.said(caption)
+            known = not self._otherwise(caption, named, heard) and (
+                bool(named) or self._near(caption, order, row, heard, read)
+            )
+            if not known:
+                found.setdefault(said, Unknown(said, tuple(self.captions[k] for k in order[:count])))
             elif caption != said:
                 found.setdefault(said, Unknown(said, (), caption))
         return list(found.values())
 
-
-def _is_near(
-    caption: str,
-    nearest: Sequence[str],
-    cosines: NDArray[np.float32],
-    alike: NDArray[np.bool_],
-    read: Encode | None,
-    enough: float,
-) -> bool:
-    """Whether a caption of the training is near one by `enough`, and those `alike` together have its words
-    that decide. Without a reading, from `FAR` on one is near by `NEAR`.
-    """
-    missing, found = set(deciding(caption)), False
-    for first in range(0, min(NEAREST, len(nearest)), AT_ONCE):
-        block = slice(first, first + AT_ONCE)
-        texts, near = nearest[block], cosines[block]
-        if read is None:
-            near = np.where(near >= FAR, NEAR, 0.0)
-        else:
-            readings = read([caption, *texts])
-            near = near + readings[1:] @ readings[0]
-        found = found or bool((near >= enough).any())
-        beside = (near >= BESIDE) & alike[block]
-        missing.difference_update(*(deciding(text) for text, yes in zip(texts, beside, strict=True) if yes))
-        if found and not missing:
-            return True
-    return False
+    def _near(
+        self,
+        caption: str,
+        order: NDArray[np.int64],
+        row: NDArray[np.float32],
+        heard: HeardWords,
+        read: Encode | None,
+    ) -> bool:
+        """Whether a caption of the training is near one, `row` [n] as sentences, and those together that do
+        what it asks for have its words that decide. Without a reading, from `FAR` on one is near.
+        """
+        strange = heard.unheard(caption)
+        if any(map(decides, strange)):
+            return False
+        enough = SURE if strange else NEAR
+        asked = {act for acts in self.asked(caption, heard.encode, read) for act in acts}
+        missing, found = set(deciding(caption)), False
+        for first in range(0, min(NEAREST, len(order)), AT_ONCE):
+            block = order[first : first + AT_ONCE]
+            texts = [self.captions[k] for k in block]
+            if read is None:
+                near = np.where(row[block] >= FAR, NEAR, 0.0)
+            else:
+                readings = read([caption, *texts])
+                near = row[block] + readings[1:] @ readings[0]
+            found = found or bool((near >= enough).any())
+            for k, text, nearness in zip(block, texts, near, strict=True):
+                if nearness >= BESIDE and (not asked or not asked.isdisjoint(self.acts[k])):
+                    missing.difference_update(deciding(text))
+            if found and not missing:
+                return True
+        return False
 
 
 def _known(acts: Acts) -> bool:

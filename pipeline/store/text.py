@@ -120,12 +120,13 @@ class TextSource:
         return known.unknown(captions, self._heard, read) if known and captions else []
 
     def understood(self, caption: str, read: Encode | None = None) -> Understood:
-        """A caption of a body as it is read, and what it may ask for."""
+        """A caption of a body as it is read, and what it may ask for: of one that is not known nothing is."""
         known = self.known.get("body")
         if known is None or not known.acts:
             return caption, ()
         meant = self.spelt(caption)
-        return meant, known.asked(meant, self._heard.encode, read)
+        strange = known.unknown([meant], self._heard, read)
+        return meant, () if strange else known.asked(meant, self._heard.encode, read)
 
     def spelt(self, caption: str) -> str:
         """A caption as it is read: misspelt words of the training set right."""

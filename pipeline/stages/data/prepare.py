@@ -13,7 +13,7 @@ from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
-from motionloom.datasets.text.words import Acts
+from motionloom.datasets.text.said import Acts
 from motionloom.pipeline.contract.stage import (
     CPU,
     RUNTIME,
