@@ -12,7 +12,7 @@ decides that by the dataset it passes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -23,7 +23,7 @@ from rich.progress import track
 from torch import Tensor
 
 from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
-from motionloom.datasets.motion.layout import Family, MotionLayout
+from motionloom.datasets.motion.layout import ROOT, Family, MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, in_order
 
@@ -58,6 +58,14 @@ class FeatureStats:
         """values * std + mean over the last axis; numpy or torch, differentiable."""
         mean, std = self._like(values, columns)
         return values * std + mean
+
+    def with_root(self, gain: float) -> FeatureStats:
+        """Those by which the columns of the root come out `gain` times as large."""
+        std = self.std.copy()
+        for name in ROOT:
+            if self.layout.has(name):
+                std[self.layout.slice(name)] /= gain
+        return replace(self, std=std, _tensors={})
 
     @staticmethod
     def unit(layout: MotionLayout) -> FeatureStats:

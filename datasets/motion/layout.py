@@ -31,6 +31,8 @@ Part = Literal["all", "bodyhand", "body", "hand", "face"]
 BODY_JOINTS = 22
 WRISTS = (20, 21)
 FACE_DIMS = 50
+ROOT = ("root_yaw_velocity", "root_xz_velocity", "root_height")
+"""Fields of the way that the root goes."""
 
 
 def _h3d_fields(joints: int, *, rotations: bool, face: bool) -> tuple[tuple[str, int], ...]:

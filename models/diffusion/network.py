@@ -39,6 +39,11 @@ class DiffusionConfig(StackConfig):
     quieted: bool = False
     """Enter noisy frames as the best linear guess of the motion in them, which is next to nothing where they
     are next to noise [ours]: small networks take long to learn that. False is MDM's."""
+    spread: bool = False
+    """Add the condition to every frame too, the text as long as its width's root [ours]: it comes through
+    where frames are next to noise. False is MDM's."""
+    frames_per_token: int = Field(default=1, ge=1)
+    """Frames that are one token together [ours]; 1 is MDM's."""
     velocity_weight: float = Field(default=0.0, ge=0)
     """Weight of the same error between frame-to-frame differences, which makes motion smoother; 0 is MDM's
     for features."""
@@ -66,15 +71,17 @@ class MotionDiffusion(nn.Module):
         if config.quieted:
             share = torch.from_numpy(np.cumprod(1 - config.schedule.beta_table()) ** 0.5).float()
         self.register_buffer("share", share, persistent=False)
-        self.enter = nn.Linear(motion_dim, config.dim)
-        self.seen = nn.Linear(observed_width(motion_dim), config.dim, bias=False) if config.observed else None
+        per = config.frames_per_token
+        shown = per * observed_width(motion_dim)
+        self.enter = nn.Linear(per * motion_dim, config.dim)
+        self.seen = nn.Linear(shown, config.dim, bias=False) if config.observed else None
         self.text = nn.Linear(text_dim, config.dim)
         self.time = nn.Sequential(
             nn.Linear(config.dim, config.dim), nn.SiLU(), nn.Linear(config.dim, config.dim)
         )
         self.dropout = nn.Dropout(config.dropout)
         self.stack = Transformer(config, config.layers, norm=config.norm)
-        self.leave = nn.Linear(config.dim, motion_dim)
+        self.leave = nn.Linear(config.dim, per * motion_dim)
 
     def forward(
         self,
@@ -97,17 +104,27 @@ class MotionDiffusion(nn.Module):
                 without such columns take no notice of it.
         """
         time = self.time(waves(step, self.config.dim).to(self.text.weight.dtype))
-        condition = self.text(text * conditioned[:, None]) + time
+        text = text * conditioned[:, None]
+        condition = self.text(text * self.text_dim**0.5 if self.config.spread else text) + time
         if self.config.quieted:
             noisy = noisy * self.share[step][:, None, None].to(noisy.dtype)
-        frames = self.enter(noisy)
+        frames = self.enter(self._tokens(noisy * mask[..., None]))
+        if self.config.spread:
+            frames = frames + condition[:, None].to(frames.dtype)
         if self.seen is not None and seen is not None:
-            frames = frames + self.seen(seen.to(frames.dtype))
+            frames = frames + self.seen(self._tokens(seen.to(frames.dtype)))
         x = torch.cat([condition[:, None].to(frames.dtype), frames], dim=1)
         x = self.dropout(x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype))
-        visible = torch.cat([mask.new_ones(len(mask), 1), mask], dim=1)
+        visible = torch.cat([mask.new_ones(len(mask), 1), self._tokens(mask[..., None]).any(-1)], dim=1)
         out: Tensor = self.leave(self.stack(x, visible)[:, 1:])
+        out = out.view(len(out), -1, self.motion_dim)[:, : mask.shape[1]]
         return out.to(torch.promote_types(out.dtype, torch.float32)) * mask[..., None]
+
+    def _tokens(self, frames: Tensor) -> Tensor:
+        """[B, T, D] -> [B, T / k, k D] of k frames a token, with zeros after the last."""
+        per = self.config.frames_per_token
+        whole = torch.nn.functional.pad(frames, (0, 0, 0, -frames.shape[1] % per))
+        return whole.reshape(len(frames), -1, per * frames.shape[2])
 
 
 def step_waves(step: Tensor, dim: int) -> Tensor:

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.datasets.motion.features.torch_joints import torch_joints_of, torch_way
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.layout import ROOT, MotionLayout
 from motionloom.datasets.schema import UserError
-
-_ROOT = ("root_yaw_velocity", "root_xz_velocity", "root_height")
 
 
 class Recovery:
@@ -48,9 +46,9 @@ class Recovery:
     @staticmethod
     def possible(layout: MotionLayout, columns: NDArray[np.int64]) -> bool:
         """Whether the columns of a layout hold the root."""
-        if layout.family == "raw" or not all(layout.has(field) for field in _ROOT):
+        if layout.family == "raw" or not all(layout.has(field) for field in ROOT):
             return False
-        return all(np.isin(np.arange(layout.dim)[layout.slice(field)], columns).all() for field in _ROOT)
+        return all(np.isin(np.arange(layout.dim)[layout.slice(field)], columns).all() for field in ROOT)
 
     def way(self, features: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
         """Heading in radians [B, T], and z and x of the root in metres [B, T, 2], of normalised features

@@ -60,8 +60,21 @@ class ScheduleConfig(Config):
     set_alpha_to_one: bool = True
     """Whether ddim's last step ends without noise; MLD's ends with that of time step 0."""
 
+    shift: float = Field(default=1.0, gt=0)
+    """How many times as strong as usual the noise is beside the motion, at every step. Where many columns
+    move together, motion shows through noise that hides each column, so that small networks learn too little
+    of what comes before: Hoogeboom et al. 2023 shift the noise of large images so. 1 is the papers'."""
+
     def beta_table(self) -> NDArray[np.float64]:
         """Variance that each step adds [steps]."""
+        if self.shift == 1:
+            return self._unshifted()
+        kept = np.cumprod(1 - self._unshifted())
+        kept = kept / (kept + self.shift**2 * (1 - kept))
+        shifted: NDArray[np.float64] = np.minimum(1 - kept / np.append(1.0, kept[:-1]), 0.999)
+        return shifted
+
+    def _unshifted(self) -> NDArray[np.float64]:
         if self.betas == "linear":
             return np.linspace(1e-4, 0.02, self.steps)
         if self.betas == "scaled_linear":

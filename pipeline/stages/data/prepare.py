@@ -37,6 +37,9 @@ class StatsConfig(StageConfig):
 
     group: bool = False
     """Average the deviation over each kind of feature, as HumanML3D does."""
+    root_gain: float = Field(1.0, gt=0)
+    """How many times as large as other columns the root's are, once normalised [ours]: few as they are,
+    errors in them add up to the way."""
     mean: Path | None = Field(None, json_schema_extra=RUNTIME)
     """The `Mean.npy` of a release whose weights a stage loads (`published`), in place of the data's own."""
     std: Path | None = Field(None, json_schema_extra=RUNTIME)
@@ -46,8 +49,10 @@ class StatsConfig(StageConfig):
     def _both(self) -> StatsConfig:
         if (self.mean is None) != (self.std is None):
             raise ValueError("mean and std are given together, or neither")
-        if self.mean is not None and self.group:
-            raise ValueError("group is of the data's own statistics: leave it out beside mean and std")
+        if self.mean is not None and (self.group or self.root_gain != 1):
+            raise ValueError(
+                "group and root_gain are of the data's own statistics: leave them out beside mean and std"
+            )
         return self
 
     @property
@@ -98,7 +103,8 @@ class StatsStage(StageKind[StatsConfig]):
                 f"    of {paths[0].name} and {paths[1].name}, {dataset.layout.dim} dimensions"
             )
             return
-        compute(dataset, group=context.config.group).save(context.folder / _STATS)
+        stats = compute(dataset, group=context.config.group)
+        stats.with_root(context.config.root_gain).save(context.folder / _STATS)
         context.console.print(
             f"    {len(dataset)} clips, {int(dataset.frames.sum())} frames, {dataset.layout.dim} dimensions"
         )

@@ -64,7 +64,8 @@ class DiffusionStage(CaptionStage[DiffusionStageConfig, CaptionInputs, MotionDif
     def release(self, net: MotionDiffusion) -> Release | None:
         """MDM's `trans_enc`."""
         config = net.config
-        if config.norm == "pre" or config.observed or config.quieted:
+        ours = config.observed or config.quieted or config.spread or config.frames_per_token > 1
+        if config.norm == "pre" or ours:
             return None
         return Release(mdm_names(net), unread=("*.pe", "clip_model.*"))
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from motionloom.datasets.loading.statistics import STD_FLOOR, FeatureStats, Moments, compute, from_moments
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.layout import ROOT, MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reader import ShardDataset
 
@@ -35,6 +35,17 @@ def test_grouping_averages_stds_per_field_as_humanml3d_does() -> None:
     plain = rows.std(axis=0)
     for start, end in ((0, 1), (1, 3), (3, 4), (4, 67), (67, 193), (193, 259), (259, 263)):
         np.testing.assert_allclose(std[start:end], plain[start:end].mean(), rtol=1e-6)
+
+
+def test_the_root_counts_as_much_as_is_said(train: ShardDataset) -> None:
+    plain = compute(train)
+    gained = plain.with_root(5.0)
+    rows, root = train.motion(0), [train.layout.slice(name) for name in ROOT]
+    larger = np.ones(train.layout.dim)
+    for columns in root:
+        larger[columns] = 5.0
+    np.testing.assert_allclose(gained.normalize(rows), plain.normalize(rows) * larger, rtol=1e-5, atol=1e-5)
+    np.testing.assert_array_equal(plain.with_root(1.0).std, plain.std)
 
 
 def test_still_columns_are_floored_and_no_frames_refused() -> None:

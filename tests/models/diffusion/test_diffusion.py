@@ -16,6 +16,7 @@ from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.models.training.stage_module import OptimConfig
 
 SMALL = DiffusionConfig(dim=32, ff=64, layers=2, heads=2, dropout=0.0)
+OURS = SMALL.model_copy(update={"spread": True, "frames_per_token": 2})
 
 
 @pytest.mark.parametrize(
@@ -45,22 +46,52 @@ def test_schedule_equals_public_tables(shared: Path, name: str, config: Schedule
         np.testing.assert_allclose(taken[0], golden[f"{name}__p_mean"][row], rtol=1e-3, atol=2e-3)
 
 
+@pytest.mark.parametrize("shift", [1.0, 5.0])
+def test_a_shift_is_noise_so_many_times_as_strong(shift: float) -> None:
+    kept, shifted = (np.cumprod(1 - ScheduleConfig(shift=s).beta_table()) for s in (1.0, shift))
+    noise = np.sqrt((1 - kept) / kept)[:-1]
+    np.testing.assert_allclose(np.sqrt((1 - shifted) / shifted)[:-1], shift * noise, rtol=1e-9)
+    assert (np.diff(shifted) < 0).all() and shifted[-1] >= 0
+
+
 @pytest.mark.usefixtures("float64")
-def test_padding_plays_no_part() -> None:
+@pytest.mark.parametrize("config", [SMALL, OURS])
+@pytest.mark.parametrize("frames", [7, 8])
+def test_padding_plays_no_part(config: DiffusionConfig, frames: int) -> None:
     torch.manual_seed(0)
-    net = MotionDiffusion(SMALL, 5, 7).eval()
+    net = MotionDiffusion(config, 5, 7).eval()
     x, text = torch.randn(1, 12, 5), torch.randn(1, 7)
     step, conditioned = torch.tensor([30]), torch.tensor([True])
-    mask = torch.arange(12)[None] < 8
+    mask = torch.arange(12)[None] < frames
     padded = net(x, step, text, mask, conditioned)
-    alone = net(x[:, :8], step, text, mask[:, :8], conditioned)
-    torch.testing.assert_close(padded[:, :8], alone, atol=1e-5, rtol=1e-5)
-    assert (padded[:, 8:] == 0).all()
+    alone = net(x[:, :frames], step, text, mask[:, :frames], conditioned)
+    torch.testing.assert_close(padded[:, :frames], alone, atol=1e-5, rtol=1e-5)
+    assert (padded[:, frames:] == 0).all()
 
 
-def test_hidden_text_has_no_influence() -> None:
+def test_frames_of_a_token_lie_side_by_side() -> None:
+    net = MotionDiffusion(OURS, 3, 7)
+    x = torch.arange(15.0).view(1, 5, 3)
+    tokens = net._tokens(x)
+    assert tokens.shape == (1, 3, 6) and tokens[0, 1].tolist() == [6, 7, 8, 9, 10, 11]
+    assert tokens[0, 2].tolist() == [12, 13, 14, 0, 0, 0]
+
+
+def test_a_spread_text_reaches_every_frame_without_attention() -> None:
     torch.manual_seed(0)
-    net = MotionDiffusion(SMALL, 5, 7).eval()
+    x, mask, step = torch.randn(1, 12, 5), torch.ones(1, 12, dtype=torch.bool), torch.tensor([30])
+    for config, reached in ((SMALL, False), (OURS, True)):
+        net = MotionDiffusion(config.model_copy(update={"layers": 1}), 5, 7).eval()
+        for values in net.stack.blocks.parameters():
+            torch.nn.init.zeros_(values)  # blocks that pass on what they are given
+        one, two = (net(x, step, torch.full((1, 7), t), mask, torch.tensor([True])) for t in (0.0, 1.0))
+        assert bool((one != two).any(-1).all()) is reached
+
+
+@pytest.mark.parametrize("config", [SMALL, OURS])
+def test_hidden_text_has_no_influence(config: DiffusionConfig) -> None:
+    torch.manual_seed(0)
+    net = MotionDiffusion(config, 5, 7).eval()
     x, mask, step = torch.randn(1, 12, 5), torch.ones(1, 12, dtype=torch.bool), torch.tensor([30])
     for conditioned, same in ((False, True), (True, False)):
         pair = [net(x, step, torch.randn(1, 7) * 3, mask, torch.tensor([conditioned])) for _ in range(2)]
