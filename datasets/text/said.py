@@ -35,12 +35,12 @@ ACTIONS = {
 _MORE = {
     "turn": r"(turn|pivot|spin|rotat)(e|s|es|ed|ing|ning)?|spun|about[- ]face|face the other way",
     "walk": r"(walk|stroll|wander|trudg|strid|ambl|saunter)(e|s|es|ed|ing)?"
-    r"|(takes?|took|taking) (\w+ )*steps?|back away|back(s|ed|ing) (away|up|off)",
+    r"|(takes?|took|taking) (\w+ ){0,4}steps?|back away|back(s|ed|ing) (away|up|off)",
     "run": r"(run|jog|dash|sprint)(s|es|ed|ged|ning|ging|ing)?|ran",
     "wave": r"wav(e|es|ed|ing)",
     "raise": r"(rais|lift)(e|es|s|ed|ing)?|(arms?|hands?) (up|in the air)",
     "kick": r"kick(s|ed|ing)?",
-    "punch": r"punch(es|ed|ing)?|(jab|uppercut)(s|bed|bing)?|(hit|swing|swung)(s|ting|ing)? .*fist",
+    "punch": r"punch(es|ed|ing)?|(jab|uppercut)(s|bed|bing)?|(hit|swing|swung)(s|ting|ing)? .{0,60}fist",
     "hop": r"hop(s|ped|ping)?",
     "jump": r"(jump|leap)(s|ed|ing|t)?|skip(s|ping)? (with a )?rope",
     "squat": r"squat(s|ted|ting)?|crouch(es|ed|ing)?",
@@ -51,11 +51,11 @@ _MORE = {
     "crawl": r"crawl(s|ed|ing)?",
     "dance": r"(danc|groov)(e|es|ed|ing)|disco",
     "reach": r"reach(es|ed|ing)?|extend(s|ed|ing)? (a|an|one|the|his|her|their|your) (hand|arm)"
-    r"|(pick|picks|picked|picking) (\w+ )*up",
+    r"|(pick|picks|picked|picking) (\w+ ){0,5}up",
     "point": r"point(s|ed|ing)?",
     "stretch": r"stretch(es|ed|ing)?",
 }
-"""As asked of a model: also other words for the same."""
+"""As asked of a model: also other words for the same. Repeats are bounded, so that no caption takes long."""
 _OTHERS = (
     r"then|while|after|before|danc\w+|reach\w*|point\w*|step\w*|not"
     r"|in place|on the spot|back and forth|to and fro|side to side"
@@ -171,14 +171,15 @@ def asked_of(caption: str, action: str) -> Said:
 
 def _count_of(text: str, action: str) -> int | None:
     """How often a caption asks for an action; of one that is not counted, if it says so in so many words."""
-    words = _MORE[action]
-    again = re.search(rf"\b({words})\b(\W+({words})\b)+", text)
-    if again and action in _COUNTED:
-        return len(re.findall(rf"\b({words})\b", again[0]))
-    if action in _COUNTED and says(text, rf"one (\w+ )?({words})"):
-        return 1
     times = _NOT_TIMES if action in _COUNTED else _STEPS if action == "walk" else r"(?= ?times\b)"
-    found = re.findall(rf"\bx?(\d+|{'|'.join(_NUMBERS)})(?:x?)\b{times}", text)
+    if action in _COUNTED:
+        words = _MORE[action]
+        again = re.search(rf"\b({words})\b(\W+({words})\b)+", text)
+        if again:
+            return len(re.findall(rf"\b({words})\b", again[0]))
+        if says(text, rf"one (\w+ )?({words})"):
+            return 1
+    found = re.findall(rf"\bx?(\d+|{'|'.join(_NUMBERS)})x?\b{times}", text)
     numbers = {int(one) if one.isdigit() else _NUMBERS[one] for one in found}
     return numbers.pop() if len(numbers) == 1 else None
 

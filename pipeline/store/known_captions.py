@@ -58,12 +58,11 @@ BESIDE = 1.05
 NEAREST, AT_ONCE = 128, 32
 """Known captions that the model reads beside a new one at most, and how many at a time."""
 
-
+SURE = 1.4
+"""The same from which words that were never heard change nothing, unless they decide."""
 OTHERWISE = 0.1
 """By how much a caption may be nearer, as a sentence, to an action that is none of the training's
 (`OTHER_ACTIONS`)."""
-SURE = 1.4
-"""The same from which words that were never heard change nothing, unless they decide."""
 LIKE_IT, AS_NEAR = 3, 0.05
 """Known captions whose motions say what a new one may ask for, at most, and by how much less near than the
 nearest; chosen on the same sentences."""

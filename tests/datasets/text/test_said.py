@@ -16,6 +16,12 @@ def test_every_action_of_the_synthetic_clips_has_words() -> None:
     assert all(acts_said(f"please {name}") == (name,) for name in said._MORE)
 
 
+def test_no_caption_takes_long() -> None:
+    """Every repeat is bounded: a hundred thousand words are read in one go, and none is found."""
+    assert not any("*" in words or ")+" in words for words in said._MORE.values())
+    assert acts_said("take pick hit " * 33_000) == ()
+
+
 @pytest.mark.parametrize(
     ("caption", "acts"),
     [
