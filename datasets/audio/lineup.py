@@ -39,10 +39,11 @@ def motion_frame_features(
     return rows_at(audio_features(samples, rate, settings), settings.fps, fps, frames)
 
 
-def features_of(sound: Sound, fps: float, width: int = DIM) -> NDArray[np.float32]:
+def features_of(sound: Sound, fps: float, width: int = DIM, rate: float | None = None) -> NDArray[np.float32]:
     """Features [T, width] of a sound, a row for each motion frame, by all of the piece that it is a slice of.
 
-    The width says which: the 438 published ones, or those of `rhythm_features`.
+    The width says which: the 438 published ones, at `rate` rows a second where that is given, or those of
+    `rhythm_features`.
 
     Tempo and beats are read from many seconds around a frame, in training too: a slice heard alone would
     look different. A piece is analysed once; the sound keeps what was found.
@@ -51,19 +52,20 @@ def features_of(sound: Sound, fps: float, width: int = DIM) -> NDArray[np.float3
     # The piece is heard from within a frame's length on, so that its rows lie on the motion's frames.
     first = int(sound.begin * fps + 1e-6)
     lead = max(0.0, sound.begin - first / fps)
-    known = piece.analysed.get((lead, fps, width))
+    known = piece.analysed.get((lead, fps, width, rate))
     if known is None:
         whole = piece.slice(lead) if round(lead * piece.rate) else piece
-        known = _analysed(whole, fps, width)
-        piece.analysed[lead, fps, width] = known
+        known = _analysed(whole, fps, width, rate)
+        piece.analysed[lead, fps, width, rate] = known
     frames = max(1, round(sound.seconds * fps))
     return known[np.minimum(np.arange(first, first + frames), len(known) - 1)]
 
 
-def _analysed(whole: Sound, fps: float, width: int) -> NDArray[np.float32]:
+def _analysed(whole: Sound, fps: float, width: int, rate: float | None) -> NDArray[np.float32]:
     frames = max(1, round(whole.seconds * fps))
     if width == DIM:
-        return motion_frame_features(whole, None, fps, frames)
+        settings = None if rate is None else AudioSettings.parse({"fps": rate}, "audio features")
+        return motion_frame_features(whole, None, fps, frames, settings)
     from motionloom.datasets.audio.rhythm_features import RHYTHM_DIM, rhythm_features
 
     if width != RHYTHM_DIM:

@@ -60,7 +60,9 @@ class Sound:
     """The longer sound that this is a slice of; features of music are made of whole pieces."""
     begin: float = 0.0
     """Second of the piece at which it begins."""
-    analysed: dict[tuple[float, float, int], NDArray[np.float32]] = field(default_factory=dict, repr=False)
+    analysed: dict[tuple[float, float, int, float | None], NDArray[np.float32]] = field(
+        default_factory=dict, repr=False
+    )
     """Features of the piece from a second on, at frames a second, by width (`lineup.features_of`)."""
 
     def __post_init__(self) -> None:

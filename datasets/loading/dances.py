@@ -13,7 +13,19 @@ from motionloom.datasets.loading.crops import Crops
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS, joints24_of
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.clips import ClipDataset
+
+
+def danced_joints(layout: MotionLayout) -> int:
+    """Joints that Bailando sees: the layout's, or of SMPL's columns SMPL's 24."""
+    return SMPL_JOINTS if layout.name == "smpl75" else layout.num_joints
+
+
+def joints_of_dance(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:
+    """Those of features [T, D] in their own units, [T, N, 3]."""
+    return joints24_of(features) if layout.name == "smpl75" else joints_of(features, layout)
 
 
 class JointCrops(Crops):
@@ -21,7 +33,7 @@ class JointCrops(Crops):
 
     def __init__(self, dataset: ClipDataset) -> None:
         self.dataset = dataset
-        self.width = 3 * dataset.layout.num_joints
+        self.width = 3 * danced_joints(dataset.layout)
         self.present = np.ones((4, self.width), dtype=np.bool_)
         self.clips = np.arange(len(dataset))
 
@@ -29,7 +41,7 @@ class JointCrops(Crops):
         self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int, present: int
     ) -> None:
         """Joints of frames `start .. start + length` into `out` [T >= length, 3 N], then zeros."""
-        joints = joints_of(clip[: start + length], self.dataset.layout)[start:]
+        joints = joints_of_dance(clip[: start + length], self.dataset.layout)[start:]
         out[:length] = joints.reshape(length, -1)
         out[length:] = 0.0
 

@@ -30,7 +30,9 @@ class AudioModality(FrameModality):
 
         if not isinstance(given, Sound):
             return super().features(given, fps)
-        return features_of(given, fps, prepared.dim if isinstance(prepared, FrameStats) else self.width)
+        if not isinstance(prepared, FrameStats):
+            return features_of(given, fps, self.width)
+        return features_of(given, fps, prepared.dim, prepared.rate)
 
     def seconds(self, given: object) -> float | None:
         from motionloom.datasets.audio.sound import Sound

@@ -65,6 +65,9 @@ class FrameStats:
     std: NDArray[np.float32]
     frames: int = 0
     """Rows they were computed from."""
+    rate: float | None = None
+    """Rows a second that what a person gives is analysed at, each then lasting several frames of the motion;
+    None = one for every frame."""
 
     @property
     def dim(self) -> int:
@@ -76,13 +79,20 @@ class FrameStats:
 
     def save(self, path: Path) -> None:
         """Write a safetensors file, atomically; the same statistics give the same bytes."""
-        save_columns(path, self.mean, self.std, self.frames)
+        rate = {} if self.rate is None else {"rate": str(self.rate)}
+        save_columns(path, self.mean, self.std, self.frames, **rate)
 
     @staticmethod
     def load(path: Path) -> FrameStats:
         """Read what `save` wrote; `UserError` when it is not that."""
-        mean, std, frames, _ = load_columns(path, "its stage")
-        return FrameStats(mean, std, frames)
+        mean, std, frames, about = load_columns(path, "its stage")
+        try:
+            rate = float(about["rate"]) if "rate" in about else None
+        except ValueError:
+            raise UserError(
+                f"{path}: not a statistics file (rate '{about['rate']}'); run its stage again"
+            ) from None
+        return FrameStats(mean, std, frames, rate)
 
 
 class Clips(Protocol):

@@ -179,8 +179,16 @@ class Rows:
     of: int
 
 
-Source = str | Rows
-"""Where a tensor of ours lies in a release: in one of its shape (axes of length 1 aside), or in some rows."""
+@dataclass(frozen=True)
+class Joined:
+    """Tensors of equal shapes, one below the other."""
+
+    names: tuple[str, ...]
+
+
+Source = str | Rows | Joined
+"""Where a tensor of ours lies in a release: in one of its shape (axes of length 1 aside), in some rows of
+one, or in several."""
 
 
 @dataclass(frozen=True)
@@ -207,6 +215,8 @@ class Release:
             shape = tuple(own[name].shape)
             if isinstance(source, Rows):
                 shapes[source.name] = (source.of, *shape[1:])
+            elif isinstance(source, Joined):
+                shapes |= dict.fromkeys(source.names, (shape[0] // len(source.names), *shape[1:]))
             else:
                 shapes[source] = shape
         found = exact_tensors(path, shapes, self.fix, self.unread)
@@ -216,6 +226,8 @@ class Release:
 def _taken(found: Mapping[str, torch.Tensor], source: Source) -> torch.Tensor:
     if isinstance(source, Rows):
         return found[source.name][list(source.rows)]
+    if isinstance(source, Joined):
+        return torch.cat([found[name] for name in source.names])
     return found[source]
 
 

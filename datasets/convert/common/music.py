@@ -36,7 +36,8 @@ class SoundConfig(ConvertConfig):
     audio_features: bool = True
     """Store the 438 audio features."""
     audio_fps: float | None = Field(default=None, gt=0)
-    """Rows of audio features a second; default: one for every motion frame. AIST++ publishes 60."""
+    """Rows of audio features a second that the music is analysed at, each stored for all motion frames
+    nearest to it; default: one for every motion frame. Bailando's release hears 7.5."""
     sound_rate: int = Field(default=16_000, ge=0, le=192_000)
     """Sample rate at which the sound itself is stored; 0 leaves it out."""
 
@@ -54,16 +55,17 @@ def cut_of(
 ) -> tuple[NDArray[np.float32] | None, Wav | None]:
     """The part of a piece from second `start` on that is `seconds` long.
 
-    Audio features [T_audio, 438] (`audio_fps` rows a second, as long as the motion) and the sound itself.
+    Audio features [T, 438], a row for each frame of the motion, and the sound itself.
     """
     settings = config.audio_settings()
     features, samples = piece_of_music(folder, sound, settings, config.sound_rate)
     rows: NDArray[np.float32] | None = None
     if features is not None and settings is not None:
-        first = round(start * settings.fps)
-        count = max(1, round(seconds * settings.fps))
+        from motionloom.datasets.audio.lineup import rows_at
+
+        first, count = round(start * config.fps), max(1, round(seconds * config.fps))
         # The last frame may lie at the very end of the music, past the last row by a rounding.
-        rows = features[np.minimum(np.arange(first, first + count), len(features) - 1)]
+        rows = rows_at(features, settings.fps, config.fps, first + count)[first:]
     if samples is None:
         return rows, None
     begin = round(start * config.sound_rate)

@@ -5,13 +5,17 @@ Canonical: the floor at 0, the first root above the origin, the first heading +Z
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.rigid import fit_rigid, on_bones
-from motionloom.datasets.motion.body.smpl import BodyModel
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, facing
 from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.motion.skeleton import Skeleton
 
 SMPL_JOINTS = 24
 
@@ -48,3 +52,29 @@ def fit_smpl75(joints: NDArray[np.floating]) -> NDArray[np.float32]:
     rest = body.rest_joints()
     motion = on_bones(fit_rigid(joints[:, :BODY_JOINTS], body.skeleton), body.skeleton.bones(rest))
     return smpl75_of(motion.rotations, motion.joints, rest[0])
+
+
+def joints24_of(columns: NDArray[np.floating]) -> NDArray[np.float64]:
+    """All of SMPL's joints [..., T, 24, 3] of columns [..., T, 75], on the neutral body, whose hands lie amid
+    the knuckles [ours].
+    """
+    turns = columns[..., 3:].reshape(*columns.shape[:-1], SMPL_JOINTS, 3)
+    return smpl_joints(turns, columns[..., :3], _neutral24())
+
+
+@cache
+def _neutral24() -> BodyModel:
+    body, whole = Skeleton.named("smpl22"), Skeleton.named("smplx52")
+    names, parents, rest = body.joints, body.parents, body.rest
+    for side in ("left", "right"):
+        knuckles = [whole.index(f"{side}_{finger}1") for finger in ("index", "middle", "ring", "pinky")]
+        x, y, z = whole.offsets[knuckles].mean(axis=0).tolist()
+        names, parents = (*names, f"{side}_hand"), (*parents, body.index(f"{side}_wrist"))
+        rest = (*rest, (x, y, z))
+    named = Skeleton("smpl24", names, parents, rest)
+    return replace(
+        BodyModel.neutral("smpl22"),
+        skeleton=named,
+        template=named.rest_joints,
+        directions=np.zeros((len(named), 3, 0)),
+    )

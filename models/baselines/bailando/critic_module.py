@@ -75,7 +75,7 @@ class ActorCriticModule(PlayersModule):
     def play(self, player: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """A player's loss, and the mean reward of a code."""
         gpt = self.net.gpt
-        true, music, heard = codes_of(self.vq.module, batch)
+        true, music, heard = codes_of(gpt, self.vq.module, batch)
         if "codes" not in shared:
             with evaluating(gpt):
                 codes = gpt.dance(true[:, :1], music, self.config.temperature)

@@ -9,6 +9,8 @@ Legend: B batch, L codes in the context, E features of music, D width, K codes.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from pydantic import Field
 from torch import Tensor, nn
@@ -28,6 +30,9 @@ class CrossGptConfig(StackConfig):
     """Of the part that an actor and its critic share, and as many again before the codes are said."""
     context: int = Field(default=29, ge=1)
     """Codes of each half that it sees."""
+    music: Literal["mean", "first"] = "mean"
+    """What is heard of the music of a code's frames: the mean [ours], or the first row, as the release hears
+    one row a code."""
 
 
 class CrossGpt(nn.Module):
@@ -50,6 +55,10 @@ class CrossGpt(nn.Module):
         for layer in (*self.codes, *self.out, self.music):
             nn.init.normal_(layer.weight, std=0.02)
         self.register_buffer("kept", torch.zeros(kept, 2, dtype=torch.int64))
+
+    def heard(self, music: Tensor, code_frames: int, codes: int | None = None) -> Tensor:
+        """The music [B, L, E] of so many codes; music [B, T, E] of frames, after its end 0."""
+        return music_of_codes(music, code_frames, codes, first=self.config.music == "first")
 
     def forward(self, codes: Tensor, music: Tensor) -> Tensor:
         """`music[:, t]` is that of the code after `codes[:, t]`."""
@@ -104,10 +113,15 @@ def code_errors(logits: Tensor, codes: Tensor) -> Tensor:
     return each.view(codes.shape)
 
 
-def music_of_codes(music: Tensor, code_frames: int, codes: int | None = None) -> Tensor:
-    """The mean music [B, L, E] of the frames of each code; music [B, T, E], after its end 0."""
+def music_of_codes(
+    music: Tensor, code_frames: int, codes: int | None = None, *, first: bool = False
+) -> Tensor:
+    """The mean music [B, L, E] of the frames of each code, or that of the `first`; music [B, T, E], after its
+    end 0.
+    """
     count = -(-music.shape[1] // code_frames) if codes is None else codes
     rows = functional.pad(
         music[:, : count * code_frames], (0, 0, 0, max(0, count * code_frames - music.shape[1]))
     )
-    return rows.reshape(len(music), count, code_frames, -1).mean(2)
+    frames = rows.reshape(len(music), count, code_frames, -1)
+    return frames[:, :, 0] if first else frames.mean(2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from motionloom.models.baselines.bailando.gpt import CrossGpt, code_errors, music_of_codes
+from motionloom.models.baselines.bailando.gpt import CrossGpt, code_errors
 from motionloom.models.baselines.bailando.vq import HALVES, DanceVq, places
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.training.distributed import masked_mean
@@ -26,7 +26,7 @@ class CrossGptModule(StageModule):
 
         Rows without music do not count.
         """
-        codes, music, heard = codes_of(self.vq.module, batch)
+        codes, music, heard = codes_of(self.net, self.vq.module, batch)
         logits, true = self.net(codes[:, :-1], music[:, 1:]), codes[:, 1:]
         counts = heard[:, None].expand(true.shape[:2])
         each, hits = code_errors(logits, true), (logits.argmax(-1) == true).float()
@@ -35,8 +35,8 @@ class CrossGptModule(StageModule):
         return {"loss": loss, **found}
 
 
-def codes_of(vq: DanceVq, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
+def codes_of(gpt: CrossGpt, vq: DanceVq, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     """Codes [B, L, 2] of a batch's joints, the music [B, L, E] of each, and who has music, bool [B]."""
     features, mask, _ = batch["conditions"]["audio"]
     codes = vq.encode(places(batch["motion"]))
-    return codes, music_of_codes(features, vq.config.code_frames, codes.shape[1]), mask.any(1)
+    return codes, gpt.heard(features, vq.config.code_frames, codes.shape[1]), mask.any(1)

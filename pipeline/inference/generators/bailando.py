@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.loading.dances import joints_of_dance
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
-from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.features.smpl75 import fit_smpl75
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.models.baselines.bailando.gpt import CrossGpt, music_of_codes
+from motionloom.models.baselines.bailando.gpt import CrossGpt
 from motionloom.models.baselines.bailando.vq import DanceVq
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.inference.generators.fact import music_of
@@ -63,9 +63,9 @@ class BailandoGenerator:
         if request.seed_motions is None:
             first = gpt.kept[[seed % len(gpt.kept) for seed in request.seeds]][:, None]
         else:
-            seeds = np.stack([joints_of(motion, self.layout) for motion in request.seed_motions])
+            seeds = np.stack([joints_of_dance(motion, self.layout) for motion in request.seed_motions])
             first = self.vq.encode(torch.from_numpy(seeds).to(device, torch.float32))
-        music = music_of_codes(music_of(request, self.given), self.unit_frames, count)
+        music = gpt.heard(music_of(request, self.given), self.unit_frames, count)
         codes = gpt.dance(first, music.to(device))
         out = []
         for row, frames in zip(codes, lengths, strict=True):

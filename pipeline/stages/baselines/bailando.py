@@ -11,7 +11,7 @@ import torch
 from pydantic import Field
 from torch.utils.data import Dataset
 
-from motionloom.datasets.loading.dances import BeatBatches, JointCrops
+from motionloom.datasets.loading.dances import BeatBatches, JointCrops, danced_joints
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout
@@ -25,10 +25,11 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
 from motionloom.pipeline.inference.generators.bailando import BailandoGenerator
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.baselines.bailando_release import release_of_codes, release_of_gpt
 from motionloom.pipeline.stages.baselines.dances import dance_batches, spread_dances
 from motionloom.pipeline.stages.networks.tokenizer import require_uses
 from motionloom.pipeline.store.data import Data
-from motionloom.pipeline.store.weights import ModelFacts, load_facts
+from motionloom.pipeline.store.weights import ModelFacts, Release, load_facts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
@@ -87,11 +88,15 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
                 f"window {config.window} is no multiple of the {config.net.code_frames} frames of a code "
                 f"(net.halvings {config.net.halvings})"
             )
-        extra = {"joints": layout.num_joints}
+        extra = {"joints": danced_joints(layout)}
         return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: DanceVqInputs) -> DanceVq:
         return DanceVq(DanceVqConfig.parse(facts.config, facts.where), facts.fact("joints", int))
+
+    def release(self, net: DanceVq) -> Release:
+        """Bailando's, with the decoder of the root."""
+        return release_of_codes(net)
 
     def module(
         self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, seed: int
@@ -150,6 +155,10 @@ class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt])
 
     def network(self, facts: ModelFacts, inputs: CrossGptInputs) -> CrossGpt:
         return gpt_of(facts)
+
+    def release(self, net: CrossGpt) -> Release:
+        """Bailando's, without its critic."""
+        return release_of_gpt(net)
 
     def prepare(self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs) -> None:
         """First codes of training dances."""
@@ -227,6 +236,10 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
 
     def network(self, facts: ModelFacts, inputs: ActorCriticInputs) -> ActorCritic:
         return ActorCritic(gpt_of(facts), facts.fact("critic_layers", int))
+
+    def release(self, net: ActorCritic) -> Release:
+        """Bailando's."""
+        return release_of_gpt(net)
 
     def prepare(self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs) -> None:
         """The actor starts as the trained GPT."""

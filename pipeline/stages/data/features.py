@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from pydantic import Field
 
@@ -29,6 +30,11 @@ class FeaturesConfig(StageConfig):
     width: int | None = Field(None, ge=1)
     """How many the shards hold, where a modality has several kinds: of music 438, or those of rhythm.
     None = the modality's usual ones."""
+    raw: bool = False
+    """Networks read the features as they are: of a release that did (`published`)."""
+    rate: float | None = Field(None, ge=5, le=240)
+    """Rows a second that the shards' features were analysed at (`audio_fps` of the converter), where that was
+    not each frame of the motion: a song that somebody gives is analysed so too."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,10 @@ class FeaturesStage(StageKind[FeaturesConfig]):
                 f"stage '{context.name}': the shards hold {stats.dim} features of {self.name} a frame, not "
                 f"{wanted}; set width: {stats.dim}"
             )
-        stats.save(context.folder / self.file)
+        config = context.config
+        if config.raw:
+            stats = replace(stats, mean=np.zeros_like(stats.mean), std=np.ones_like(stats.std))
+        replace(stats, rate=config.rate).save(context.folder / self.file)
         context.console.print(f"    {stats.frames} frames of {self.name}, {stats.dim} features")
 
     def preview(self, config: FeaturesConfig, given: Inputs) -> FeaturesPreview:

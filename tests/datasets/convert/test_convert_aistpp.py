@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import soundfile
 
+from motionloom.datasets.audio.features import AudioSettings, audio_features
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.aistpp.convert import AistppConfig
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
@@ -232,6 +233,18 @@ def test_music_goes_with_the_motion(fixture: Path, tmp_path: Path) -> None:
     onset = audio[:, 52]
     times = np.flatnonzero(onset > 0.5 * onset.max()) / 60
     assert np.abs((times + 0.375) % 0.75 - 0.375).max() < 0.06
+
+
+def test_music_analysed_at_its_own_rate(fixture: Path, tmp_path: Path) -> None:
+    """Bailando's: eight frames to a row, of which the first has it at its own time."""
+    config = AistppConfig(source=fixture, fps=60.0, layout="smpl75", audio_fps=7.5)
+    convert(config, tmp_path / "out")
+    reader, i = clip_of(tmp_path / "out", "train", REAL)
+    found = reader.array(i, "audio.npy")
+    music, rate = soundfile.read(fixture / "wavs/mBR0.wav", dtype="float32")
+    wanted = audio_features(music, rate, AudioSettings(fps=7.5))
+    assert found is not None and found.shape == (720, 438)
+    np.testing.assert_array_equal(found[::8], wanted[:90])
 
 
 def test_twenty_frames_and_an_offset(source: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from motionloom.datasets.motion.canonical import (
     retarget,
     turn,
 )
-from motionloom.datasets.motion.features.smpl75 import fit_smpl75
+from motionloom.datasets.motion.features.smpl75 import fit_smpl75, joints24_of
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
@@ -249,6 +249,20 @@ def test_joints_alone_are_posed_by_the_neutral_body(body: BodyModel) -> None:
 
 
 WHOLE = Skeleton.named("smplx52")
+
+
+def test_hands_of_smpl_turn_with_the_wrist() -> None:
+    columns = np.random.default_rng(0).normal(0, 0.5, (4, 75))
+    made = joints24_of(columns)
+    np.testing.assert_allclose(made[:, :22], joints_of_columns(columns, NEUTRAL), atol=1e-12)
+    turned = columns.copy()
+    turned[:, 3 + 3 * 20 : 3 + 3 * 22] += 0.7  # both wrists
+    other = joints24_of(turned)
+    np.testing.assert_allclose(other[:, :22], made[:, :22], atol=1e-12)
+    for hand, wrist in ((22, 20), (23, 21)):
+        lengths = np.linalg.norm(other[:, hand] - other[:, wrist], axis=-1)
+        np.testing.assert_allclose(lengths, 0.0926, atol=1e-3)
+        assert np.linalg.norm(other[:, hand] - made[:, hand], axis=-1).min() > 0.01
 
 
 def posed(seed: int, size: float = 1.0) -> np.ndarray:

@@ -142,7 +142,7 @@ def test_the_loss_is_the_cross_entropy_of_both_halves() -> None:
     vq, gpt, given = small_vq(), small_gpt(), dances()
     given["conditions"]["audio"].mask[2] = False
     found = CrossGptModule(gpt, OPTIM, seed=0, max_steps=1, vq=vq).eval().losses(given)
-    codes, music, _ = codes_of(vq, given)
+    codes, music, _ = codes_of(gpt, vq, given)
     total, hits = 0.0, 0.0
     for row in (0, 1, 3, 4, 5, 6, 7):
         chances = gpt(codes[row : row + 1, :-1], music[row : row + 1, 1:])[0].log_softmax(-1)
@@ -209,7 +209,7 @@ def test_codes_are_predicted_better_than_the_commonest() -> None:
     module = CrossGptModule(gpt, OPTIM, seed=0, max_steps=1, vq=vq)
     last = steps(module, "", [gpt], 80, 3e-3)[-1]
     torch.manual_seed(79)
-    codes = codes_of(vq, dances())[0][:, 1:]
+    codes = codes_of(gpt, vq, dances())[0][:, 1:]
     for half, name in enumerate(("up", "down")):
         commonest = codes[..., half].flatten().bincount().max() / codes[..., half].numel()
         assert float(last[f"accuracy_{name}"]) > float(commonest) + 0.2
