@@ -75,12 +75,17 @@ def diversity(x: Tensor, *, pairs: int = 300, seed: int = 0) -> Tensor:
 def multimodality(x: Tensor, *, pairs: int = 10, seed: int = 0) -> Tensor:
     """Mean distance of `pairs` random pairs among the repeats of each text: x [texts, repeats, Z]. Scalar
     float64.
+
+    The published draw may pair a repeat with itself. With fewer repeats than `pairs` that would be most of
+    what is drawn: then it is the mean of all pairs.
     """
-    if pairs > x.shape[1]:
-        raise UserError(
-            f"MModality draws {pairs} pairs and each text has {x.shape[1]} samples; sample more or draw fewer"
-        )
-    first, second = _two_draws(x.shape[1], pairs, seed)
+    count = x.shape[1]
+    if count < 2:
+        raise UserError("MModality needs two samples of each text at least; sample more")
+    if count < pairs:
+        first, second = torch.triu_indices(count, count, 1)
+    else:
+        first, second = _two_draws(count, pairs, seed)
     x = x.double()
     out: Tensor = torch.linalg.vector_norm(x[:, first] - x[:, second], dim=-1).mean()
     return out

@@ -255,7 +255,7 @@ def _spread(role: str, title: str, latents: Latents, protocol: Protocol, seed: i
         rows[RECORDED].pop(f"{role}.{name}", None)  # to themselves
     if len(latents.made) > 1 and len(latents.real) > 1:
         several = torch.stack(list(latents.made), dim=1)
-        value = multimodality(several, pairs=min(PAIRS, several.shape[1]), seed=seed)
+        value = multimodality(several, pairs=PAIRS, seed=seed)
         rows[MODEL][f"{role}.multimodality"] = Estimate(float(value))
     metrics = (*SPREAD_METRICS, LatentMetric(lambda row: {}, (_VARIETY,)))
     facts = {**protocol, "training_clips": len(latents.others)}
