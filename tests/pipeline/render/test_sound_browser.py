@@ -120,6 +120,17 @@ def test_frames_follow_the_sound_after_seek_pause_and_at_half_speed(
     assert_in_step(seen, 0.5)
 
 
+def test_a_pause_stands_where_the_sound_stopped(visit: Make, until: Make, dance: Path) -> None:
+    """Also where the page has drawn nothing for a while, and the sound went on."""
+    page = visit(dance)
+    turn_on(page, until)
+    until(page, "__viewer.audio.currentTime > 0.3")
+    busy = "const end = performance.now() + 500; while (performance.now() < end);"
+    page.evaluate(f"() => {{ {busy} __viewer.play(false); }}")
+    stopped = page.evaluate("[__viewer.time, __viewer.audio.currentTime]")
+    assert abs(stopped[0] - stopped[1]) < 1.5 / FPS
+
+
 def test_scrubbing_silences_and_a_new_round_starts_the_sound_again(
     visit: Make, until: Make, dance: Path
 ) -> None:

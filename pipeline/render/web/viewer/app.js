@@ -74,7 +74,8 @@ function mountViewer(root, data, options) {
   };
   const frame = () => clamp(Math.round(state.time * rate), 0, last);
   const play = (on) => {
-    if (on && state.time >= duration) state.time = 0;
+    if (!on) state.time = player.halt(state.time);
+    else if (state.time >= duration) state.time = 0;
     state.playing = on;
     if (on && pace) pace.begin(clips.length);
     bar.play.textContent = on ? "❚❚" : "▶";

@@ -37,6 +37,13 @@ function makePlayer(sounds, { laps, changed, stopped }) {
     starting = false;
     last = null;
   };
+  /* Silence at once; the viewer's time where the sound stopped, which may have gone on since the last drawing. */
+  player.halt = (time) => {
+    const { audio } = player, [lap, done] = laps(time);
+    const heard = audio && !audio.paused && !audio.seeking && !starting && time === last;
+    player.rest();
+    return heard ? lap * done + audio.currentTime : time;
+  };
 
   const begin = (place) => {
     const { audio } = player;
