@@ -58,14 +58,12 @@ def cut_of(
     Audio features [T, 438], a row for each frame of the motion, and the sound itself.
     """
     settings = config.audio_settings()
-    features, samples = piece_of_music(folder, sound, settings, config.sound_rate)
+    features, samples = piece_of_music(folder, sound, settings, config.fps, config.sound_rate)
     rows: NDArray[np.float32] | None = None
-    if features is not None and settings is not None:
-        from motionloom.datasets.audio.lineup import rows_at
-
+    if features is not None:
         first, count = round(start * config.fps), max(1, round(seconds * config.fps))
         # The last frame may lie at the very end of the music, past the last row by a rounding.
-        rows = rows_at(features, settings.fps, config.fps, first + count)[first:]
+        rows = features[np.minimum(np.arange(first, first + count), len(features) - 1)]
     if samples is None:
         return rows, None
     begin = round(start * config.sound_rate)
@@ -74,17 +72,21 @@ def cut_of(
 
 @lru_cache(maxsize=_KEPT_PIECES)
 def piece_of_music(
-    folder: Path, sound: str, settings: AudioSettings | None, rate: int
+    folder: Path, sound: str, settings: AudioSettings | None, fps: float, rate: int
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
-    """Features of a whole music file (where settings are given), and its samples at `rate` (unless 0)."""
+    """Features of a whole music file at `fps` (where settings are given), its samples at `rate` (unless 0)."""
     from motionloom.datasets.audio.features import audio_features
+    from motionloom.datasets.audio.lineup import rows_at
     from motionloom.datasets.audio.sound import read_sound, resample_sound
 
     if settings is None and not rate:
         return None, None
     label = f"{folder.name}/{sound}"
     samples, found = read_sound(inside(folder, sound, label), label)
-    features = None if settings is None else audio_features(samples, found, settings)
+    features = None
+    if settings is not None:
+        analysed = audio_features(samples, found, settings)
+        features = rows_at(analysed, settings.fps, fps, round(len(analysed) * fps / settings.fps))
     kept = resample_sound(samples, found, rate) if rate else None
     for shared in (features, kept):
         if shared is not None:
