@@ -1,10 +1,12 @@
-"""The size and shape of the code in figures: lines, rooms, the longest chain of imports, options, `Any`.
+"""The size and shape of the code in figures, each with the most that it may be.
 
-    python benchmarks/house.py                      # this checkout
-    python benchmarks/house.py --write              # and into docs/architecture.md
+    python benchmarks/house.py                  # this checkout, figure by figure
+    python benchmarks/house.py --lower          # lower the limits of docs/architecture.md to today's figures
+    python benchmarks/house.py --chain --small  # the files behind two of the figures
 
-A room is what stands at the top of `pipeline/`. A chain is a file, a file that it imports, and so on;
-imports inside functions count. `docs/architecture.md` holds this table between two markers; a test compares.
+A room is a folder at the top of `datasets/`, `models/` or `pipeline/`. A chain is a file, a file that it
+imports, and so on; imports inside functions count. The limits stand in `docs/architecture.md` between two
+markers; a test holds them. Who raises one says in the commit what it buys.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import ast
 import re
+import subprocess
 import sys
 import tomllib
 from functools import cache
@@ -19,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "architecture.md"
 SOURCE = ("datasets", "models", "pipeline", "configs")
 CODE = (".py", ".js", ".css", ".html")
 UNCOUNTED = ("__pycache__", "__init__.py", "py.typed")
@@ -31,14 +35,37 @@ def files(*folders: str, suffixes: tuple[str, ...] = (".py",)) -> list[Path]:
     return sorted(path for path in found if path.suffix in suffixes and "__pycache__" not in path.parts)
 
 
+def tracked(*patterns: str) -> list[Path]:
+    """Files that git tracks, or would, by these patterns; where there is no git, those of the folder."""
+    command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "--", *patterns]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode == 0 and listed.stdout:
+        found = {ROOT / name for name in listed.stdout.splitlines()}
+    else:
+        found = {path for pattern in patterns for path in ROOT.rglob(pattern.split("/")[-1])}
+        tops = {pattern.split("/")[0] for pattern in patterns if "/" in pattern}
+        found = {path for path in found if not tops or path.relative_to(ROOT).parts[0] in tops}
+    return sorted(path for path in found if path.is_file())
+
+
 def lines(paths: list[Path]) -> int:
     """Lines of text of all files together."""
     return sum(len(path.read_text(encoding="utf-8").splitlines()) for path in paths)
 
 
-def documents() -> list[Path]:
-    """Every page for readers: those at the top and in `docs/`."""
-    return sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+def source() -> list[Path]:
+    """The sources that the budget counts: Python and the pages' JavaScript."""
+    return tracked("pipeline/*.py", "datasets/*.py", "models/*.py", "pipeline/*.js")
+
+
+def lines_of_rooms() -> dict[str, int]:
+    """Room -> lines of its sources; what lies at the top of a folder counts as `pipeline/*`."""
+    out: dict[str, int] = {}
+    for path in source():
+        top, *rest = path.relative_to(ROOT).parts
+        room = f"{top}/{rest[0]}" if len(rest) > 1 else f"{top}/*"
+        out[room] = out.get(room, 0) + lines([path])
+    return dict(sorted(out.items()))
 
 
 def imports() -> dict[Path, set[Path]]:
@@ -111,38 +138,71 @@ def anys() -> int:
     return sum(len(re.findall(r"\bAny\b", line)) for line in text.splitlines() if "import " not in line)
 
 
-def table() -> str:
-    """All figures as Markdown."""
+def small_files() -> list[Path]:
+    """Source files under 70 lines that one other file imports: each could be a part of it."""
+    importers: dict[Path, int] = {}
+    for targets in imports().values():
+        for target in targets:
+            importers[target] = importers.get(target, 0) + 1
+    return [
+        path
+        for path, count in sorted(importers.items())
+        if count == 1 and path.name != "__init__.py" and lines([path]) < 70
+    ]
+
+
+def figures() -> dict[str, int]:
+    """Every figure by its name in the table of limits."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    entries, folder = fullest_folder()
+    words = sum(len(page.read_text(encoding="utf-8").split()) for page in tracked("*.md"))
     parameters = cli_parameters()
-    rows: dict[str, object] = {
-        "source lines (Python, JavaScript, CSS, HTML)": lines(files(*SOURCE, suffixes=CODE)),
-        "test lines": lines(files("tests")),
-        "words in documents": sum(len(page.read_text(encoding="utf-8").split()) for page in documents()),
+    return {
+        "source lines": lines(source()),
+        "test lines": lines(tracked("tests/*.py")),
+        "benchmark lines": lines(tracked("benchmarks/*.py")),
+        "words of Markdown": words,
+        "commands": len(parameters),
+        "command-line parameters": sum(parameters.values()),
         "rooms of `pipeline/`": rooms(),
-        "entries of the fullest folder": f"{entries} (`{folder}/`)",
+        "entries of the fullest folder": fullest_folder()[0],
         "files on the longest chain of imports": len(longest_chain()),
-        "commands; their parameters": f"{len(parameters)}; {sum(parameters.values())}",
+        "files under 70 lines with one importer": len(small_files()),
         "the word `Any`, imports apart": anys(),
         "required packages": len(project["dependencies"]),
-    }
-    return "\n".join(["| | |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows.items())])
+    } | {f"`{room}`": count for room, count in lines_of_rooms().items()}
+
+
+def limits() -> dict[str, int]:
+    """The most that each figure may be, from docs/architecture.md."""
+    text = PAGE.read_text(encoding="utf-8").split(MARKERS[0])[1].split(MARKERS[1])[0]
+    return {name: int(most) for name, most in re.findall(r"^\| (.+?) \| (\d+) \|$", text, re.M)}
+
+
+def lower() -> None:
+    """Write today's figures as the limits; one that would rise stays, unless it is new."""
+    before = limits()
+    rows = [f"| {name} | {min(value, before.get(name, value))} |" for name, value in figures().items()]
+    start, rest = PAGE.read_text(encoding="utf-8").split(MARKERS[0])
+    table = "\n".join(["| figure | most |", "|---|---|", *rows])
+    end = rest.split(MARKERS[1])[1]
+    PAGE.write_text(f"{start}{MARKERS[0]}\n{table}\n{MARKERS[1]}{end}", encoding="utf-8")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--write", action="store_true", help="also into docs/architecture.md")
+    parser.add_argument(
+        "--lower", action="store_true", help="today's figures become the limits where they are less"
+    )
     parser.add_argument("--chain", action="store_true", help="the files on the longest chain of imports")
+    parser.add_argument("--small", action="store_true", help="files under 70 lines with one importer")
     options = parser.parse_args()
-    if options.chain:
-        print("\n".join(str(path.relative_to(ROOT)) for path in longest_chain()))
-    print(table())
-    if options.write:
-        page = ROOT / "docs" / "architecture.md"
-        before, rest = page.read_text(encoding="utf-8").split(MARKERS[0])
-        after = rest.split(MARKERS[1])[1]
-        page.write_text(f"{before}{MARKERS[0]}\n{table()}\n{MARKERS[1]}{after}", encoding="utf-8")
+    listed = (longest_chain() if options.chain else []) + (small_files() if options.small else [])
+    print("".join(f"{path.relative_to(ROOT)}\n" for path in listed), end="")
+    if options.lower:
+        lower()
+    most = limits()
+    for name, value in figures().items():
+        print(f"{value:>7} of {most.get(name, 0):>7}  {name}")
 
 
 if __name__ == "__main__":
