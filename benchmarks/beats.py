@@ -15,7 +15,6 @@ Then what is no music, by `confidence`: silence, noise, and files that `--speech
 
 from __future__ import annotations
 
-import argparse
 import shlex
 import subprocess
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from bench import Column, Record, arguments, command_line, report
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import beats as librosa_beats
@@ -33,6 +33,15 @@ from motionloom.datasets.synth.music.tapped import RENDER_RATE, SongPoolConfig
 
 Times = NDArray[np.float64]
 
+COLUMNS = (
+    Column("ours", "ours", 2),
+    Column("ours, any octave", "ours, any octave", 2),
+    Column("ours, ms late", "ours, late", 0),
+    Column("our downbeats", "our downbeats", 2),
+    Column("librosa's", "librosa's", 2),
+    Column("librosa's, any octave", "librosa's, any octave", 2),
+    Column("librosa's, ms late", "librosa's, late", 0),
+)
 NEAR = 0.07
 RUN = 4
 SECONDS = 90.0
@@ -95,62 +104,39 @@ def agreed_f(runs: list[Times], found: Times, *, any_tempo: bool) -> float:
     return 2 * count / max(1, sum(len(truth) + len(found) for truth, found in pairs))
 
 
-def rendered(count: int) -> None:
-    """Against true beats."""
+def rendered(count: int) -> Record:
+    """F against true beats, averaged over songs."""
     pool = SongPoolConfig(songs=max(2, count), seed=SEED)
-    rows, downbeats, late = [], [], []
+    found: dict[str, list[float]] = {column.figure: [] for column in COLUMNS}
     for number in range(count):
         song = pool.song(number)
         sound = Sound(render_song(song, RENDER_RATE), RENDER_RATE)
         truth = np.array(song.beats_within(0, song.seconds))
         ours, theirs = track(sound), librosa_beats(sound.samples, sound.rate)
-        rows.append(
-            [
-                max(f_measure(one, found) for one in which(truth))
-                for found in (ours.times, theirs)
-                for which in (lambda beats: [beats], tempi)
-            ]
-        )
-        late.append([lateness(truth, found) for found in (ours.times, theirs)])
+        for name, times in (("ours", ours.times), ("librosa's", theirs)):
+            found[name].append(f_measure(truth, times))
+            found[f"{name}, any octave"].append(max(f_measure(one, times) for one in tempi(truth)))
+            found[f"{name}, late"].append(1000 * lateness(truth, times))
+        # Bars begin at every beat whose number is a multiple of the meter.
         bars = truth[(song.beat_number(0.0) + np.arange(len(truth))) % song.meter == 0]
-        downbeats.append(f_measure(bars, ours.times[ours.bar_places == 0]))
-    mean, behind = np.mean(rows, axis=0), 1000 * np.nanmedian(late, axis=0)
-    print(
-        f"{count} rendered songs, F: ours {mean[0]:.3f} (any {mean[1]:.3f}), librosa {mean[2]:.3f} "
-        f"(any {mean[3]:.3f}); our downbeats {np.mean(downbeats):.3f}; late by "
-        f"{behind[0]:.0f} and {behind[1]:.0f} ms"
-    )
+        found["our downbeats"].append(f_measure(bars, ours.times[ours.bar_places == 0]))
+    cells = {name: [float(np.nanmean(values))] for name, values in found.items() if values}
+    return {"title": f"{count} rendered songs", "cells": cells}
 
 
-def real(paths: list[Path], references: list[str]) -> None:
-    """Against agreed beats."""
-    rows = []
-    print("| song | confidence | bpm | librosa's | true beats | F (any), late | librosa's |")
-    print("|---|---|---|---|---|---|---|")
-    for path in paths:
-        sound = Sound.read(path)
-        sound = sound.slice(0, min(SECONDS, sound.seconds))
-        ours, theirs = track(sound), librosa_beats(sound.samples, sound.rate)
-        runs = _true_runs(path, references, sound.seconds)
-        row = [
-            agreed_f(runs, found, any_tempo=which)
-            for found in (ours.times, theirs)
-            for which in (False, True)
-        ]
-        beats, whole = sum(map(len, runs)), np.concatenate([*runs, np.empty(0)])
-        late = [f"{1000 * lateness(whole, found):.0f} ms" for found in (ours.times, theirs)]
-        if beats:
-            rows.append(row)
-        print(
-            f"| {path.stem} | {ours.confidence:.2f} | {_bpm(ours.times):.0f} | {_bpm(theirs):.0f} "
-            f"| {beats} | {row[0]:.2f} ({row[1]:.2f}), {late[0]} | {row[2]:.2f} ({row[3]:.2f}), {late[1]} |",
-            flush=True,
-        )
-    mean = np.mean(rows, axis=0)
-    print(
-        f"{len(rows)} real songs, F: ours {mean[0]:.3f} (any {mean[1]:.3f}), librosa {mean[2]:.3f} "
-        f"(any {mean[3]:.3f})"
-    )
+def real(path: Path, references: list[str]) -> Record:
+    """F against the beats that a file or two trackers agree on."""
+    sound = Sound.read(path)
+    sound = sound.slice(0, min(SECONDS, sound.seconds))
+    ours, theirs = track(sound), librosa_beats(sound.samples, sound.rate)
+    runs = _true_runs(path, references, sound.seconds)
+    whole, cells = np.concatenate([*runs, np.empty(0)]), dict[str, list[float]]()
+    for name, times in (("ours", ours.times), ("librosa's", theirs)) if len(whole) else ():
+        cells[name] = [agreed_f(runs, times, any_tempo=False)]
+        cells[f"{name}, any octave"] = [agreed_f(runs, times, any_tempo=True)]
+        cells[f"{name}, late"] = [1000 * lateness(whole, times)]
+    facts = {"confidence": f"{ours.confidence:.2f}", "bpm": f"{_bpm(ours.times):.0f}", "beats": len(whole)}
+    return {"title": path.stem, "cells": cells, "protocol": facts}
 
 
 def _true_runs(path: Path, references: list[str], seconds: float) -> list[Times]:
@@ -165,13 +151,16 @@ def _true_runs(path: Path, references: list[str], seconds: float) -> list[Times]
     return max((agreed_runs(*two) for two in combinations(known, 2)), key=lambda runs: sum(map(len, runs)))
 
 
-def no_music(speech: list[Path]) -> None:
+def no_music(speech: list[Path]) -> list[Record]:
     """Confidence in what has no beat."""
     rng = np.random.default_rng(0)
     noise = np.clip(0.2 * rng.standard_normal(20 * RENDER_RATE), -1, 1).astype(np.float32)
     sounds = {"silence": Sound(np.zeros_like(noise), RENDER_RATE), "noise": Sound(noise, RENDER_RATE)}
-    for name, sound in {**sounds, **{path.stem: Sound.read(path) for path in speech}}.items():
-        print(f"{name}: confidence {track(sound).confidence:.2f}")
+    sounds |= {path.stem: Sound.read(path) for path in speech}
+    return [
+        {"title": name, "cells": {}, "protocol": {"confidence": f"{track(sound).confidence:.2f}"}}
+        for name, sound in sounds.items()
+    ]
 
 
 def _printed(command: str, path: Path, seconds: float) -> Times:
@@ -185,19 +174,15 @@ def _bpm(times: Times) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("songs", nargs="*", type=Path)
     parser.add_argument("--rendered", type=int, default=0, help="how many songs to render")
     parser.add_argument("--reference", action="append", default=[], help="a command that prints beats")
     parser.add_argument("--speech", action="append", default=[], type=Path)
-    given = parser.parse_args()
-    if given.rendered:
-        rendered(given.rendered)
-    if given.songs:
-        real(given.songs, given.reference)
-    no_music(given.speech)
+    args = arguments(parser)
+    rows = [rendered(args.rendered)] if args.rendered else []
+    rows += [real(path, args.reference) for path in args.songs]
+    report("F of beats within 70 ms", COLUMNS, rows + no_music(args.speech), args.record)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """How well clips are edited: gaps filled, paths and pins met, beside what needs no model.
 
-    python benchmarks/edit.py inbetween --write
-    python benchmarks/edit.py inbetween --real clips/*.bvh --name edit_real
+    python benchmarks/edit.py inbetween --record edit --card
+    python benchmarks/edit.py inbetween --real clips/*.bvh --record edit_real --card
 
 Test clips are made here, from the data settings of the recipe, or are BVH files. Of each the middle 40 % is
 taken away and made again: by the model, along straight lines, along splines through all that is kept, and as
@@ -10,21 +10,20 @@ same gap with the left wrist pinned in its middle, and goes a bent path with not
 several strengths and without the last exact step, so that its price shows. And all after the gap's begin does
 what the words of another test clip say, by the rules that judge synthetic clips; beside the clip as it was.
 
-Seeds are those of the drawing; of the training there is one. `--write` makes the record and,
-from the records, the card of a shipped model.
+Seeds are those of the drawing; of the training there is one. `--card` writes the card of a shipped model.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from bench import Column, arguments, command_line, report, table_of
 from model_card import digests, test_clips, truth_from
 from numpy.typing import NDArray
-from results import RECORDS, read_records, table_of, write
+from results import read_records
 from rich.console import Console
 
 from motionloom.datasets.motion.body.landing import eased, landed
@@ -56,16 +55,16 @@ SEEDS = (0, 1, 2)
 STRENGTHS = (0.0, 1.0, 5.0)
 OTHER_WORDS = "other words from the gap on"
 CARD = Path(__file__).with_name("edit_card.md")
-COLUMNS = [
-    {"title": "from the recording, cm", "figure": "away", "digits": 1, "scale": 1.0},
-    {"title": "acceleration at the seams, m/s²", "figure": "seams", "digits": 1, "scale": 1.0},
-    {"title": "acceleration inside, m/s²", "figure": "inside", "digits": 1, "scale": 1.0},
-    {"title": "feet slide, % of steps", "figure": "skating", "digits": 0, "scale": 100.0},
-    {"title": "pin missed by, cm", "figure": "pin", "digits": 1, "scale": 1.0},
-    {"title": "path missed by, cm", "figure": "path", "digits": 1, "scale": 1.0},
-    {"title": "other action done, %", "figure": "action", "digits": 0, "scale": 100.0},
-    {"title": "of what the words ask, %", "figure": "words", "digits": 0, "scale": 100.0},
-]
+COLUMNS = (
+    Column("from the recording, cm", "away"),
+    Column("acceleration at the seams, m/s²", "seams"),
+    Column("acceleration inside, m/s²", "inside"),
+    Column("feet slide, % of steps", "skating", 0, 100),
+    Column("pin missed by, cm", "pin"),
+    Column("path missed by, cm", "path"),
+    Column("other action done, %", "action", 0, 100),
+    Column("of what the words ask, %", "words", 0, 100),
+)
 Joints = NDArray[np.float64]
 
 
@@ -208,7 +207,7 @@ def rows_of(
         console.print(f"{number} of {len(clips)}", highlight=False)
     rows: list[dict[str, object]] = []
     for title, runs in found.items():
-        names = [str(column["figure"]) for column in COLUMNS if column["figure"] in runs[SEEDS[0]][0]]
+        names = [column.figure for column in COLUMNS if column.figure in runs[SEEDS[0]][0]]
         cells = {
             name: [float(np.mean([one[name] for one in run])) for run in runs.values()] for name in names
         }
@@ -248,15 +247,12 @@ def write_card(model: Path, title: str, description: str, config: SynthConfig) -
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("model", type=Path, help="an exported folder, or the name of a model of the package")
     parser.add_argument("--real", nargs="+", type=Path, help="BVH files, in place of synthetic test clips")
     parser.add_argument("--clips", type=int, default=10, help="synthetic test clips")
-    parser.add_argument("--name", default="edit", help="of the record")
-    parser.add_argument("--write", action="store_true", help="write the record, and the model's card")
-    args = parser.parse_args()
+    parser.add_argument("--card", action="store_true", help="write the model's card from its records")
+    args = arguments(parser)
     model, console = MotionModel(args.model, "cpu"), Console()
     recipe = load_recipe(RECIPE)
     wanted = len(args.real) if args.real else args.clips
@@ -270,13 +266,9 @@ def main() -> None:
         raise UserError("no clips to edit")
     rows = rows_of(model, clips, words, training_of(config, TRAINING), console)
     kind = "recorded clips" if args.real else "synthetic test clips"
-    if args.write:
-        write(args.name, f"Gaps in {kind}, filled; {recipe.name}", COLUMNS, rows)
-        folder = model_folder(args.model)
-        write_card(folder, args.model.name, recipe.description, config)
-        console.print(str(RECORDS / f"{args.name}.json"), soft_wrap=True)
-    for row in rows:
-        console.print(row)
+    report(f"Gaps in {kind}, filled; {recipe.name}", COLUMNS, rows, args.record)
+    if args.card:
+        write_card(model_folder(args.model), args.model.name, recipe.description, config)
 
 
 if __name__ == "__main__":

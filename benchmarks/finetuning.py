@@ -17,25 +17,22 @@ recorded clip by its latents; and by geometry whether the motion does what the c
 (caption_check.py). LABELS is a JSON lines file with `id`, `content` and `style` of the clips. Beside them:
 recorded motion, another clip's, and what `--start` makes before it is trained.
 
-Killed and started again it goes on where it was; `--show` prints what there is.
+Killed and started again it goes on where it was.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch.nn.functional as F
-import yaml
+from bench import Column, arguments, command_line, kept, process_seconds, report, train
 from caption_check import BY_CONTENT
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 from wordings import Label, read_labels
 
@@ -49,11 +46,10 @@ from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.latent_metrics import LatentRow, recalls
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.networks import embed_motions
 from motionloom.pipeline.store.training_log import read_training_log
+from motionloom.pipeline.store.yaml import dump_yaml
 
 Joints = NDArray[np.float64]
 
@@ -66,7 +62,13 @@ ARMS: dict[str, dict[str, tuple[float, float]]] = {
 """Arm -> training -> its share of the time, and its learning rate."""
 BATCH = {"tokenizer": 32, "tma": 32, "gpt": 16}
 SIZE = 32
-SHOWN = ("t2m_r1", "t2m_r3", "m2t_r1", "content", "style", "obeys")
+COLUMNS = (
+    *(
+        Column(figure, figure, 1, 100)
+        for figure in ("t2m_r1", "t2m_r3", "m2t_r1", "content", "style", "obeys")
+    ),
+    *(Column(figure, figure) for figure in ("pose_mm", "world_mm", "seconds")),
+)
 PROBE = (10, 40)
 """Steps of the two trainings whose difference says what a step costs."""
 
@@ -125,21 +127,11 @@ class Clips:
         return {"pose_mm": 1000 * float(np.mean(pose)), "world_mm": 1000 * float(np.mean(world))}
 
 
-def write(folder: Path, recipe: dict[str, Any]) -> Path:
-    path = folder.parent / f"{folder.name}.yaml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(yaml.safe_dump(recipe, sort_keys=False))
-    return path
-
-
-def base(args: argparse.Namespace, console: Console) -> Path:
+def base(args: argparse.Namespace) -> Path:
     """A run with the clips and their captions, which all arms read."""
-    folder = args.work / "base"
     data = {"kind": "shards", "path": str(args.data.resolve()), "verify": False}
     stages = {"data": data, "stats": {"kind": "stats"}, "text": {"kind": "text"}}
-    recipe = {"name": "finetuning-base", "seed": 1, "hardware": {"threads": 1}, "stages": stages}
-    run_recipe(write(folder, recipe), folder, console=console)
-    return folder
+    return train(args.work / "base", stages, seed=1)
 
 
 def arm_recipe(
@@ -149,10 +141,11 @@ def arm_recipe(
     read = {"data": str(args.work.resolve() / "base/stages/data")}
     text = {"text": str(args.work.resolve() / "base/stages/text")}
     stages: dict[str, Any] = {name: {} for name in STAGES} | {"tokens": {"kind": "tokens"}}
-    recipe = {"name": f"finetuning-{arm}", "seed": seed, "hardware": {"threads": 1}, "stages": stages}
+    recipe: dict[str, Any] = {"seed": seed, "stages": stages}
     recipe["start"] = str(args.start.resolve()) if args.start.is_dir() else str(args.start)
     if arm == "scratch":  # the sizes of the model, none of its weights
-        path = write(args.work / "sizes", {**recipe, "stages": stages_of(stages, read, text)})
+        path = args.work / "sizes.yaml"
+        path.write_text(dump_yaml({"name": "sizes", **recipe, "stages": stages_of(stages, read, text)}))
         sizes = load_recipe(path)
         for name in STAGES:
             stage = sizes.stage(name)
@@ -183,47 +176,35 @@ def stages_of(stages: dict[str, Any], data: dict[str, str], text: dict[str, str]
     }
 
 
-def train(recipe: dict[str, Any], folder: Path, console: Console) -> dict[str, float]:
+def train_arm(recipe: dict[str, Any], folder: Path) -> dict[str, float]:
     """Run an arm, stage by stage; processor seconds of its trainings, those of an earlier, killed run too."""
-    path, log = write(folder, recipe), folder.parent / f"{folder.name}.seconds.json"
+    log = folder.parent / f"{folder.name}.seconds.json"
     taken: dict[str, float] = json.loads(log.read_text()) if log.is_file() else {}
     for name in ("tokenizer", "tma", "tokens", "gpt"):
-        begin = time.process_time()
-        run_recipe(path, folder, select=Selection(until=name), replace=True, console=console)
+        begin = process_seconds()
+        train(folder, until=name, **recipe)
         if name in STAGES:
-            seconds = time.process_time() - begin
+            seconds = process_seconds() - begin
             if name not in taken or seconds > 20:  # planning alone takes a second or two
                 taken[name] = taken.get(name, 0.0) + seconds
             log.write_text(json.dumps(taken))
     return taken
 
 
-def costs(args: argparse.Namespace, console: Console) -> dict[str, float]:
+def costs(args: argparse.Namespace) -> dict[str, float]:
     """Processor seconds of a step of each training; "lora" of a GPT's adapters."""
-    kept = args.work / "costs.json"
-    out: dict[str, float] = json.loads(kept.read_text()) if kept.is_file() else {}
-    for arm, names in (("whole", STAGES), ("lora", ("gpt",))):
-        for name in names:
-            key = "lora" if arm == "lora" else name
-            if key in out:
-                continue
-            spent = []
-            for steps in PROBE:
-                recipe = arm_recipe(args, arm, 0, dict.fromkeys(STAGES, PROBE[0]) | {name: steps}, 1.0)
-                folder = args.work / "probe"
-                path = write(folder, recipe)
-                above = {"tokenizer": None, "tma": None, "gpt": "tokens"}[name]
-                if above is not None:
-                    run_recipe(
-                        path, folder, select=Selection(until="tma,tokens"), replace=True, console=console
-                    )
-                begin = time.process_time()
-                select = Selection(only=name, force=True)
-                run_recipe(path, folder, select=select, replace=True, console=console)
-                spent.append(time.process_time() - begin)
-            out[key] = (spent[1] - spent[0]) / (PROBE[1] - PROBE[0])
-            kept.write_text(json.dumps(out, indent=1))
-    console.print("processor seconds a step:", {k: round(v, 4) for k, v in out.items()})
+    out: dict[str, float] = {}
+    for arm, name in (*(("whole", name) for name in STAGES), ("lora", "gpt")):
+        spent = []
+        for steps in PROBE:
+            folder = args.work / "probe"
+            recipe = arm_recipe(args, arm, 0, dict.fromkeys(STAGES, PROBE[0]) | {name: steps}, 1.0)
+            if name == "gpt":
+                train(folder, until="tma,tokens", **recipe)
+            begin = process_seconds()
+            train(folder, until=name, force=True, **recipe)
+            spent.append(process_seconds() - begin)
+        out["lora" if arm == "lora" else name] = (spent[1] - spent[0]) / (PROBE[1] - PROBE[0])
     return out
 
 
@@ -236,19 +217,18 @@ def steps_of(args: argparse.Namespace, arm: str, cost: Mapping[str, float]) -> d
     return out
 
 
-def best_rate(args: argparse.Namespace, arm: str, steps: Mapping[str, int], console: Console) -> float:
+def best_rate(args: argparse.Namespace, arm: str, steps: Mapping[str, int]) -> float:
     """The rate whose GPT predicts held-out clips best, with the search's seed."""
-    kept = args.work / "search.json"
-    found: dict[str, dict[str, float]] = json.loads(kept.read_text()) if kept.is_file() else {}
-    rows = found.setdefault(arm, {})
-    folder = args.work / "search" / arm
-    for rate in args.rates:
-        if str(rate) not in rows:
-            train(arm_recipe(args, arm, args.search_seed, steps, rate), folder, console)
-            losses = [row["val/ce"] for row in read_training_log(folder / "stages/gpt") if "val/ce" in row]
-            rows[str(rate)] = losses[-1]
-            kept.write_text(json.dumps(found, indent=1))
-    return float(min(rows, key=lambda rate: rows[rate]))
+    if len(args.rates) == 1:
+        return float(args.rates[0])
+
+    def loss(rate: float) -> float:
+        folder = args.work / "search" / arm
+        train_arm(arm_recipe(args, arm, args.search_seed, steps, rate), folder)
+        return [row["val/ce"] for row in read_training_log(folder / "stages/gpt") if "val/ce" in row][-1]
+
+    files = {rate: args.work / f"search-{arm}-{rate:g}.json" for rate in args.rates}
+    return min(files, key=lambda rate: kept(files[rate], lambda: loss(rate)))
 
 
 def figures_of(bundle: Bundle, clips: Clips, seed: int, args: argparse.Namespace) -> dict[str, float]:
@@ -259,35 +239,8 @@ def figures_of(bundle: Bundle, clips: Clips, seed: int, args: argparse.Namespace
     return clips.figures([m.joints for m in made]) | clips.reconstruction(tokenizer)
 
 
-def show(found: Mapping[str, Any], console: Console) -> None:
-    """One row for each arm: mean and deviation over the seeds."""
-    columns = [*SHOWN, "pose_mm", "world_mm", "seconds"]
-    table = Table("arm", *columns, title="test clips; mean ± deviation over seeds", title_justify="left")
-
-    def cell(rows: Sequence[Mapping[str, float]], name: str) -> str:
-        values = np.array([row[name] for row in rows if name in row]) * (100.0 if name in SHOWN else 1.0)
-        if not len(values):
-            return ""
-        more = f" ± {values.std(ddof=1):.1f}" if len(values) > 1 else ""
-        return f"{values.mean():.1f}{more}"
-
-    for arm, rows in found.items():
-        table.add_row(arm, *(cell(list(rows.values()), name) for name in columns))
-    console.print(table)
-    scratch = found.get("scratch", {})
-    for arm in ("whole", "lora"):
-        both = [seed for seed in found.get(arm, {}) if seed in scratch]
-        for name in ("t2m_r1", "obeys"):
-            gains = [100 * (found[arm][seed][name] - scratch[seed][name]) for seed in both]
-            if gains:
-                said = ", ".join(f"{gain:+.1f}" for gain in gains)
-                console.print(f"{arm} - scratch, {name}: {said} points")
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("labels", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--data", type=Path, help="shards of the clips, in the layout of the model")
@@ -302,43 +255,45 @@ def main() -> None:
     parser.add_argument("--tested", type=int, default=0, help="test clips to generate for; 0 for all")
     parser.add_argument("--top-p", type=float, default=0.95)
     parser.add_argument("--cfg-scale", type=float, default=1.0)
-    parser.add_argument("--show", action="store_true", help="only print what there is")
-    args = parser.parse_args()
-    console, kept = Console(width=160), args.work / "figures.json"
-    found: dict[str, dict[str, dict[str, float]]] = json.loads(kept.read_text()) if kept.is_file() else {}
-    if args.show:
-        show(found, console)
-        return
-    data = StageCache().get(finished_stages(base(args, console))["data"])
+    args = arguments(parser)
+    data = StageCache().get(finished_stages(base(args))["data"])
     clips = Clips(args, data, read_labels(args.labels))
+    recorded = [truth.joints for truth in clips.truths]
+    found: dict[str, list[dict[str, float]]] = {}
 
-    def keep(arm: str, seed: int, row: dict[str, float]) -> None:
-        found.setdefault(arm, {})[str(seed)] = row
-        kept.write_text(json.dumps(found, indent=1))
+    def measure(row: str, seed: int, figures: Callable[[], dict[str, float]]) -> None:
+        found.setdefault(row, []).append(kept(args.work / f"figures-{row}-{seed}.json", figures))
 
-    if "recorded" not in found:
-        keep("recorded", 0, clips.figures([t.joints for t in clips.truths], skip_own=True))
-        for seed in args.seeds:
-            other = np.random.default_rng(seed).permutation(len(clips.truths))
-            keep("another clip's", seed, clips.figures([clips.truths[i].joints for i in other]))
-    untrained = "as it came" not in found and args.arms != ["scratch"]  # which takes the model's sizes alone
-    for seed in args.seeds if untrained else ():
-        keep("as it came", seed, figures_of(Bundle.open(args.start), clips, seed, args))
-    cost = costs(args, console)
-    for arm in args.arms:
-        steps = steps_of(args, arm, cost)
-        rate = best_rate(args, arm, steps, console) if len(args.rates) > 1 else args.rates[0]
-        console.print(arm, steps, f"GPT's rate x {rate:g}")
+    def other(seed: int) -> dict[str, float]:
+        order = np.random.default_rng(seed).permutation(len(recorded))
+        return clips.figures([recorded[i] for i in order])
+
+    def arm_figures(arm: str, seed: int) -> dict[str, float]:
+        recipe, folder = arm_recipe(args, arm, seed, steps[arm], rates[arm]), args.work / f"{arm}-{seed}"
+        seconds = sum(train_arm(recipe, folder).values())
+        return figures_of(Bundle.open(folder), clips, seed, args) | {"seconds": seconds}
+
+    measure("recorded", 0, lambda: clips.figures(recorded, skip_own=True))
+    for seed in args.seeds:
+        measure("another clip's", seed, lambda seed=seed: other(seed))
+        if args.arms != ["scratch"]:  # which takes the model's sizes alone
+            measure("as it came", seed, lambda s=seed: figures_of(Bundle.open(args.start), clips, s, args))
+    cost = kept(args.work / "costs.json", lambda: costs(args))
+    steps = {arm: steps_of(args, arm, cost) for arm in args.arms}
+    rates = {arm: best_rate(args, arm, steps[arm]) for arm in args.arms}
     for seed in args.seeds:
         for arm in args.arms:
-            if str(seed) in found.get(arm, {}):
-                continue
-            steps, folder = steps_of(args, arm, cost), args.work / f"{arm}-{seed}"
-            rate = best_rate(args, arm, steps, console) if len(args.rates) > 1 else args.rates[0]
-            taken = train(arm_recipe(args, arm, seed, steps, rate), folder, console)
-            row = figures_of(Bundle.open(folder), clips, seed, args)
-            keep(arm, seed, row | {"seconds": sum(taken.values())})
-        show(found, console)
+            measure(arm, seed, lambda arm=arm, seed=seed: arm_figures(arm, seed))
+    figures = [column.figure for column in COLUMNS]
+    rows = [
+        {
+            "title": f"{arm}, GPT's rate × {rates[arm]:g}" if arm in rates else arm,
+            "cells": {f: [one[f] for one in each] for f in figures if f in each[0]},
+            "seeds": args.seeds,
+        }
+        for arm, each in found.items()
+    ]
+    report(f"Fine-tuning, {args.seconds:g} s", COLUMNS, rows, args.record)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 
 About ten minutes on one GPU. It runs one recipe in WORK: synthetic whole-body clips of full length, then
 H2VQ, TMA and the Hierarchical-GPT at the sizes of `humantomato-paper`, each some hundred steps in several
-arithmetics, with the text prior and the alignment loss that training has. Printed, and written to gpu.md:
+arithmetics, with the text prior and the alignment loss that training has. Told, and recorded by `--record`:
 
 - samples a second and the time of a step: medians of the training's own log (`flight/`), its first third left
   out;
@@ -21,7 +21,6 @@ Where WORK has finished stages it goes on behind them, so a second call only pri
 
 from __future__ import annotations
 
-import argparse
 import gzip
 import json
 import statistics
@@ -34,6 +33,7 @@ from typing import Any
 
 import torch
 import yaml
+from bench import Column, Record, arguments, command_line, report
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -138,7 +138,7 @@ def peak(device: torch.device, precision: str, given: float | None) -> float | N
 
 def trainings(
     run: Path, stages: Mapping[str, Finished], device: torch.device, tflops: float | None
-) -> Iterator[list[str]]:
+) -> Iterator[Record]:
     """Rows of the table of trainings."""
     cards = estimate(load_recipe(run / "recipe.yaml", strict=False))
     for name, stage in stages.items():
@@ -156,22 +156,22 @@ def trainings(
         share = kernel_share(stage.folder)
         most = max((row.get("cuda_peak_mib", 0.0) for row in rows), default=0.0) / 1024
         said = cards[name].memory_bytes / 2**30
-        yield [
-            name.split("-")[0],
-            config.precision + (", compiled" if config.compile else ""),
-            str(config.batch_size),
-            f"{middle['samples_per_second']:,.0f}",
-            f"{1000 * middle['step_seconds']:.1f}",
-            f"{work / 1e12:.3g}",
-            used,
-            "" if share is None else f"{share:.0%}",
-            ", ".join(f"{key} {value:.1%}" for key, value in waited.items()),
-            f"{most:.3g}" if most else "",
-            f"{said:.3g}" + (f" ({said / most - 1:+.0%})" if most else ""),
-        ]
+        cells = {
+            "arithmetic": config.precision + (", compiled" if config.compile else ""),
+            "batch": str(config.batch_size),
+            "samples/s": f"{middle['samples_per_second']:,.0f}",
+            "ms a step": f"{1000 * middle['step_seconds']:.1f}",
+            "TFLOP a step": f"{work / 1e12:.3g}",
+            "of the peak": used,
+            "kernels run": "" if share is None else f"{share:.0%}",
+            "waited for": ", ".join(f"{key} {value:.1%}" for key, value in waited.items()),
+            "peak GiB": f"{most:.3g}" if most else "",
+            "dry run said": f"{said:.3g}" + (f" ({said / most - 1:+.0%})" if most else ""),
+        }
+        yield {"title": name.split("-")[0], "cells": cells}
 
 
-def sampling(run: Path, device: torch.device, batches: list[int]) -> Iterator[list[str]]:
+def sampling(run: Path, device: torch.device, batches: list[int]) -> Iterator[Record]:
     """Rows of the table of sampling."""
     bundle = Bundle.open(run, device)
     seconds = min(FRAMES / bundle.layout.fps, bundle.max_seconds)
@@ -183,7 +183,12 @@ def sampling(run: Path, device: torch.device, batches: list[int]) -> Iterator[li
                 captions, seconds=seconds, seed=attempt, sampling=SamplingConfig(), batch=batch
             )
             took = time.perf_counter() - begin
-        yield [str(batch), str(len(made[0].joints)), f"{took:.2f}", f"{60 * batch / took:,.0f}"]
+        cells = {
+            "frames": str(len(made[0].joints)),
+            "seconds": f"{took:.2f}",
+            "motions a minute": f"{60 * batch / took:,.0f}",
+        }
+        yield {"title": f"{batch} at once", "cells": cells}
 
 
 def run_all(stages: Mapping[str, Any], where: list[str]) -> list[str]:
@@ -195,15 +200,8 @@ def run_all(stages: Mapping[str, Any], where: list[str]) -> list[str]:
     return [name for name in compiled if subprocess.run([*run, name]).returncode]
 
 
-def table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("work", type=Path)
     parser.add_argument("--size", choices=("paper", "small", "tiny"), default="paper")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
@@ -213,7 +211,7 @@ def main() -> None:
     parser.add_argument(
         "--batches", type=int, nargs="+", default=[1, 32, 256], help="motions sampled at once"
     )
-    args = parser.parse_args()
+    args = arguments(parser)
     device = choose_device(args.device)
     args.work.mkdir(parents=True, exist_ok=True)
     path, run = args.work / "gpu.yaml", args.work / "run"
@@ -222,18 +220,16 @@ def main() -> None:
     failed = run_all(content["stages"], [str(path), "-o", str(run)])
     stages = finished_stages(run)
     named = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
-    head = [
-        "training", "arithmetic", "batch", "samples/s", "ms a step", "TFLOP a step", "of the peak",
-        "kernels run", "waited for", "peak GiB", "dry run said",
-    ]  # fmt: skip
-    text = "\n\n".join((
-        f"{named}, torch {torch.__version__}, `humantomato-{args.size}`, {args.steps} steps each.",
-        table(head, list(trainings(run, stages, device, args.peak_tflops))),
-        table(["at once", "frames", "seconds", "motions a minute"], [*sampling(run, device, args.batches)]),
-        *([f"Ended with an error: {', '.join(failed)}."] if failed else []),
-    ))  # fmt: skip
-    print(text)
-    (args.work / "gpu.md").write_text(text + "\n")
+    where = f"{named}, torch {torch.__version__}, `humantomato-{args.size}`, {args.steps} steps each"
+    tables = {
+        "trainings": list(trainings(run, stages, device, args.peak_tflops)),
+        "sampling": list(sampling(run, device, args.batches)),
+    }
+    for name, rows in tables.items():
+        columns = [Column(title, title) for title in rows[0]["cells"]]
+        report(f"{name}: {where}", columns, rows, args.record and f"{args.record}_{name}")
+    if failed:
+        raise SystemExit(f"ended with an error: {', '.join(failed)}")
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from learning import Shares, judge
+from bench import Shares, judge
 from results import read_records, table_of
 from rich.console import Console
 from rich.table import Table

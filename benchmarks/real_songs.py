@@ -1,7 +1,7 @@
 """Is a real song followed? Dances on their own songs, on the same beats shifted, and on each other's songs.
 
     python benchmarks/real_songs.py MODEL song.ogg another.mp3 third.wav
-    python benchmarks/real_songs.py MODEL songs... --train SHARDS --record benchmarks/records/real_songs.json
+    python benchmarks/real_songs.py MODEL songs... --train SHARDS --record real_songs
 
 Stretches of every song are danced to, from several seeds. The beats are those of a file beside the song
 (`song.beats`, a line of seconds each) or librosa's of the whole song, whatever the model itself hears, and no
@@ -24,23 +24,19 @@ repeated, a random training dance, and standing still.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from bench import Column, arguments, command_line, report
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 from scipy.stats import spearmanr
 
 from motionloom.datasets.audio.features import beats as librosa_beats
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.audio.tracker import track
-from motionloom.datasets.base.files import write_json
 from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.shards.clips import ClipDataset
@@ -49,7 +45,6 @@ from motionloom.models.metrics.dance import foot_skating
 from motionloom.models.metrics.dance_beats import alignment, motion_beats
 from motionloom.models.metrics.dance_features import kinetic_features, zero_start
 from motionloom.pipeline.evaluation.dances import dance_at, with_music
-from motionloom.pipeline.evaluation.estimate import estimate
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import read_music
 
@@ -215,9 +210,7 @@ def figures(
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("model", help="a run, an export, or a model of the package")
     parser.add_argument("songs", type=Path, nargs="+")
     parser.add_argument("--train", type=Path, required=True, help="shards of dances that it was trained on")
@@ -225,8 +218,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--late", type=float, default=LATE, help="seconds that librosa's beats are late")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--record", type=Path, help="a JSON file for docs/results.md")
-    args = parser.parse_args()
+    args = arguments(parser)
     model = MotionModel.from_pretrained(args.model)
     training = Training(ShardDataset.open(args.train, "train"))
     parts = [part for song in args.songs for part in stretches(song, args.stretches, args.seconds, args.late)]
@@ -245,39 +237,19 @@ def main() -> None:
         "random training dance": rival(training.random),
         "standing": rival(training.standing),
     }
-    found: dict[str, dict[str, list[float]]] = {}
+    protocol = {
+        "songs": len(args.songs),
+        "stretches": len(parts),
+        "seconds each": args.seconds,
+        "late": args.late,
+    }
+    found = []
     for name, make in rows.items():
         each = [figures(parts, make(seed), training.fps, training, seed) for seed in range(args.seeds)]
-        found[name] = {figure: [one[figure] for one in each] for figure in each[0]}
-    columns = list(next(iter(found.values())))
-    table = Table(
-        "", *columns, title=f"{len(parts)} stretches of {len(args.songs)} songs, {args.seeds} seeds"
-    )
-    for name, values in found.items():
-        cells = [
-            f"{e.value:.3f} ± {e.interval:.3f}" if (e := estimate(values[c])).interval else f"{e.value:.3f}"
-            for c in columns
-        ]
-        table.add_row(name, *cells)
-    Console(width=220).print(table)
-    if args.record is not None:
-        protocol = {
-            "songs": len(args.songs),
-            "stretches": len(parts),
-            "seconds each": args.seconds,
-            "late": args.late,
-        }
-        record = {
-            "title": "Dances to real songs",
-            "measured": f"{datetime.now(UTC):%Y-%m-%d}",
-            "command": f"python benchmarks/real_songs.py {args.model} SONGS --train SHARDS",
-            "columns": [{"title": c, "figure": c, "digits": 2, "scale": 1.0} for c in columns],
-            "rows": [
-                {"title": name, "cells": values, "seeds": list(range(args.seeds)), "protocol": protocol}
-                for name, values in found.items()
-            ],
-        }
-        write_json(args.record, record)
+        cells = {figure: [one[figure] for one in each] for figure in each[0]}
+        found.append({"title": name, "cells": cells, "seeds": list(range(args.seeds)), "protocol": protocol})
+    columns = [Column(figure, figure, 2) for figure in found[0]["cells"]]
+    report("Dances to real songs", columns, found, args.record)
 
 
 if __name__ == "__main__":

@@ -14,15 +14,10 @@ it goes on where it was.
 from __future__ import annotations
 
 import argparse
-import json
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-import matplotlib
-import numpy as np
-import yaml
-from rich.console import Console
-from rich.table import Table
+from bench import Column, arguments, command_line, kept, report, train
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
@@ -30,9 +25,6 @@ from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.reconstruction import reconstruction_errors
 from motionloom.pipeline.evaluation.truth import truth_of
-from motionloom.pipeline.runs.api import run_recipe
-
-matplotlib.use("Agg")
 
 CODES = {"num_codes": 512, "decay": 0.9, "reset_below": 0.05}
 NETS: dict[str, tuple[str, dict]] = {
@@ -55,88 +47,46 @@ COMMON = {
     "finger_gain": 4.0,
 }
 PAPER = {"recon": "l2", "velocity_weight": 0.0, "root_gain": 1.0, "finger_gain": 0.0}
-COLUMNS = {"mpjpe": "MPJPE", "mpjpe_body": "body", "mpjpe_hand": "hands", "pose": "pose", "world": "world"}
-
+COLUMNS = (
+    Column("bit/s", "bits", 0),
+    Column("MPJPE, mm", "mpjpe"),
+    Column("body", "mpjpe_body"),
+    Column("hands", "mpjpe_hand"),
+    Column("pose", "pose"),
+    Column("world", "world"),
+)
+TRIVIAL = {"nearest training clip": "_nearest_train_clip", "mean pose": "_mean_pose"}
 
 HANDED = ("h2vq", "separate")
 """Stage kinds that need hands."""
 
 
-def recipe(work: Path, kind: str, net: dict, seed: int, args: argparse.Namespace) -> Path:
-    """The recipe file of one run; data, statistics and windows are the same for all."""
-    train = {"steps": args.steps, "batch_size": 16, "checkpoint_every": 200, "validate_every": 0}
-    stages = {
+def stages(kind: str, net: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
+    """One tokenizer; data, statistics and windows are the same for all."""
+    return {
         "data": {"kind": "shards", "path": str(args.shards.resolve()), "verify": False},
         "stats": {"kind": "stats", "group": args.features == "paper"},
         "tokenizer": {
             "kind": kind,
             "net": {**COMMON, **net, **(PAPER if args.features == "paper" else {})},
             "optim": {"lr": 2.0e-3, "warmup_steps": 30, "schedule": "cosine"},
-            "train": train,
+            "train": {"steps": args.steps, "batch_size": 16, "checkpoint_every": 200, "validate_every": 0},
         },
     }
-    path = work / "recipe.yaml"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(yaml.safe_dump({"name": "order", "seed": seed, "stages": stages}))
-    return path
 
 
 def measure(run: Path, clips: int) -> dict[str, float]:
-    """Figures of one finished run, kept beside it."""
-    kept = run / "figures.json"
-    if kept.is_file():
-        return dict(json.loads(kept.read_text()))
-    stages, stage_cache = finished_stages(run), StageCache()
-    tokenizer, data = stage_cache.get(stages["tokenizer"]), stage_cache.get(stages["data"])
+    """Figures of one finished run."""
+    finished, cache = finished_stages(run), StageCache()
+    tokenizer, data = cache.get(finished["tokenizer"]), cache.get(finished["data"])
     test = data.split("test")
     truths = [truth_of(test, i) for i in range(min(clips, len(test)))]
     figures = reconstruction_errors(tokenizer, data.split("train"), truths)
-    figures["bits"] = tokenizer.net.bits_per_second
-    kept.write_text(json.dumps(figures))
-    return figures
-
-
-def show(results: dict[str, list[dict[str, float]]], console: Console) -> None:
-    table = Table(
-        "tokenizer", "bit/s", *COLUMNS.values(), title="test clips, mm, mean ± deviation over seeds"
-    )
-    for title, rows in results.items():
-        cells = [_spread([row[key] for row in rows if key in row]) for key in COLUMNS]
-        table.add_row(title, f"{rows[0]['bits']:.0f}", *cells)
-    first = next(iter(results.values()))[0]
-    for name, suffix in (("nearest training clip", "_nearest_train_clip"), ("mean pose", "_mean_pose")):
-        table.add_row(
-            name, "", *(_spread([first[k + suffix]] if k + suffix in first else []) for k in COLUMNS)
-        )
-    console.print(table)
-
-
-def _spread(values: Sequence[float]) -> str:
-    if not values:
-        return ""
-    deviation = f" ± {np.std(values, ddof=1):.1f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.1f}{deviation}"
-
-
-def draw(results: dict[str, list[dict[str, float]]], path: Path) -> None:
-    """Every seed as a dot, so that the order can be judged against the spread."""
-    import matplotlib.pyplot as plt
-
-    figure, panels = plt.subplots(1, len(COLUMNS), figsize=(12, 3), sharey=True, layout="constrained")
-    for panel, (key, title) in zip(panels, COLUMNS.items(), strict=True):
-        for row, (_name, figures) in enumerate(results.items()):
-            values = [f[key] for f in figures if key in f]
-            panel.plot(values, [row] * len(values), "o", alpha=0.7, color="C0")
-        panel.set_title(f"{title}, mm")
-        panel.set_yticks(range(len(results)), list(results))
-        panel.grid(axis="x", alpha=0.3)
-    figure.savefig(path, dpi=120)
+    return {**figures, "bits": tokenizer.net.bits_per_second}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("work", type=Path)
     parser.add_argument("--shards", type=Path, help="whole-body shards; default: synthetic clips")
     parser.add_argument("--seeds", type=int, default=3)
@@ -145,12 +95,11 @@ def main() -> None:
     parser.add_argument("--nets", nargs="*", choices=list(NETS), default=list(NETS))
     parser.add_argument("--made", type=int, default=2000, help="synthetic clips to make")
     parser.add_argument("--clips", type=int, default=100, help="test clips at most")
-    args = parser.parse_args()
+    args = arguments(parser)
     if args.shards is None:
         args.shards = args.work / "shards"
         fields = {"clips": args.made, "fps": 20, "min_seconds": 2.0, "max_seconds": 5.0, "seed": 7}
         synthesize(SynthConfig.parse(fields, "synthetic clips"), args.shards, workers=2)
-    console = Console()
     handed = ShardDataset.open(args.shards, "train").layout.has_part("hand")
     results: dict[str, list[dict[str, float]]] = {}
     for seed in range(args.seeds):
@@ -159,14 +108,19 @@ def main() -> None:
             if not handed and kind in HANDED:
                 continue
             net = net if handed else {**net, "part": "body", "finger_gain": 0.0}
-            run = args.work / args.features / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
-            run_recipe(recipe(run, kind, net, seed, args), run, console=console)
-            results.setdefault(title, []).append(measure(run, args.clips))
-        show(results, console)
-    place = args.work / args.features
-    draw(results, place / "order.png")
-    (place / "order.json").write_text(json.dumps(results, indent=1))
-    console.print(f"{place / 'order.json'}, {place / 'order.png'}")
+            folder = args.work / args.features / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
+            run = train(folder, stages(kind, net, args), seed=seed)
+            row = kept(run / "figures.json", lambda run=run: measure(run, args.clips))
+            results.setdefault(title, []).append(row)
+    figures = [column.figure for column in COLUMNS]
+    cells = {t: {f: [row[f] for row in rows if f in row] for f in figures} for t, rows in results.items()}
+    first = next(iter(results.values()))[0]
+    cells |= {t: {f: [first[f + end]] for f in figures if f + end in first} for t, end in TRIVIAL.items()}
+    rows = [
+        {"title": title, "cells": {figure: values for figure, values in found.items() if values}}
+        for title, found in cells.items()
+    ]
+    report(f"Tokenizers, {args.steps} steps, {args.features} features", COLUMNS, rows, args.record)
 
 
 if __name__ == "__main__":

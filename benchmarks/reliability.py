@@ -10,7 +10,6 @@ them that part says so and is left out. The trainings are those of
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import json
 import os
@@ -27,6 +26,7 @@ sys.path.append(str(ROOT / "tests/helpers"))  # the tests do the same on a small
 
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
+from bench import arguments, command_line  # noqa: E402
 from kill_matrix import Cell, Seen, read_seen, run_cells  # noqa: E402
 from preempted import launch, preempt, write_recipe  # noqa: E402
 from rich.console import Console  # noqa: E402
@@ -262,14 +262,12 @@ TABLES: dict[str, Callable[[Path], list[str]]] = {
 
 def main() -> None:
     """Do what is asked and missing, then print everything."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("work", type=Path)
     parser.add_argument("--parts", default=",".join(PARTS), help=f"of {', '.join(PARTS)}, or none")
     parser.add_argument("--kills", type=int, default=20, help="SIGKILLs in each cell of the matrix")
     parser.add_argument("--cells", default="*", help="pattern of the cells' names: STAGE-RANKS-WORKERS")
-    args = parser.parse_args()
+    args = arguments(parser)
     for name in filter(None, args.parts.split(",")):
         PARTS[name](args.work, Asked(args.kills, args.cells))
     for name, table in TABLES.items():

@@ -11,16 +11,14 @@ as their mean with 95 % by Student's t over seeds. In the words `{{name}}` is th
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
-import subprocess
 from collections.abc import Iterable, Mapping
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from motionloom.pipeline.evaluation.estimate import estimate
+from bench import HERE, RECORDS, SEEDS, Column, Record, arguments, command_line, report, shown, table_of
+
 from motionloom.pipeline.evaluation.figures import (
     FILE_NAME,
     MODEL,
@@ -33,18 +31,7 @@ from motionloom.pipeline.evaluation.figures import (
     FigureFile,
 )
 
-HERE = Path(__file__).resolve().parent
-RECORDS, WORDS, PAGE = HERE / "records", HERE / "results_page.md", HERE.parent / "docs" / "results.md"
-Record = dict[str, Any]
-
-
-class Column(NamedTuple):
-    """A figure of `metrics.json`, scaled and with so many digits; `log:` names one of `metrics.jsonl`."""
-
-    title: str
-    figure: str
-    digits: int = 1
-    scale: float = 1.0
+WORDS, PAGE = HERE / "results_page.md", HERE.parent / "docs" / "results.md"
 
 
 class Table(NamedTuple):
@@ -192,37 +179,25 @@ TABLES = {
         ),
     ),
 }  # fmt: skip
-SEEDS = (7, 8, 9)
+INGREDIENTS = "python benchmarks/ude_ingredients.py CLIPS WORK"
 COMMANDS = {
     **dict.fromkeys(("dances", "dance_texts"), "motionloom run ude-dance"),
     "rivals": "motionloom run baselines-tiny",
     **dict.fromkeys(("rivals_ude_text", "rivals_ude_music"), "motionloom run baselines-tiny-ude"),
-    "edit": "python benchmarks/edit.py inbetween --write",
-    "edit_real": "python benchmarks/edit.py inbetween --write --name edit_real --real *.bvh",
 }
+"""What was run before `--collect`; otherwise the script of UDE's ingredients."""
 
 
 def collect(run: Path, names: Iterable[str]) -> None:
     """Write a record of each of these tables of which a stage has finished."""
-    RECORDS.mkdir(exist_ok=True)
     for name in names:
         table = TABLES[name]
         rows = [row for row in (row_of(run, table, title) for title in table.rows) if row["cells"]]
         if rows:
-            write(name, table.title, [column._asdict() for column in table.columns], rows)
+            report(table.title, table.columns, rows, name, COMMANDS.get(name, INGREDIENTS))
     path = run / "decoded.json"
     if path.is_file():
         write_decoded(json.loads(path.read_text()))
-
-
-def write(name: str, title: str, columns: list[dict[str, Any]], rows: list[Record]) -> None:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=HERE)
-    record = {
-        "title": title, "measured": f"{datetime.now(UTC):%Y-%m-%d}", "commit": commit.stdout.strip(),
-        "command": COMMANDS.get(name, "python benchmarks/ude_ingredients.py CLIPS WORK"),
-        "columns": columns, "rows": rows,
-    }  # fmt: skip
-    (RECORDS / f"{name}.json").write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n")
 
 
 def row_of(run: Path, table: Table, title: str) -> Record:
@@ -282,48 +257,7 @@ def write_decoded(found: Record) -> None:
                     "protocol": {"split": "test", "clips": found["clips"]},
                 }
             )
-    write("ude_true_tokens", "Decoders of true tokens", [c._asdict() for c in columns], rows)
-
-
-def shown(values: Any, column: Mapping[str, Any]) -> str:
-    """A cell: text as it is, a value, or the mean of several with its interval over seeds."""
-    if not isinstance(values, list):
-        return str(values)
-    digits, found = column["digits"], estimate([column["scale"] * value for value in values])
-    half = "" if found.interval is None else f" ± {found.interval:.{digits}f}"
-    return f"{found.value:.{digits}f}{half}"
-
-
-def table_of(record: Record) -> str:
-    """The table as Markdown, with its protocol below."""
-    columns = record["columns"]
-    head = [record.get("corner", ""), *(column["title"] for column in columns)]
-    lines = [head, ["---"] * len(head)]
-    for row in record["rows"]:
-        cells = [shown(row["cells"].get(column["figure"], ""), column) for column in columns]
-        count = len(row.get("seeds", []))
-        short = f" ({count} seed{'s' * (count > 1)})" if 0 < count < len(SEEDS) else ""
-        lines.append([row["title"] + short, *cells])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + protocol_of(record)
-
-
-def protocol_of(record: Record) -> str:
-    """How the rows were measured: what they share, then what each has of its own."""
-    each = {row["title"]: row.get("protocol", {}) for row in record["rows"] if row.get("protocol")}
-    if not each:
-        return ""
-    common = {k: v for k, v in next(iter(each.values())).items() if all(p.get(k) == v for p in each.values())}
-    parts = [said(common)]
-    for title, own in each.items():
-        rest = said({k: v for k, v in own.items() if k not in common})
-        parts += [f"{title}: {rest}"] if rest else []
-    return "\n\n" + "; ".join(part for part in parts if part) + f" ({record['measured']})."
-
-
-def said(facts: Mapping[str, Any]) -> str:
-    return ", ".join(
-        f"{name.removeprefix('sampling.')} {value}" for name, value in facts.items() if str(value) != "{}"
-    )
+    report("Decoders of true tokens", columns, rows, "ude_true_tokens", INGREDIENTS)
 
 
 def page(words: str, records: Mapping[str, Record]) -> str:
@@ -352,14 +286,12 @@ def rendered() -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("--collect", type=Path, help="the folder of a run")
     parser.add_argument(
         "--tables", nargs="+", choices=TABLES, default=list(TABLES), help="which records are made of it"
     )
-    args = parser.parse_args()
+    args = arguments(parser)
     if args.collect is not None:
         collect(args.collect, args.tables)
     PAGE.write_text(rendered(), encoding="utf-8")

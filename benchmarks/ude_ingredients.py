@@ -15,13 +15,11 @@ those of its stages' `metrics.json` (`benchmarks/results.py`) and, of decoders o
 
 from __future__ import annotations
 
-import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from bench import arguments, command_line, kept, train
 
 from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
 from motionloom.models.diffusion.sampling import decode_motions
@@ -29,8 +27,6 @@ from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.truth import spread
-from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.plan import Selection
 
 Stages = dict[str, dict[str, Any]]
 
@@ -191,8 +187,8 @@ QUESTIONS = ((codebook_arms,), (decoder_arms,), (token_arms,), (gru_arms, advers
 """In the order in which they are asked; of the last every seed answers all."""
 
 
-def decoded(run: Path, clips: int = 100) -> None:
-    """Write `decoded.json`: test clips' true tokens, decoded by each decoder twice."""
+def decoded(run: Path, clips: int = 100) -> dict[str, Any]:
+    """Figures of test clips' true tokens, decoded by each decoder twice."""
     stages, cache = finished_stages(run), StageCache()
     dataset = cache.get(stages["data"]).split("test")
     tokenizer, layout = cache.get(stages[f"ema_{SHARED}"]), dataset.layout
@@ -216,9 +212,7 @@ def decoded(run: Path, clips: int = 100) -> None:
             "variety, mm": apart(both[0], both[1], layout.fps),
             "speed": speed(both[0], layout.fps) / speed(truth, layout.fps),
         }
-    (run / "decoded.json").write_text(
-        json.dumps({"clips": len(recorded), "frames": 64, "rows": out}, indent=1) + "\n"
-    )
+    return {"clips": len(recorded), "frames": 64, "rows": out}
 
 
 def apart(one: list[Any], other: list[Any], fps: float) -> float:
@@ -236,27 +230,20 @@ def speed(motions: list[Any], fps: float) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("clips", type=Path)
     parser.add_argument("work", type=Path)
     parser.add_argument("--seeds", type=int, nargs="+", default=[7, 8, 9])
     parser.add_argument("--until", help="stages, with commas between them")
-    args = parser.parse_args()
+    args = arguments(parser)
     stages = base(args.clips.resolve())
     for together in QUESTIONS:
         for seed in args.seeds:
             for question in together:
                 stages |= question(seed)
-    args.work.mkdir(parents=True, exist_ok=True)
-    recipe = args.work / "recipe.yaml"
-    recipe.write_text(
-        yaml.safe_dump({"name": "ude-ingredients", "seed": 7, "stages": stages}, sort_keys=False)
-    )
-    run = run_recipe(recipe, args.work / "run", select=Selection(until=args.until))
+    run = train(args.work / "run", stages, until=args.until, seed=7)
     if not args.until:
-        decoded(run)
+        kept(run / "decoded.json", lambda: decoded(run))
 
 
 if __name__ == "__main__":

@@ -6,14 +6,12 @@
 Held-out clips as they are recorded; their true tokens decoded by the tokenizer and by DMD; tokens that each
 UTT makes for their music or caption, with and without z, decoded by both and drawn twice. Beat Align of
 dances (to their own music and to other songs), genre and tempo, attributes of captions (those of held-out
-combinations apart too): all measured on the joints. `variety` is how far the two draws are apart. Stations
-whose stage has not finished are left out. Writes `stations.json` (`--out`) into the run's folder.
+combinations apart): all measured on the joints. `variety` is the distance of the two draws. Stations whose
+stage has not finished are left out.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +19,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from bench import Column, arguments, command_line, judge, report
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
-from motionloom.datasets.synth.measure import agrees
 from motionloom.models.diffusion.sampling import decode_motions
 from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.models.gpt.tokens import Codes
@@ -165,48 +161,8 @@ def _means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
     return {name: found.value for name, found in row_estimates([rows]).items()}
 
 
-def caption_figures(
-    truths: Sequence[Mapping[str, Any]],
-    motions: Sequence[Any],
-    fps: float,
-    apart: Sequence[Mapping[str, Any]],
-) -> dict[str, float]:
-    """Shares of right attributes, "every" all together, "whole" of clips with all right, and both of these of
-    held-out combinations and of the other clips; faces play no part.
-
-    A combination with a hand's shape holds out a hand beside a motion that is known ("new hand"); one without
-    holds out the motion itself ("new motion"), which training has never seen.
-    """
-    found: dict[str, list[bool]] = {}
-    for truth, joints in zip(truths, motions, strict=True):
-        right = agrees(dict(truth), joints, None, fps)
-        new = [c for c in apart if all(truth.get(k) == v for k, v in c.items())]
-        groups = ["held out" if new else "other"]
-        if new:
-            hands = all("left_hand" in c or "right_hand" in c for c in new)
-            groups.append("new hand" if hands else "new motion")
-        for name, value in right.items():
-            for title in (name, "every", *(f"{group} every" for group in groups)):
-                found.setdefault(title, []).append(value)
-        for title in ("whole", *(f"{group} whole" for group in groups)):
-            found.setdefault(title, []).append(all(right.values()))
-    return {name: float(np.mean(values)) for name, values in found.items()}
-
-
-def show(console: Console, title: str, rows: Mapping[str, Mapping[str, float]]) -> None:
-    names = list(next(iter(rows.values())))
-    table = Table(title=title)
-    for column in ("", *names):
-        table.add_column(column)
-    for station, figures in rows.items():
-        table.add_row(station, *(f"{figures[n]:.3f}" if n in figures else "" for n in names))
-    console.print(table)
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--clips", type=int, default=100, help="held-out dances, and captions, at most")
     parser.add_argument("--seed", type=int, default=0)
@@ -215,12 +171,11 @@ def main() -> None:
     parser.add_argument("--cfg-scale", type=float, default=1.0)
     parser.add_argument("--music-cfg-scale", type=float, help="guidance of dances (default: --cfg-scale)")
     parser.add_argument("--split", default="test")
-    parser.add_argument("--out", default="stations.json")
     parser.add_argument("--no-dances", action="store_true", help="for models of words alone")
     parser.add_argument("--no-dmd", action="store_true", help="decode by the tokenizer alone")
     parser.add_argument("--utt", nargs="*", default=["utt"], help="UTT stages to compare")
-    args = parser.parse_args()
-    console, engine = Console(width=220), Engine.of(args.run, args.utt)
+    args = arguments(parser)
+    engine = Engine.of(args.run, args.utt)
     if args.no_dmd:
         engine.dmd = None
     stages, stage_cache = finished_stages(args.run), StageCache()
@@ -232,31 +187,30 @@ def main() -> None:
         cfg_scale=args.cfg_scale,
         guidance={} if args.music_cfg_scale is None else {"audio": args.music_cfg_scale},
     )
-    out: dict[str, Any] = {"arguments": {k: str(v) for k, v in vars(args).items()}}
+    out: dict[str, dict[str, float]] = {}
     if not args.no_dances:
         clips = dances_of(dataset, args.clips, unit=GROUP_FRAMES)
         apart = other_songs(clips, 5, args.seed)
         recorded = [np.asarray(dataset.motion(c.index))[: len(c.joints)] for c in clips]
         prompts = [Prompt(sound=c.sound, conditions={"audio": c.music}) for c in clips]
-        out["dances"] = {}
         for name, *both in engine.stations(recorded, prompts, sampling, args.seed):
             one, other = ([joints_of(m, layout) for m in motions] for motions in both)
-            out["dances"][name] = dance_figures(clips, one, apart) | {"variety": variety(one, other, fps)}
-        show(console, f"{len(clips)} dances to {len({c.song for c in clips})} songs", out["dances"])
+            out[name] = dance_figures(clips, one, apart) | {"variety of dances": variety(one, other, fps)}
     if has_caption(dataset).any():
         truths = [truth_of(dataset, i) for i in spread(dataset, 10 * args.clips)]
         said = [t for t in truths if t.truth and t.truth.get("action") != "dance"][: args.clips]
         place = {name: number for number, name in enumerate(dataset.ids)}
         recorded = [np.asarray(dataset.motion(place[t.id]))[: len(t.features)] for t in said]
-        prompts, records = [Prompt(text=t.caption) for t in said], [t.truth or {} for t in said]
+        prompts = [Prompt(text=t.caption) for t in said]
         held = [c for s in stages.values() for c in getattr(s.config, "hold_out", [])]
-        out["captions"] = {}
         for name, *both in engine.stations(recorded, prompts, sampling, args.seed):
             one, other = ([joints_of(m, layout) for m in motions] for motions in both)
-            found = caption_figures(records, one, fps, held) | {"variety": variety(one, other, fps)}
-            out["captions"][name] = found
-        show(console, f"{len(said)} captions", out["captions"])
-    (args.run / args.out).write_text(json.dumps(out, indent=2))
+            shares = judge(said, ((joints, None) for joints in one), fps, held)
+            found = {f"{kind}: {name}": value for kind, row in shares.items() for name, value in row.items()}
+            out.setdefault(name, {}).update(found, variety=variety(one, other, fps))
+    columns = [Column(figure, figure, 3) for figure in dict.fromkeys(f for row in out.values() for f in row)]
+    rows = [{"title": name, "cells": {k: [v] for k, v in row.items()}} for name, row in out.items()]
+    report(f"Stations of {args.run.name}", columns, rows, args.record)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.recipe import load_recipe
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
-SCRIPTS = [*sorted(FOLDER.glob("*.py")), FOLDER.parent / "docs" / "pictures.py"]
+SCRIPTS = [path for path in sorted(FOLDER.glob("*.py")) if path.name != "bench.py"]  # which the others share
+SCRIPTS.append(FOLDER.parent / "docs" / "pictures.py")
 
 
 DOCS = sorted([*FOLDER.parent.glob("*.md"), *FOLDER.parent.glob("docs/*.md")])

@@ -1,4 +1,4 @@
-"""Commands that compute next to nothing import next to nothing; seconds are in `benchmarks/startup.py`.
+"""Commands that compute next to nothing import next to nothing.
 
 One process runs them in turn, from the lightest on, and says after each which libraries have come in.
 """

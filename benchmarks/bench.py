@@ -1,0 +1,197 @@
+"""How every script of this folder reads its arguments, trains, times, prints and records.
+
+A script fills rows and calls `report`: the same Markdown is printed and, by `--record NAME`, stands in
+`benchmarks/records/NAME.json` with its command, versions and cost, from where `results.py` takes it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import resource
+import shlex
+import statistics
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from rich.console import Console
+
+from motionloom.datasets.base.files import write_json
+from motionloom.datasets.synth.measure import agrees
+from motionloom.pipeline.evaluation.estimate import estimate
+from motionloom.pipeline.evaluation.truth import Truth
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.plan import Selection
+from motionloom.pipeline.store.yaml import dump_yaml
+
+HERE = Path(__file__).resolve().parent
+RECORDS = HERE / "records"
+SEEDS = (7, 8, 9)
+"""Seeds of a full table; a row of fewer says how many."""
+Record = dict[str, Any]
+Shares = dict[str, dict[str, float]]
+"""Held out or not -> attribute -> share of right ones."""
+Judged = tuple[NDArray[Any], NDArray[Any] | None]
+"""Joints [T, N, 3] and expression [T, 50], or None."""
+
+
+class Column(NamedTuple):
+    """A figure of `metrics.json`, scaled and with so many digits; `log:` names one of `metrics.jsonl`."""
+
+    title: str
+    figure: str
+    digits: int = 1
+    scale: float = 1.0
+
+
+def command_line(doc: str | None) -> argparse.ArgumentParser:
+    """A parser whose help is the script's docstring, with the options that all scripts share."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    parser.add_argument("--record", help="write benchmarks/records/NAME.json")
+    return parser
+
+
+def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The command's arguments; torch computes on as many threads as they say from here on."""
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    return args
+
+
+def train(
+    folder: Path, stages: Mapping[str, Any], *, until: str | None = None, force: bool = False, **fields: Any
+) -> Path:
+    """Run a recipe of these stages in `folder`, whose name it gets; finished stages are not repeated."""
+    path = folder.parent / f"{folder.name}.yaml"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hardware = {"accelerator": "cpu", "threads": torch.get_num_threads()}
+    path.write_text(dump_yaml({"name": folder.name, "hardware": hardware, **fields, "stages": dict(stages)}))
+    select = Selection(only=until, force=True) if force else Selection(until=until)
+    return run_recipe(path, folder, select=select, replace=True, console=Console())
+
+
+def kept(path: Path, measure: Callable[[], Any]) -> Any:
+    """The JSON value in `path`, measured and written first where it is missing: a killed script goes on."""
+    if not path.is_file():
+        write_json(path, measure())
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def cpu_seconds(calls: Mapping[str, Callable[[], object]], rounds: int = 7) -> dict[str, float]:
+    """Median CPU seconds of each call, own and of child processes.
+
+    The calls take turns, so that a slow phase of the machine meets all of them; the first round fills caches.
+    """
+    seconds: dict[str, list[float]] = defaultdict(list)
+    for turn in range(rounds + 1):
+        for name, call in calls.items():
+            begin = process_seconds()
+            call()
+            if turn:
+                seconds[name].append(process_seconds() - begin)
+    return {name: statistics.median(values) for name, values in seconds.items()}
+
+
+def process_seconds() -> float:
+    """CPU seconds that this process and its finished children have used."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+def judge(
+    truths: Sequence[Truth], motions: Iterable[Judged], fps: float, hold_out: Sequence[Mapping[str, Any]]
+) -> Shares:
+    """Shares of right attributes; "shape" is of hands that are not relaxed, "every" all attributes together,
+    "whole" the share of clips that get all right."""
+    rows: dict[str, dict[str, list[bool]]] = {"held out": defaultdict(list), "other": defaultdict(list)}
+    for truth, (joints, face) in zip(truths, motions, strict=True):
+        record = truth.truth or {}
+        apart = any(all(record.get(k) == v for k, v in c.items()) for c in hold_out)
+        kind = rows["held out" if apart else "other"]
+        right = agrees(record, joints, face, fps)
+        for name, value in right.items():
+            kind[name].append(value)
+            kind["every"].append(value)
+            if name.endswith("_hand") and record[name] != "relaxed":
+                kind["shape"].append(value)
+        kind["whole"].append(all(right.values()))
+    return {kind: {name: float(np.mean(v)) for name, v in found.items()} for kind, found in rows.items()}
+
+
+def report(
+    title: str,
+    columns: Sequence[Column],
+    rows: Sequence[Record],
+    name: str | None,
+    command: str | None = None,
+) -> None:
+    """Print the table of rows and, where it has a name, write its record."""
+    record = {"title": title, "columns": [column._asdict() for column in columns], "rows": list(rows)}
+    if name is not None:
+        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, cwd=HERE)
+        path = RECORDS / f"{name}.json"
+        versions = {package: version(package) for package in ("torch", "numpy")}
+        facts = {
+            "measured": f"{datetime.now(UTC):%Y-%m-%d}",
+            "commit": commit.stdout.decode().strip(),
+            "command": command or f"python benchmarks/{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}",
+            "versions": {"python": platform.python_version()} | versions,
+            "cpu_seconds": round(process_seconds()),
+        }
+        path.write_text(json.dumps(facts | record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        print(path)
+    print(f"{title}\n\n{table_of(record)}")
+
+
+def table_of(record: Record) -> str:
+    """A record as Markdown, with its protocol below."""
+    columns = record["columns"]
+    head = [record.get("corner", ""), *(column["title"] for column in columns)]
+    lines = [head, ["---"] * len(head)]
+    for row in record["rows"]:
+        cells = [shown(row["cells"].get(column["figure"], ""), column) for column in columns]
+        count = len(row.get("seeds", []))
+        short = f" ({count} seed{'s' * (count > 1)})" if 0 < count < len(SEEDS) else ""
+        lines.append([row["title"] + short, *cells])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + _protocol(record)
+
+
+def shown(values: Any, column: Mapping[str, Any]) -> str:
+    """A cell: text as it is, a value, or the mean over seeds with its 95 % interval (Student's t)."""
+    if not isinstance(values, list):
+        return str(values)
+    digits, found = column["digits"], estimate([column["scale"] * value for value in values])
+    half = "" if found.interval is None else f" ± {found.interval:.{digits}f}"
+    return f"{found.value:.{digits}f}{half}"
+
+
+def _protocol(record: Record) -> str:
+    """How the rows were measured: what they share, then what each has of its own."""
+    each = {row["title"]: row.get("protocol", {}) for row in record["rows"] if row.get("protocol")}
+    if not each:
+        return ""
+    common = {k: v for k, v in next(iter(each.values())).items() if all(p.get(k) == v for p in each.values())}
+    parts = [_facts(common)]
+    for title, own in each.items():
+        rest = _facts({k: v for k, v in own.items() if k not in common})
+        parts += [f"{title}: {rest}"] if rest else []
+    measured = f" ({record['measured']})" if "measured" in record else ""
+    return "\n\n" + "; ".join(part for part in parts if part) + f"{measured}."
+
+
+def _facts(facts: Mapping[str, Any]) -> str:
+    return ", ".join(
+        f"{name.removeprefix('sampling.')} {value}" for name, value in facts.items() if str(value) != "{}"
+    )
