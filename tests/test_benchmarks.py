@@ -36,10 +36,7 @@ COMMANDS = sorted(
         )
     }
 )
-"""Every command of a benchmark that the documents give, without `python benchmarks/`.
-
-In a sentence a script's name alone is none.
-"""
+"""Every command of a benchmark that the documents give, without `python benchmarks/`."""
 
 
 def loaded(script: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
