@@ -159,13 +159,19 @@ def table_of(record: Record) -> str:
     """A record as Markdown, with its protocol below."""
     columns = record["columns"]
     head = [record.get("corner", ""), *(column["title"] for column in columns)]
-    lines = [head, ["---"] * len(head)]
+    lines = []
     for row in record["rows"]:
         cells = [shown(row["cells"].get(column["figure"], ""), column) for column in columns]
         count = len(row.get("seeds", []))
         short = f" ({count} seed{'s' * (count > 1)})" if 0 < count < len(SEEDS) else ""
         lines.append([row["title"] + short, *cells])
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + _protocol(record)
+    return markdown(head, lines) + _protocol(record)
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table as Markdown."""
+    lines = ["| " + " | ".join(row) + " |" for row in (head, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
 
 def shown(values: Any, column: Mapping[str, Any]) -> str:
@@ -178,17 +184,23 @@ def shown(values: Any, column: Mapping[str, Any]) -> str:
 
 
 def _protocol(record: Record) -> str:
-    """How the rows were measured: what they share, then what each has of its own."""
-    each = {row["title"]: row.get("protocol", {}) for row in record["rows"] if row.get("protocol")}
+    """How the rows were measured: what they share, then what each group of rows has of its own."""
+    each = {row["title"]: dict(row["protocol"]) for row in record["rows"] if row.get("protocol")}
     if not each:
         return ""
-    common = {k: v for k, v in next(iter(each.values())).items() if all(p.get(k) == v for p in each.values())}
-    parts = [_facts(common)]
+    undrawn = [row["title"] for row in record["rows"] if not row.get("seeds") and row["title"] in each]
+    for title in undrawn:  # recordings and nearest clips, of which sampling settings say nothing
+        each[title] = {key: value for key, value in each[title].items() if not key.startswith("sampling.")}
+    common = {
+        key: value
+        for key, value in next(iter(each.values())).items()
+        if all(own.get(key, value if title in undrawn else None) == value for title, own in each.items())
+    }
+    groups: dict[str, list[str]] = defaultdict(list)
     for title, own in each.items():
-        rest = _facts({k: v for k, v in own.items() if k not in common})
-        parts += [f"{title}: {rest}"] if rest else []
-    measured = f" ({record['measured']})" if "measured" in record else ""
-    return "\n\n" + "; ".join(part for part in parts if part) + f"{measured}."
+        groups[_facts({k: v for k, v in own.items() if k not in common})].append(title)
+    parts = [_facts(common)] + [f"{' and '.join(titles)}: {own}" for own, titles in groups.items() if own]
+    return f"\n\n*Measured {record.get('measured', 'now')}: {'; '.join(part for part in parts if part)}.*"
 
 
 def _facts(facts: Mapping[str, Any]) -> str:

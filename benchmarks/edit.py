@@ -211,7 +211,8 @@ def rows_of(
         cells = {
             name: [float(np.mean([one[name] for one in run])) for run in runs.values()] for name in names
         }
-        rows.append({"title": title, "cells": cells, "seeds": list(runs), "protocol": {"clips": len(clips)}})
+        drawn = list(runs) if len(runs) > 1 else []  # what needs no model has no seeds
+        rows.append({"title": title, "cells": cells, "seeds": drawn, "protocol": {"clips": len(clips)}})
     return rows
 
 
@@ -233,13 +234,18 @@ def write_card(model: Path, title: str, description: str, config: SynthConfig) -
     """The card of a shipped model, from the records."""
     records = read_records()
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
-    tables = "\n\n".join(table_of(records[name]) for name in ("edit", "edit_real") if name in records)
+    shown = [records[name] for name in ("edit", "edit_real") if name in records]
+    for record, pulls in zip(shown, (("pull 1",), ("pull 0", "pull 1", "pull 5")), strict=False):
+        # The first table shows what the strength of the pull does; the second repeats the ends alone.
+        record["rows"] = [row for row in record["rows"] if not row["title"].endswith(pulls)]
+    tables = "\n\n".join(table_of(record) for record in shown)
     sums = "\n".join(f"    {value}  {name}" for name, value in digests(model).items())
-    actions = ", ".join(name for name in config.action_names if name != "then")
-    description = f"{description}; it knows {actions}"
+    description = (
+        f"{description}; it knows {', '.join(name for name in config.action_names if name != 'then')}"
+    )
     text = CARD.read_text(encoding="utf-8").format(
         description=description, bytes=size, tables=tables, recipe=RECIPE, clips=config.clips,
-        actions=actions, digests=sums,
+        digests=sums,
     )  # fmt: skip
     (model / "README.md").write_text(text, encoding="utf-8")
     facts = {"name": title, "description": description, "recipe": RECIPE}

@@ -1,12 +1,12 @@
-"""`docs/results.md` from records: the figures are in `benchmarks/records`, the words in `results_page.md`.
+"""Fill the tables of `docs/results.md` from the records in `benchmarks/records`.
 
-    python benchmarks/results.py                     # writes docs/results.md
+    python benchmarks/results.py                     # updates docs/results.md
     python benchmarks/results.py --collect WORK/run  # first makes records of a run of ude_ingredients.py
 
 A record is a table: its title, day, commit, command, protocol, columns, and rows whose cells are values, one
-a seed, or text (`imported`: of an earlier journal, not measured again). Several values are shown
-as their mean with 95 % by Student's t over seeds. In the words `{{name}}` is the table of a record and
-`{{name: row: column}}` one of its cells, so that no figure is typed by hand.
+a seed, or text (`imported`: of an earlier journal, not measured again). Several values are shown as their
+mean with a 95 % interval by Student's t over seeds. In the page, the table after the comment `<!--name-->` is
+that of the record `name`; the text around the tables is edited in the page and holds no measured figure.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from bench import HERE, RECORDS, SEEDS, Column, Record, arguments, command_line, report, shown, table_of
+from bench import HERE, RECORDS, SEEDS, Column, Record, arguments, command_line, report, table_of
 
 from motionloom.pipeline.evaluation.figures import (
     FILE_NAME,
     MODEL,
-    NEAREST_LABELS,
     NEAREST_MUSIC,
     NEAREST_WORDS,
     OTHER_MUSIC,
@@ -31,7 +30,9 @@ from motionloom.pipeline.evaluation.figures import (
     FigureFile,
 )
 
-WORDS, PAGE = HERE / "results_page.md", HERE.parent / "docs" / "results.md"
+PAGE = HERE.parent / "docs" / "results.md"
+TABLE = re.compile(r"(<!--(\w+)-->\n)(?:\|.*\n)*(?:\n\*Measured .*\n)?")
+"""The name of a record, and what stands below it: the table, and the line that says how it was measured."""
 
 
 class Table(NamedTuple):
@@ -53,10 +54,12 @@ TEXT = (
 )
 MUSIC = (Column("Beat Align", "beat_align.bailando", 3), *TEXT[1:])
 ANSWERS = {"recorded": RECORDED, "nearest training caption": NEAREST_WORDS}
-DECODERS = {
-    "tokenizer's decoder": "greedy",
-    "DMD, predicts the noise": "greedy_epsilon",
-    "DMD, predicts the motion": "greedy_sample",
+VARIANTS = {
+    "GPT": "greedy",
+    "GPT with z": "greedy_z",
+    "GRU": "greedy_gru",
+    "GPT, DMD predicts noise": "greedy_epsilon",
+    "GPT, DMD predicts motion": "greedy_sample",
 }
 ADVERSARIAL = {
     "without L_adv": "adv0",
@@ -80,8 +83,6 @@ RIVALS_TEXT = {
     "UDE": "evaluate",
 }
 RIVALS_MUSIC = {"FACT": "evaluate_fact", "Bailando": "evaluate_bailando", "UDE": "evaluate_dances"}
-NETWORKS = {"GPT": "greedy", "GRU": "greedy_gru"}
-NOISE = {"without z": "greedy", "with z": "greedy_z"}
 
 
 def _of(prefix: str, stages: Mapping[str, str], answers: Mapping[str, str]) -> dict[str, tuple[str, str]]:
@@ -97,7 +98,6 @@ DANCES = {
     "dance to the nearest training music": NEAREST_MUSIC,
     "random training dance": RANDOM_DANCE,
 }
-LOOKUPS = {"nearest training labels": NEAREST_LABELS, "nearest training caption": NEAREST_WORDS}
 
 TABLES = {
     "rivals": Table(
@@ -131,19 +131,6 @@ TABLES = {
             *TEXT[1:5],
         ),
     ),
-    "dance_texts": Table(
-        "Captions",
-        {
-            "generated": ("evaluate", MODEL),
-            **{title: ("evaluate", row) for title, row in LOOKUPS.items()},
-            "recorded": ("evaluate", RECORDED),
-        },
-        (
-            Column("action right, %", "agreement.action", 0, 100),
-            Column("everything right, %", "agreement.everything", 0, 100),
-            TEXT[0],
-        ),
-    ),
     "ude_codebook": Table(
         "Codebooks of 512 codes, 1,000 steps of 32 windows",
         {
@@ -160,14 +147,9 @@ TABLES = {
             Column("codes in a batch, %", "log:train/usage_code", 0, 100),
         ),
     ),
-    "ude_decoders_text": Table("Table 5, captions", _of("text_", DECODERS, ANSWERS), TEXT),
-    "ude_decoders_music": Table("Table 5, music", _of("music_", DECODERS, {"recorded": RECORDED}), MUSIC),
-    "ude_noise_text": Table("Table 4, captions", _of("text_", NOISE, {}), TEXT),
-    "ude_noise_music": Table("Table 4, music", _of("music_", NOISE, {}), MUSIC),
-    "ude_networks_text": Table("Table 3, captions", _of("text_", NETWORKS, {}), TEXT),
-    "ude_networks_music": Table("Table 3, music", _of("music_", NETWORKS, {}), MUSIC),
-    "ude_adversarial_text": Table(
-        "L_adv, captions", _of("text_drawn_", ADVERSARIAL, {}), TEXT
+    "ude_variants_text": Table("Tables 3 to 5, captions", _of("text_", VARIANTS, ANSWERS), TEXT),
+    "ude_variants_music": Table(
+        "Tables 3 to 5, music", _of("music_", VARIANTS, {"recorded": RECORDED}), MUSIC
     ),
     "ude_adversarial": Table(
         "L_adv from the first step on, 200 steps",
@@ -181,7 +163,7 @@ TABLES = {
 }  # fmt: skip
 INGREDIENTS = "python benchmarks/ude_ingredients.py CLIPS WORK"
 COMMANDS = {
-    **dict.fromkeys(("dances", "dance_texts"), "motionloom run ude-dance"),
+    "dances": "motionloom run ude-dance",
     "rivals": "motionloom run baselines-tiny",
     **dict.fromkeys(("rivals_ude_text", "rivals_ude_music"), "motionloom run baselines-tiny-ude"),
 }
@@ -195,9 +177,6 @@ def collect(run: Path, names: Iterable[str]) -> None:
         rows = [row for row in (row_of(run, table, title) for title in table.rows) if row["cells"]]
         if rows:
             report(table.title, table.columns, rows, name, COMMANDS.get(name, INGREDIENTS))
-    path = run / "decoded.json"
-    if path.is_file():
-        write_decoded(json.loads(path.read_text()))
 
 
 def row_of(run: Path, table: Table, title: str) -> Record:
@@ -236,43 +215,9 @@ def logged(run: Path, stage: str, seed: int, column: Column) -> float | None:
     return sum(last) / len(last) if last else None
 
 
-def write_decoded(found: Record) -> None:
-    """The decoders' record: true tokens of test clips, decoded twice."""
-    titles = dict(zip(("tokenizer", "epsilon", "sample"), DECODERS, strict=True))
-    columns = [
-        Column("pose error, mm", "pose error, mm"),
-        Column("two draws apart, mm", "variety, mm"),
-        Column("speed, % of the recorded", "speed", 0, 100),
-    ]
-    rows = []
-    for start, title in titles.items():
-        arms = {name: cells for name, cells in found["rows"].items() if name.split("_")[0] == start}
-        if arms:
-            cells = {column.figure: [arm[column.figure] for arm in arms.values()] for column in columns}
-            rows.append(
-                {
-                    "title": title,
-                    "cells": cells,
-                    "seeds": [],
-                    "protocol": {"split": "test", "clips": found["clips"]},
-                }
-            )
-    report("Decoders of true tokens", columns, rows, "ude_true_tokens", INGREDIENTS)
-
-
-def page(words: str, records: Mapping[str, Record]) -> str:
-    """The words with their figures."""
-
-    def filled(found: re.Match[str]) -> str:
-        name, *place = found[1].split(": ")
-        record = records[name]
-        if not place:
-            return table_of(record)
-        column = next(c for c in record["columns"] if c["title"] == place[1])
-        row = next(r for r in record["rows"] if r["title"] == place[0])
-        return shown(row["cells"][column["figure"]], column)
-
-    return re.sub(r"\{\{(.+?)\}\}", filled, words)
+def page(text: str, records: Mapping[str, Record]) -> str:
+    """The page with the table of each record that it names."""
+    return TABLE.sub(lambda found: found[1] + table_of(records[found[2]]) + "\n", text)
 
 
 def read_records() -> dict[str, Record]:
@@ -282,7 +227,7 @@ def read_records() -> dict[str, Record]:
 
 
 def rendered() -> str:
-    return page(WORDS.read_text(encoding="utf-8"), read_records())
+    return page(PAGE.read_text(encoding="utf-8"), read_records())
 
 
 def main() -> None:

@@ -5,7 +5,7 @@
 CLIPS holds real captioned clips (BVH archives, `captions.jsonl`, `joint_map.json`); synthetic dances are
 made. One recipe is written into WORK and run there: data, judge, then an arm of every question for every
 seed. Killed and started again it goes on where it was; `--seeds` and `--until` take a part. Its figures are
-those of its stages' `metrics.json` (`benchmarks/results.py`) and, of decoders on true tokens, `decoded.json`.
+those of its stages' `metrics.json` (`benchmarks/results.py`).
 
 - codebook: learnt by gradient from the paper's start, from data, and by moving averages;
 - decoder: DMD (160 wide, 133 columns) that predicts the noise and the motion; the tokenizer's own;
@@ -18,15 +18,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from bench import arguments, command_line, kept, train
-
-from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
-from motionloom.models.diffusion.sampling import decode_motions
-from motionloom.models.gpt.drawing import sample_seeds
-from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import StageCache
-from motionloom.pipeline.evaluation.truth import spread
+from bench import arguments, command_line, train
 
 Stages = dict[str, dict[str, Any]]
 
@@ -187,48 +179,6 @@ QUESTIONS = ((codebook_arms,), (decoder_arms,), (token_arms,), (gru_arms, advers
 """In the order in which they are asked; of the last every seed answers all."""
 
 
-def decoded(run: Path, clips: int = 100) -> dict[str, Any]:
-    """Figures of test clips' true tokens, decoded by each decoder twice."""
-    stages, cache = finished_stages(run), StageCache()
-    dataset = cache.get(stages["data"]).split("test")
-    tokenizer, layout = cache.get(stages[f"ema_{SHARED}"]), dataset.layout
-    recorded = [np.asarray(dataset.motion(i))[:64] for i in spread(dataset, clips) if dataset.frames[i] >= 64]
-    codes, truth = tokenizer.encode(recorded), [joints_of(m, layout) for m in recorded]
-    out: dict[str, dict[str, float]] = {}
-    for name in ["tokenizer", *(s for s in stages if stages[s].kind.name == "dmd")]:
-        both = []
-        for seed in (0, 1):
-            if name == "tokenizer":
-                motions = tokenizer.decode(codes.codes, codes.groups.tolist())
-            else:
-                seeds = sample_seeds(seed, len(recorded))
-                made = decode_motions(
-                    cache.get(stages[name]).net, codes, seeds=seeds, sampler="dpm++", steps=20, window=64
-                )
-                motions = [tokenizer.of_coordinates(motion) for motion in made]
-            both.append([joints_of(m, layout) for m in motions])
-        out[name] = {
-            "pose error, mm": apart(both[0], truth, layout.fps),
-            "variety, mm": apart(both[0], both[1], layout.fps),
-            "speed": speed(both[0], layout.fps) / speed(truth, layout.fps),
-        }
-    return {"clips": len(recorded), "frames": 64, "rows": out}
-
-
-def apart(one: list[Any], other: list[Any], fps: float) -> float:
-    """Mean distance of joints, root and heading aligned, millimetres."""
-    pairs = zip(one, other, strict=True)
-    found = [
-        np.linalg.norm(local_joints_of(a, fps) - local_joints_of(b, fps), axis=-1).mean() for a, b in pairs
-    ]
-    return 1000 * float(np.mean(found))
-
-
-def speed(motions: list[Any], fps: float) -> float:
-    """Mean speed of all joints, metres a second: an average of several motions is too slow."""
-    return fps * float(np.mean([np.linalg.norm(np.diff(m, axis=0), axis=-1).mean() for m in motions]))
-
-
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("clips", type=Path)
@@ -241,9 +191,7 @@ def main() -> None:
         for seed in args.seeds:
             for question in together:
                 stages |= question(seed)
-    run = train(args.work / "run", stages, until=args.until, seed=7)
-    if not args.until:
-        kept(run / "decoded.json", lambda: decoded(run))
+    train(args.work / "run", stages, until=args.until, seed=7)
 
 
 if __name__ == "__main__":
