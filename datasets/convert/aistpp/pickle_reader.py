@@ -1,24 +1,19 @@
 """AIST++ annotations are pickles, which can run any code. This is the one place that reads a pickle.
 
-Four fences, each enough against the usual attack:
-- only the opcodes that containers, numbers, text and numpy arrays need; none that names a class to build;
-- only the globals that numpy's own arrays name (`ALLOWED`); anything else is refused by its name;
-- even these are not numpy's: stand-ins collect what a file says about an array, and the array is built here,
-  from plain numbers whose bytes must have exactly the size that the shape demands. So no object arrays, no
-  huge shape without data, and nothing of the running program that a file could change;
-- limits on the file's size, on its opcodes and on its memo.
-Only `smpl_poses`, `smpl_trans` and `smpl_scaling` are used.
+`pickle.Unpickler` does the reading; its `find_class` knows only the names with which numpy pickles arrays
+(`ALLOWED`, protocols 0 to 5) and gives an inert record for each, so nothing is called while a file is read.
+The three arrays that are used are then built here, of plain numbers whose bytes must have exactly the size
+that the shape demands: no object arrays, no huge shape without data. Memory is bounded by the file's size.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import pickle
 import pickletools
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,26 +27,24 @@ POSE_WIDTH = 72
 MAX_BYTES = 16 * 2**20
 """The longest dances take about 1 MB."""
 
-MAX_OPCODES, MAX_CALLS = 1000, 64
-"""A real file has about 150 instructions, 20 of them calls. A call can copy the bytes of the whole file once:
-together with `MAX_BYTES` this bounds memory to 1 GiB.
-"""
+MAX_OPCODES = 1000
+"""A real file has about 150 instructions."""
+
+ALLOWED = frozenset(
+    {
+        "numpy.ndarray",
+        "numpy.dtype",
+        "numpy.core.multiarray._reconstruct",
+        "numpy.core.multiarray.scalar",
+        "numpy.core.numeric._frombuffer",  # protocol 5
+        "_codecs.encode",  # bytes in the protocols of Python 2
+    }
+)
+"""Every global that a file may name."""
 
 MAX_RADIANS = 100.0
 MAX_METRES = 1000.0
 """Beyond these a value is damage, not a pose."""
-
-_OPCODE_NAMES = """
-PROTO FRAME STOP MARK NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 FLOAT BINFLOAT
-STRING BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES
-SHORT_BINBYTES BINBYTES8 EMPTY_DICT DICT SETITEM SETITEMS EMPTY_LIST LIST APPEND APPENDS EMPTY_TUPLE
-TUPLE TUPLE1 TUPLE2 TUPLE3 PUT BINPUT LONG_BINPUT MEMOIZE GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL
-REDUCE BUILD
-"""
-_OPCODES = frozenset(_OPCODE_NAMES.split())
-
-_CODES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1")
-_KINDS = {code: np.dtype(code) for code in _CODES}
 
 
 @dataclass(frozen=True)
@@ -102,16 +95,14 @@ def _array(name: str, data: dict[str, object], key: str, width: int) -> NDArray[
 def _values(name: str, data: dict[str, object], key: str) -> NDArray[np.floating]:
     if key not in data:
         raise UserError(f"{name}: no key '{key}'")
-    value = data[key]
-    if isinstance(value, float | int):
-        value = np.asarray(value, dtype=np.float64)
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
-        raise UserError(f"{name}: {key} is not an array of numbers")
-    return value
+    try:
+        return _decode_numbers(data[key])
+    except (_Refused, ValueError, OverflowError) as error:  # not latin1, or an integer beyond float64
+        raise UserError(f"{name}: {key} is not an array of numbers: {error}") from None
 
 
 def load_aist_pickle(path: Path, name: str | None = None) -> dict[str, object]:
-    """The dict of a pickle of plain values and numpy arrays; `UserError` naming the file otherwise."""
+    """Return the dict of a pickle, arrays as undecoded records; `UserError` naming the file otherwise."""
     name = str(path) if name is None else name
     if not path.is_file():
         raise UserError(f"{name}: no such file")
@@ -120,8 +111,11 @@ def load_aist_pickle(path: Path, name: str | None = None) -> dict[str, object]:
         raise UserError(f"{name}: {size} bytes; an annotation has between 1 and {MAX_BYTES}")
     raw = path.read_bytes()
     try:
-        _check_opcodes(raw)
-        return _plain(_Restricted(io.BytesIO(raw), encoding="latin1").load())
+        _require_bounded(raw)
+        data = _Unpickler(io.BytesIO(raw), encoding="latin1").load()
+        if not isinstance(data, dict) or not all(isinstance(key, str) for key in data):
+            raise _Refused(f"it holds a {type(data).__name__}, not a dict of named values")
+        return data
     except _Refused as error:
         raise UserError(f"{name}: refused, {error}") from None
     except MemoryError:
@@ -132,144 +126,84 @@ def load_aist_pickle(path: Path, name: str | None = None) -> dict[str, object]:
         ) from None
 
 
-def _plain(data: object) -> dict[str, object]:
-    if not isinstance(data, dict) or not all(isinstance(key, str) for key in data):
-        raise _Refused(f"it holds a {type(data).__name__}, not a dict of named values")
-    return {key: value.values() if isinstance(value, _Array) else value for key, value in data.items()}
-
-
 class _Refused(Exception):  # noqa: N818 (a decision, not an error)
-    """What a file asks for and is refused."""
+    """A pickle asks for something that an annotation never needs."""
 
 
-def _check_opcodes(raw: bytes) -> None:
-    calls = 0
+def _require_bounded(raw: bytes) -> None:
+    """Refuse what makes the unpickler itself take memory; `genops` compares stated lengths with the data."""
     for number, (opcode, argument, _) in enumerate(pickletools.genops(raw)):
         if number >= MAX_OPCODES:
             raise _Refused(f"more than {MAX_OPCODES} pickle instructions")
-        if opcode.name not in _OPCODES:
-            shown = f" {argument!r:.80}" if argument is not None else ""
-            raise _Refused(f"pickle instruction {opcode.name}{shown}")
-        calls += opcode.name in ("REDUCE", "BUILD")
-        if calls > MAX_CALLS:
-            raise _Refused(f"more than {MAX_CALLS} arrays and other objects")
-        if opcode.name in ("PUT", "LONG_BINPUT") and (argument or 0) > MAX_OPCODES:
-            raise _Refused(f"memo place {argument}")  # the unpickler would make room for all before it
+        # Python before 3.14 makes room for all memo places below the one that is named (gh-115952).
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and argument > MAX_OPCODES:
+            raise _Refused(f"memo place {argument}")
 
 
-class _DType:
-    """Stand-in for `numpy.dtype`: a plain number type, without objects, fields or text."""
+class _Record:
+    """A name in a pickle, what it is called with, and the state of the result; nothing is called."""
 
-    __slots__ = ("found",)
+    __match_args__ = ("name", "arguments", "state")
 
-    def __init__(self, code: object, *_: object) -> None:
-        if not isinstance(code, str) or code not in _KINDS:
-            raise _Refused(f"array type {code!r:.40}; plain numbers only")
-        self.found = _KINDS[code]
+    def __init__(self, name: str, arguments: tuple[object, ...] = ()) -> None:
+        self.name, self.arguments = name, arguments
+        self.state: object = None
+
+    def __call__(self, *arguments: object) -> _Record:
+        return _Record(self.name, arguments)
 
     def __setstate__(self, state: object) -> None:
-        if not isinstance(state, tuple):
-            raise _Refused("an array without a state")
-        order = state[1]
-        if order not in ("<", ">", "|", "=") or any(part is not None for part in state[2:5]):
-            raise _Refused("an array type with fields")
-        self.found = self.found.newbyteorder(order)
+        self.state = state
 
 
-class _Array:
-    """Stand-in for `numpy.ndarray`: collects type, shape and bytes, and checks that they fit."""
-
-    __slots__ = ("found",)
-
-    def __init__(self) -> None:
-        self.found: NDArray[np.floating] | None = None
-
-    def __setstate__(self, state: object) -> None:
-        if not isinstance(state, tuple):
-            raise _Refused("an array without a state")
-        _, shape, kind, fortran, raw = state
-        if not isinstance(kind, _DType) or not isinstance(shape, tuple) or len(shape) > 3:
-            raise _Refused("an array without a plain type and shape")
-        if any(type(size) is not int or size < 0 for size in shape):
-            raise _Refused(f"array shape {shape!r:.60}")
-        self.found = _from_bytes(raw, kind, shape, "F" if fortran else "C")
-
-    def values(self) -> NDArray[np.floating]:
-        if self.found is None:
-            raise _Refused("an array that is named but not filled")
-        return self.found
-
-
-def _from_bytes(
-    raw: object, kind: _DType, shape: tuple[int, ...], order: Literal["C", "F"]
-) -> NDArray[np.floating]:
-    if isinstance(raw, str):
-        raw = raw.encode("latin1")  # pickles of Python 2 keep bytes as text
-    if not isinstance(raw, bytes):
-        raise _Refused("an array of Python objects")
-    expected = kind.found.itemsize
-    for size in shape:
-        expected *= size
-    if len(raw) != expected:
-        raise _Refused(f"an array of shape {list(shape)} with {len(raw)} bytes instead of {expected}")
-    native = kind.found.newbyteorder("=")
-    made: NDArray[np.floating] = np.frombuffer(raw, kind.found).reshape(shape, order=order).astype(native)
-    return made
-
-
-class _Callable:
-    """An allowed global: it can be called, and nothing else about it can be changed."""
-
-    __slots__ = ("_make",)
-
-    def __init__(self, make: Callable[..., object]) -> None:
-        self._make = make
-
-    def __call__(self, *arguments: object) -> object:
-        return self._make(*arguments)
-
-    def __setstate__(self, state: object) -> None:
-        raise _Refused("an attempt to change a function")
-
-
-def _reconstruct(kind: object, *_: object) -> _Array:
-    if kind is not _NDARRAY:
-        raise _Refused("an array of another class than numpy.ndarray")
-    return _Array()
-
-
-def _encode(text: object, encoding: object = None) -> bytes:
-    """`_codecs.encode` as Python 2's protocols use it for bytes; other codecs could unpack or loop."""
-    if not isinstance(text, str) or encoding != "latin1":
-        raise _Refused(f"_codecs.encode with {encoding!r:.40}")
-    return text.encode("latin1")
-
-
-def _scalar(kind: object, raw: object) -> float:
-    if not isinstance(kind, _DType):
-        raise _Refused("a number without a plain type")
-    return float(_from_bytes(raw, kind, (), "C"))
-
-
-def _no_call(*_: object) -> object:
-    raise _Refused("a call of numpy.ndarray")
-
-
-_NDARRAY = _Callable(_no_call)
-_NUMPY = {"_reconstruct": _Callable(_reconstruct), "scalar": _Callable(_scalar)}
-ALLOWED: dict[str, object] = {
-    "numpy.ndarray": _NDARRAY,
-    "numpy.dtype": _Callable(_DType),
-    "_codecs.encode": _Callable(_encode),
-    **{f"numpy.core.multiarray.{name}": made for name, made in _NUMPY.items()},
-    **{f"numpy._core.multiarray.{name}": made for name, made in _NUMPY.items()},
-}
-"""Every global that a file may name, and what it gets instead."""
-
-
-class _Restricted(pickle.Unpickler):
+class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> object:
-        found = ALLOWED.get(f"{module}.{name}")
-        if found is None:
+        # numpy 2 renamed numpy.core.
+        asked = f"{module}.{name}".replace("numpy._core.", "numpy.core.")
+        if asked not in ALLOWED:
             raise _Refused(f"the file asks for '{module}.{name}', which an annotation never needs")
-        return found
+        return _Record(asked)
+
+
+def _decode_numbers(value: object) -> NDArray[np.floating]:
+    """Return the array or number that a record describes, as numpy's own pickling would."""
+    match value:
+        case float() | int():
+            return np.asarray(value, dtype=np.float64)
+        case _Record("numpy.core.multiarray._reconstruct", _, (_, shape, kind, fortran, data)):
+            order = "F" if fortran else "C"
+        case _Record("numpy.core.numeric._frombuffer", (data, kind, shape, order)):
+            pass
+        case _Record("numpy.core.multiarray.scalar", (kind, data)):
+            shape, order = (), "C"
+        case _:
+            raise _Refused("of another kind")
+    sizes = shape if isinstance(shape, tuple) and len(shape) <= 3 else (-1,)
+    if any(type(size) is not int or not 0 <= size <= MAX_BYTES for size in sizes):
+        raise _Refused(f"array shape {shape!r:.60}")
+    dtype, raw = _decode_dtype(kind), _decode_bytes(data)
+    expected = math.prod(sizes) * dtype.itemsize
+    if len(raw) != expected:
+        raise _Refused(f"an array of shape {list(sizes)} with {len(raw)} bytes instead of {expected}")
+    values = np.frombuffer(raw, dtype).reshape(sizes, order="F" if order == "F" else "C")
+    return np.asarray(values, dtype=dtype.newbyteorder("="))
+
+
+def _decode_dtype(kind: object) -> np.dtype[np.floating]:
+    """Return a type of plain numbers; objects, fields, complex numbers and text are refused."""
+    match kind:
+        case _Record(
+            "numpy.dtype", (str(code), *_), (_, "<" | ">" | "|" | "=" as order, None, None, None, *_)
+        ):
+            if code in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"):
+                return np.dtype(code).newbyteorder(order)
+    raise _Refused("array type that is no plain number")
+
+
+def _decode_bytes(data: object) -> bytes | bytearray:
+    match data:
+        case _Record("_codecs.encode", (str(text), "latin1"), None) | str(text):
+            return text.encode("latin1")
+        case bytes() | bytearray():
+            return data
+    raise _Refused("an array without its bytes")

@@ -31,7 +31,7 @@ def saved(folder: Path, data: object, protocol: int = 4) -> Path:
     return path
 
 
-@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("protocol", range(6))
 def test_every_protocol_gives_the_same_numbers(tmp_path: Path, protocol: int) -> None:
     data = annotation(smpl_poses=np.asfortranarray(annotation()["smpl_poses"]))
     path = saved(tmp_path, data, protocol)
@@ -40,7 +40,6 @@ def test_every_protocol_gives_the_same_numbers(tmp_path: Path, protocol: int) ->
     assert np.array_equal(motion.trans, data["smpl_trans"])
     assert motion.scaling == 93.5
     assert np.allclose(motion.metres(), data["smpl_trans"] / 93.5)
-    assert load_aist_pickle(path)["smpl_loss"] == 0.25
 
 
 def test_big_endian_and_old_numpy_names(tmp_path: Path) -> None:
@@ -57,6 +56,7 @@ def test_big_endian_and_old_numpy_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
+        ({"smpl_scaling": 10**400}, "smpl_scaling"),
         ({"smpl_poses": None}, "no key 'smpl_poses'"),
         ({"smpl_poses": np.zeros((5, 24, 3), np.float32)}, r"smpl_poses is \[5, 24, 3\], not \[T, 72\]"),
         ({"smpl_poses": np.zeros((0, 72), np.float32)}, "smpl_poses is"),
@@ -100,9 +100,8 @@ def test_no_other_global_is_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (Call(np.load, "a.pkl"), "'numpy.load'"),
         (Call(np.zeros, 10**12), "'numpy.zeros'|multiarray.zeros"),
         (Call(bytearray, 2**40), r"'builtins\.bytearray'"),
-        (Call(codecs.encode, b"x", "zlib_codec"), r"_codecs\.encode with 'zlib_codec'"),
+        (Call(codecs.decode, b"x", "zlib_codec"), r"'_codecs\.decode'"),
         (Path("x"), "pathlib"),
-        ({1, 2}, "pickle instruction EMPTY_SET"),
     ]
     for attack, reason in attacks:
         path = saved(tmp_path, annotation(extra=attack))
@@ -111,42 +110,55 @@ def test_no_other_global_is_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert [found.name for found in tmp_path.iterdir()] == ["a.pkl"]
 
 
-def test_memory_is_bound_by_the_file(tmp_path: Path) -> None:
-    path = saved(tmp_path, annotation(), 2)
-    raw = path.read_bytes()
-    # The shape of smpl_trans claims 2**31 - 1 frames.
-    shape = b"K\x05K\x03\x86"
-    assert raw.count(shape) == 1
-    path.write_bytes(raw.replace(shape, b"J\xff\xff\xff\x7fK\x03\x86"))
-    with pytest.raises(UserError, match="bytes instead of 257698037"):
-        read_aist_motion(path)
-    path.write_bytes(b"\x80\x02}r\xff\xff\xff\xff.")  # LONG_BINPUT: room for 2**32 memo entries
-    with pytest.raises(UserError, match="memo place"):
-        read_aist_motion(path)
-    path.write_bytes(b"\x80\x04\x8d" + struct.pack("<Q", 2**62) + b"x.")
-    with pytest.raises(UserError, match="cut short or damaged"):
-        read_aist_motion(path)
-    path.write_bytes(b"\x80\x02" + b"N" * 2000 + b".")
-    with pytest.raises(UserError, match="more than 1000 pickle instructions"):
-        read_aist_motion(path)
-
-
-def test_allowed_names_cannot_be_changed_or_misused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("stream", "reason"),
+    [
+        (b"\x80\x02}r\xff\xff\xff\xff.", "memo place 4294967295"),  # LONG_BINPUT: room for 2**32 entries
+        (b"\x80\x04\x8d" + struct.pack("<Q", 2**62) + b"x.", "cut short or damaged"),
+        (b"\x80\x05\x96" + struct.pack("<Q", 2**40) + b"x.", "cut short or damaged"),
+        (b"\x80\x02" + b"N" * 2000 + b".", "more than 1000"),
+        (b"cnumpy\ndtype\n.", "dict"),
+        (b"(I1\nI2\nd.", "dict"),
+        (b"(S'touch PWNED'\nios\nsystem\n.", r"os\.system"),  # INST names a class by itself
+    ],
+)
+def test_hostile_instructions(tmp_path: Path, stream: bytes, reason: str) -> None:
     path = tmp_path / "a.pkl"
-    streams = {
-        # BUILD on the stand-in of a function
-        b"cnumpy._core.multiarray\n_reconstruct\n}b.": "change a function",
-        b"cnumpy\nndarray\n(I4\ntR.": "call of numpy.ndarray",
-        b"cnumpy._core.multiarray\n_reconstruct\n(I1\n(I0\ntS'b'\ntR.": "another class",
-        b"(S'a'\ncnumpy._core.multiarray\n_reconstruct\n(cnumpy\nndarray\n(I0\ntS'b'\ntRd.": "not filled",
-        b"(I1\nI2\nd.": "not a dict of named values",
-        b"(" + b"cnumpy\ndtype\n(S'f4'\ntR" * 65 + b"l.": "more than 64 arrays",
-        b"ios\nsystem\n(S'touch PWNED'\nt.": "instruction INST",
-    }
-    for raw, reason in streams.items():
-        path.write_bytes(raw)
-        with pytest.raises(UserError, match=rf"a\.pkl: refused, .*{reason}"):
-            load_aist_pickle(path)
+    path.write_bytes(stream)
+    with pytest.raises(UserError, match=rf"a\.pkl: .*{reason}"):
+        load_aist_pickle(path)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        b"cnumpy\nndarray\n(I4\nt\x81",  # NEWOBJ of a record is no call of a class
+        b"cnumpy\nndarray\n(I4\ntR",
+        b"cnumpy._core.multiarray\n_reconstruct\n(I1\n(I0\ntS'b'\ntR",  # an array that is never filled
+        b"cnumpy._core.multiarray\nscalar\n(cnumpy\ndtype\n(S'O8'\ntRS'x'\ntR",
+        b"cnumpy._core.multiarray\n_reconstruct\n}b",  # the state of a function
+        b"cnumpy\ndtype\n(S'f4'\ntR(I3\nS'>'\nNNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb",
+    ],
+)
+def test_allowed_names_are_not_misused(tmp_path: Path, value: bytes) -> None:
+    path = saved(tmp_path, annotation())
+    raw = path.read_bytes()
+    path.write_bytes(b"(S'smpl_poses'\n" + value + b"d.")
+    with pytest.raises(UserError, match=r"a\.pkl: "):
+        read_aist_motion(path)
+    path.write_bytes(raw)
+    assert read_aist_motion(path).poses.dtype == np.float32, "nothing outlives a file"
+    assert np.dtype("f4").isnative
+
+
+@pytest.mark.parametrize("frames", [b"J\xff\xff\xff\x7f", b"J\x00\x00\x10\x00"])
+def test_shapes_beyond_their_data(tmp_path: Path, frames: bytes) -> None:
+    path = saved(tmp_path, annotation(), 2)
+    raw, shape = path.read_bytes(), b"K\x05K\x03\x86"
+    assert raw.count(shape) == 1
+    path.write_bytes(raw.replace(shape, frames + b"K\x03\x86"))
+    with pytest.raises(UserError, match="smpl_trans is not an array of numbers"):
+        read_aist_motion(path)
 
 
 def test_any_cut_or_flipped_byte_is_an_error_or_other_numbers(tmp_path: Path) -> None:
