@@ -249,7 +249,7 @@ def serve(
     }
     config = ServeConfig.parse(asked, "serve")
     try:
-        from motionloom.pipeline.serve.command import serve as run_server
+        from motionloom.pipeline.serve.server import serve as run_server
     except ModuleNotFoundError as error:
         if error.name not in ("starlette", "uvicorn"):
             raise

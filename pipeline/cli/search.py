@@ -1,4 +1,4 @@
-"""`motionloom search`: clips of a data set by words or by likeness, here or on a page."""
+"""`motionloom search`: clips of a data set by words or by likeness."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from motionloom.pipeline.launch.console import make_console
 
 def search(
     root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
-    words: Annotated[str, typer.Argument(help="What the person does; without it, a page to type it.")] = "",
+    words: Annotated[str, typer.Argument(help="What the person does.")] = "",
     like: Annotated[
         str, typer.Option(help="A clip's id, or a file (.npz of generate, .npy): clips like it.")
     ] = "",
@@ -23,35 +23,20 @@ def search(
         str, typer.Option(help="Run, export or shipped model whose TMA reads words and motions.")
     ] = "synthetic",
     count: Annotated[int, typer.Option(min=1, help="Clips to list.")] = 12,
-    port: Annotated[int, typer.Option(help="Port of the page; 0 takes a free one.")] = 8000,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """The clips of a data set that are nearest to words, or to a clip; without either, a page that asks.
+    """List the clips of a data set that are nearest to words, or to a clip.
 
     Embeddings of all clips are made once and kept beside the shards.
 
     Example: `motionloom search shards "turns left and waves"`
 
     Example: `motionloom search shards --like synth-0-000012`
-
-    Example: `motionloom search shards --port 0`
     """
     console = make_console(aside=as_json)
-    if words and like:
-        raise UserError("search: give words or --like, not both")
-    if not (words or like):
-        from motionloom.pipeline.serve.requests import ServeConfig
-
-        config = ServeConfig.parse({"port": port}, "search")
-        try:
-            from motionloom.pipeline.serve.search import serve_search
-        except ModuleNotFoundError as error:
-            if error.name not in ("starlette", "uvicorn"):
-                raise
-            raise UserError(f"the page needs {error.name}: pip install 'motionloom[serve]'") from None
-        serve_search(root, model, config, device=device, console=console)
-        return
+    if bool(words) == bool(like):
+        raise UserError("search: give words or --like, one of them")
     from motionloom.pipeline.evaluation.search import Search
 
     found = Search.open(root, model, device=device, progress=True)

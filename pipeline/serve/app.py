@@ -9,10 +9,14 @@ import traceback
 import uuid
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import Future
+from importlib import resources
 from typing import TypeVar
 from urllib.parse import quote
 
+from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
@@ -21,16 +25,19 @@ from starlette.types import ASGIApp
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, change, received, why_not
-from motionloom.pipeline.serve.guard import BROKEN, guarded, read_body
+from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
 T = TypeVar("T")
 Asked = TypeVar("Asked", MotionRequest, ChangeRequest)
 
+_BROKEN = "something broke here; the server's log says what"
+
 _SCRIPTS = ("serve.js", "edit.js", "lanes.js", "figure.js", "task.js")
-"""Of the page, besides the viewer's."""
+"""Scripts of the page, besides the viewer's."""
 
 _UPLOADS = 4
 """Sounds and clips that are received at a time; others wait unread."""
@@ -46,11 +53,18 @@ class Site:
         self.model, self.config, self.worker, self.name = model, config, worker, name
         self.sounds, self.clips = Sounds(config), Clips(model, config)
         self._uploads = asyncio.Semaphore(_UPLOADS)
+        self._assets = {
+            "serve.css": resource("viewer/viewer.css") + _web_file("serve.css"),
+            "viewer.js": viewer_script(),
+            **{script: _web_file(script) for script in _SCRIPTS},
+        }
 
     @property
     def app(self) -> ASGIApp:
         """The ASGI application."""
         routes = [
+            Route("/", self.page),
+            Route("/assets/{name}", self.asset),
             Route("/api/info", self.info),
             Route("/api/generate", self.generate, methods=["POST"]),
             Route("/api/stream", self.stream, methods=["POST"]),
@@ -58,7 +72,26 @@ class Site:
             Route("/api/clips", self.add_clip, methods=["POST"]),
             Route("/api/edit", self.edit, methods=["POST"]),
         ]
-        return guarded("page.html", _SCRIPTS, routes, self.config.host, self.config.allow_hosts)
+        hosts = allowed_hosts(self.config)
+        return Starlette(
+            routes=routes,
+            middleware=[
+                Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
+                Middleware(OwnPage),
+            ],
+            exception_handlers={HTTPException: refused, Exception: broken},
+        )
+
+    async def page(self, request: Request) -> Response:
+        return Response(_web_file("page.html"), media_type="text/html; charset=utf-8")
+
+    async def asset(self, request: Request) -> Response:
+        """A script or the style, from memory."""
+        name = request.path_params["name"]
+        if name not in self._assets:
+            raise HTTPException(404)
+        kind = "text/css" if name.endswith(".css") else "text/javascript"
+        return Response(self._assets[name], media_type=f"{kind}; charset=utf-8")
 
     async def info(self, request: Request) -> Response:
         bundle, limits = self.model.bundle, self.config
@@ -119,8 +152,8 @@ class Site:
                     if gone or self.worker.stopped:
                         break
             except Exception as error:
-                words = str(error) if isinstance(error, UserError) else BROKEN
-                if words is BROKEN:
+                words = str(error) if isinstance(error, UserError) else _BROKEN
+                if words is _BROKEN:
                     traceback.print_exception(error, file=sys.stderr)
                 said = json.dumps({"error": words, "request": asked.request}) + "\n"
                 loop.call_soon_threadsafe(pieces.put_nowait, said)
@@ -221,6 +254,26 @@ class Site:
             raise HTTPException(400, str(error), named) from None
         except Stopped:
             raise HTTPException(503, "the server is stopping", named) from None
+
+
+async def refused(request: Request, error: Exception) -> Response:
+    """Return a refusal as JSON of one sentence, which names its request."""
+    assert isinstance(error, HTTPException)
+    words = {404: "no such page", 405: "no such method here"}.get(error.status_code, error.detail)
+    body, headers = {"error": words}, dict(error.headers or {})
+    if "x-request" in headers:
+        body["request"] = headers["x-request"]
+    return JSONResponse(body, error.status_code, headers)
+
+
+async def broken(request: Request, error: Exception) -> Response:
+    """Return 500 for an error of ours, which Starlette logs."""
+    return JSONResponse({"error": _BROKEN}, 500)
+
+
+def _web_file(name: str) -> str:
+    """Return the text of a file of the folder `web`."""
+    return (resources.files("motionloom.pipeline.serve") / "web" / name).read_text(encoding="utf-8")
 
 
 def _plain(name: object) -> str:

@@ -39,7 +39,7 @@ class ServeConfig(Config):
     port: int = Field(8000, ge=0, le=65535)
     """0 takes a free one."""
     allow_hosts: tuple[str, ...] = ()
-    """Names that the server is reached by, besides localhost and addresses."""
+    """Names and addresses that the server is reached by, besides localhost and `host`."""
     waiting: int = Field(32, ge=1)
     """Requests that wait for the model; more are refused."""
     max_seconds: float = Field(30.0, gt=0)
@@ -59,9 +59,9 @@ class ServeConfig(Config):
     max_request_kb: float = Field(16.0, gt=0)
     """Largest request besides a sound or a clip."""
     patience: float = Field(20.0, gt=0)
-    """Seconds in which a request must have arrived, its headers first."""
+    """Seconds in which the body of a request must have arrived."""
     connections: int = Field(256, ge=1)
-    """Connections at a time; one more takes the place of one that asks for nothing, or is closed."""
+    """Connections at a time; one more is answered 503."""
 
 
 def known_answer(name: str) -> str:

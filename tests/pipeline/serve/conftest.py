@@ -155,10 +155,10 @@ class Served:
 
 
 @contextmanager
-def _run_site(site: Callable[[ServeConfig, Worker], Any], **settings: Any) -> Iterator[Served]:
+def _run_server(model: Any, **settings: Any) -> Iterator[Served]:
     config = ServeConfig(port=0, **settings)
     place, worker = listen(config), Worker(config.waiting)
-    server = server_of(site(config, worker), worker)
+    server = server_of(Site(model, config, worker, "quick"), worker)
     thread = threading.Thread(target=server.run, args=([place],), daemon=True)
     thread.start()
     made = Served(place.getsockname()[1], server, worker, thread)
@@ -174,19 +174,9 @@ def _run_site(site: Callable[[ServeConfig, Worker], Any], **settings: Any) -> It
 
 
 @pytest.fixture(scope="session")
-def run_site() -> Callable[..., Any]:
-    """`with run_site(lambda config, worker: site) as served`."""
-    return _run_site
-
-
-@pytest.fixture(scope="session")
 def run_server() -> Callable[..., Any]:
     """`with run_server(model, waiting=4) as served`."""
-
-    def run(model: Any, **settings: Any) -> Any:
-        return _run_site(lambda config, worker: Site(model, config, worker, "quick"), **settings)
-
-    return run
+    return _run_server
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.generators.whole import WholeMotion
-from motionloom.pipeline.serve import command, server
+from motionloom.pipeline.serve import guard, server
 from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.server import listen
 
@@ -149,50 +149,15 @@ def test_a_slow_request_is_let_go(run_server: Callable[..., Any], quick: Any) ->
         assert raw.recv(64).startswith(b"HTTP/1.1 408")
 
 
-def test_half_sent_headers_are_let_go(run_server: Callable[..., Any], quick: Any) -> None:
-    """At first, and behind a request that was answered."""
-    whole = b"GET /api/info HTTP/1.1\r\nHost: localhost\r\n\r\n"
-    with run_server(quick, patience=0.3) as served:
-        for sent in (b"", b"GET / HTTP/1.1\r\nHost: loc", whole + b"GET / HTTP/1.1\r\nHo"):
-            with socket.create_connection(("127.0.0.1", served.port)) as raw:
-                raw.settimeout(20)
-                raw.sendall(sent)
-                while raw.recv(4096):
-                    pass
-        assert served.post("/api/generate", WAVE).status == 200
-
-
-def test_idle_connections_make_room_and_lock_nobody_out(run_server: Callable[..., Any], quick: Any) -> None:
-    with run_server(quick, connections=2) as served:
-        held = [socket.create_connection(("127.0.0.1", served.port)) for _ in range(6)]
-        for raw in held[:4]:
-            raw.settimeout(20)
-            with contextlib.suppress(ConnectionResetError):
-                assert raw.recv(1) == b"", "the longest are closed"
+def test_connections_are_bounded(run_server: Callable[..., Any], quick: Any) -> None:
+    with run_server(quick, connections=2) as served, contextlib.ExitStack() as held:
+        for _ in range(2):
+            held.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+        served.wait_for(lambda: len(served.server.server_state.connections) == 2)
+        assert served.ask("GET", "/api/info").status == 503
+        held.close()
+        served.wait_for(lambda: not served.server.server_state.connections)
         assert served.ask("GET", "/api/info").status == 200
-        for raw in held:
-            raw.close()
-
-
-def test_who_was_answered_last_stays(run_server: Callable[..., Any], quick: Any) -> None:
-    def asked(one: http.client.HTTPConnection) -> int:
-        one.request("GET", "/api/info")
-        answer = one.getresponse()
-        answer.read()
-        return answer.status
-
-    with run_server(quick, connections=2) as served:
-        first, second, third = (
-            http.client.HTTPConnection("127.0.0.1", served.port, timeout=20) for _ in range(3)
-        )
-        first.connect()
-        assert asked(second) == asked(first) == asked(third) == 200
-        with contextlib.suppress(ConnectionResetError):
-            assert second.sock.recv(1) == b""
-        kept = first.sock
-        assert asked(first) == 200 and first.sock is kept
-        for one in (first, second, third):
-            one.close()
 
 
 def test_names_that_no_header_can_carry(served: Any) -> None:
@@ -211,18 +176,20 @@ def test_a_bug_is_a_sentence_and_the_server_goes_on(served: Any, capsys: Any) ->
 
 
 HOSTS: list[tuple[dict[str, str], int, int]] = [
-    ({"Host": "evil.example"}, 403, 403),
-    ({"Host": "evil.example:8000"}, 403, 403),
-    ({"Host": "localhost.evil.example"}, 403, 403),
-    ({"Host": "192.168.1.5"}, 403, 403),
-    ({"Host": "[::1"}, 403, 403),
+    ({"Host": "evil.example"}, 400, 400),
+    ({"Host": "evil.example:8000"}, 400, 400),
+    ({"Host": "localhost.evil.example"}, 400, 400),
+    ({"Host": "localhost#.evil.example"}, 400, 400),
+    ({"Host": "192.168.1.5"}, 400, 400),
+    ({"Host": "[::1"}, 400, 400),
     ({"Origin": "http://evil.example"}, 403, 403),
     ({"Origin": "null"}, 403, 403),
     ({"Sec-Fetch-Site": "cross-site"}, 403, 403),
     ({"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate"}, 200, 403),  # a link may be followed
     ({"Host": "localhost", "Origin": "http://localhost", "Sec-Fetch-Site": "same-origin"}, 200, 200),
+    ({"Host": "[::1]:80"}, 200, 200),
 ]
-"""What a browser says of a request, and the answers to GET of the page and POST."""
+"""Headers of a browser, and the answers to GET of the page and POST."""
 
 
 def test_other_sites_are_refused(served: Any, quick: Any) -> None:
@@ -233,14 +200,15 @@ def test_other_sites_are_refused(served: Any, quick: Any) -> None:
         assert (seen.status, made.status) == (page, post), headers
         for got in (seen, made):
             assert "default-src" in got.headers["content-security-policy"]
-            assert got.status == 200 or got.json["error"]
         assert len(quick.asked) - before == (post == 200)
 
 
 def test_names_that_are_allowed(run_server: Callable[..., Any], quick: Any) -> None:
-    with run_server(quick, host="0.0.0.0", allow_hosts=("studio.lan",)) as served:
-        for host, status in (("studio.lan", 200), ("192.168.1.5:80", 200), ("evil.example", 403)):
+    with run_server(quick, host="0.0.0.0", allow_hosts=("Studio.lan", "192.168.1.5")) as served:
+        for host, status in (("studio.lan", 200), ("192.168.1.5:80", 200), ("10.0.0.1", 400)):
             assert served.ask("GET", "/api/info", headers={"Host": host}).status == status
+    with pytest.raises(UserError, match="allow_hosts"):
+        guard.allowed_hosts(ServeConfig(allow_hosts=("*.lan",)))
 
 
 def test_music_is_sent_and_driven_by(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -345,8 +313,7 @@ def test_a_taken_port_is_one_sentence() -> None:
 def test_without_the_extra_it_says_so(
     monkeypatch: pytest.MonkeyPatch, call: Callable[..., Any], tmp_path: Path
 ) -> None:
-    for name in ("command", "server"):
-        monkeypatch.delitem(sys.modules, f"motionloom.pipeline.serve.{name}")
+    monkeypatch.delitem(sys.modules, "motionloom.pipeline.serve.server")
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     done = call("serve", tmp_path)
     assert done.code == 2 and "serve needs uvicorn: pip install 'motionloom[serve]'" in done.err
@@ -366,11 +333,11 @@ def test_the_command_says_where_and_who_can_reach_it(
             assert places[0].getsockname()[0] == host
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(command.MotionModel, "from_pretrained", lambda *_, **options: quick)
-    monkeypatch.setattr(command, "warm", lambda model: None)
+    monkeypatch.setattr(server.MotionModel, "from_pretrained", lambda *_, **options: quick)
+    monkeypatch.setattr(server, "warm", lambda model: None)
     monkeypatch.setattr(server, "server_of", lambda site, worker: Interrupted())
     said = Console(file=io.StringIO(), width=200)
-    command.serve(tmp_path, ServeConfig(host=host, port=0), console=said)
+    server.serve(tmp_path, ServeConfig(host=host, port=0), console=said)
     text = said.file.getvalue()  # type: ignore[attr-defined]
     assert f": http://{host}:" in text and text.endswith("stopped\n")
     assert ("others can reach this server" in text) == warned
