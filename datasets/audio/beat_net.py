@@ -1,11 +1,11 @@
-"""The network that hears beats: levels of bands in, for each row how likely a beat and a downbeat are.
+"""Beat network: levels of 64 mel bands in, for each row the probability of a beat and of a downbeat out.
 
-Dilated convolutions over 60 rows a second hear some eight seconds to both sides of a row. The weights in this
-package (`beats.safetensors`) were trained by the recipe `beats` on songs that a band of General MIDI
+Row t is centred at t / 60 s. Dilated convolutions see some eight seconds to both sides of a row. The weights
+in this package (`beats.safetensors`) were trained by the recipe `beats` on songs that a band of General MIDI
 instruments plays, whose beats are known; `stages/networks/beats.py` says how they are made.
 
-What a recording does to music is taken out before the network: power becomes decibels, of which each band's
-mean over the piece is subtracted, so that neither gain nor equaliser counts.
+Gain and equaliser of a recording are taken out before the network: power becomes decibels, of which each
+band's mean over the piece is subtracted. Spectra need no librosa, whose import takes seconds.
 """
 
 from __future__ import annotations
@@ -22,9 +22,21 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from motionloom.datasets.audio.bands import BANDS
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.schema import Config, UserError
+
+BANDS = 64
+ROWS = 60
+"""Rows a second."""
+RATE = 30720
+"""Sample rate that spectra are computed at, Hz."""
+
+_HOP = RATE // ROWS
+_FFT = 2048
+_EDGES = (30.0, 14_000.0)
+_SPECTRA = 2048
+"""Rows of spectra that are computed at a time."""
 
 WEIGHTS = Path(__file__).with_name("beats.safetensors")
 
@@ -33,12 +45,50 @@ _FLOOR = 1e-8
 _BLOCK = 4096
 
 
+def band_power(sound: Sound) -> NDArray[np.float32]:
+    """Return the power of a sound's bands, float32 [1 + n // 512, 64], n its samples at 30720 Hz.
+
+    Bands are triangles, evenly spaced in mel from 30 Hz to 14 kHz, which every recording has something of.
+    """
+    from scipy.fft import rfft
+
+    samples = np.pad(sound.resampled(RATE).samples, _FFT // 2)
+    frames = np.lib.stride_tricks.sliding_window_view(samples, _FFT)[::_HOP]
+    window = np.hanning(_FFT + 1)[:-1].astype(np.float32)
+    blocks = []
+    for start in range(0, len(frames), _SPECTRA):
+        spectrum = np.abs(rfft(frames[start : start + _SPECTRA] * window, axis=1))
+        blocks.append(spectrum**2 @ _filters())
+    return np.concatenate(blocks)
+
+
+def band_from(hertz: float) -> int:
+    """Return the number of the first band whose centre is at or above a frequency."""
+    return int(np.searchsorted(_centres()[1:-1], hertz))
+
+
+def _centres() -> NDArray[np.float64]:
+    """[66] Hz: the centres of the bands, and a point to each side of them."""
+    low, high = (np.log1p(hertz / 700) for hertz in _EDGES)
+    return np.asarray(700 * np.expm1(np.linspace(low, high, BANDS + 2)))
+
+
+@lru_cache(maxsize=1)
+def _filters() -> NDArray[np.float32]:
+    """[1025, 64]: each band rises from the centre of the one below to its own and falls to the next."""
+    hertz = np.fft.rfftfreq(_FFT, 1 / RATE)[:, None]
+    points = _centres()
+    below, centre, above = points[:-2], points[1:-1], points[2:]
+    shape = np.minimum((hertz - below) / (centre - below), (above - hertz) / (above - centre))
+    return np.maximum(shape, 0).astype(np.float32)
+
+
 class BeatNetConfig(Config):
     """Sizes of the network."""
 
     width: int = Field(48, ge=1)
     layers: int = Field(8, ge=1, le=12)
-    """Dilations are 1, 2, 4, ...: each layer doubles how far is heard."""
+    """Dilations are 1, 2, 4, ...: each layer doubles the reach."""
     kernel: int = Field(5, ge=3)
     dropout: float = Field(0.1, ge=0, lt=1)
 
@@ -74,22 +124,23 @@ class BeatNet(nn.Module):
 
 
 def levels(power: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Power [T, 64] of a piece -> levels in units of 10 dB, each band's mean 0: what the network hears."""
+    """Return the network's input of a piece's power [T, 64]: levels in units of 10 dB, each band's mean 0."""
     loudest = float(power.max(initial=0.0))
     if loudest <= 0.0:
         return np.zeros_like(power)
-    found = np.log10(power / loudest + _FLOOR, dtype=np.float32)
-    return np.asarray(found - found.mean(axis=0), dtype=np.float32)
+    decibels = np.log10(power / loudest + _FLOOR, dtype=np.float32)
+    return np.asarray(decibels - decibels.mean(axis=0), dtype=np.float32)
 
 
 @torch.no_grad()
-def activations(net: BeatNet, heard: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Levels [T, 64] -> probabilities [T, 2] of a beat and a downbeat; long pieces block by block."""
-    out = np.empty((len(heard), 2), dtype=np.float32)
-    for start in range(0, len(heard), _BLOCK):
-        stop = min(start + _BLOCK, len(heard))
+def activations(net: BeatNet, rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return probabilities [T, 2] of a beat and a downbeat of levels [T, 64]; long pieces block by block."""
+    out = np.empty((len(rows), 2), dtype=np.float32)
+    for start in range(0, len(rows), _BLOCK):
+        stop = min(start + _BLOCK, len(rows))
+        # Each block is read with all rows that its logits depend on, so that no seam shows.
         first = max(0, start - net.reach)
-        around = torch.from_numpy(heard[first : stop + net.reach])
+        around = torch.from_numpy(rows[first : stop + net.reach])
         logits = net(around[None])[0, start - first : stop - first]
         out[start:stop] = logits.sigmoid().numpy()
     return out

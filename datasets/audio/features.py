@@ -33,7 +33,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from motionloom.datasets.audio import rhythm
 from motionloom.datasets.audio.compiled import load_librosa
 from motionloom.datasets.audio.sound import resample_sound
 from motionloom.datasets.audio.spectra import HOP, mel_power, separate, tuning
@@ -56,6 +55,12 @@ _BINS = 36
 
 _SILENCE = 1e-7
 """-140 dB."""
+
+_BLOCK = 2048
+"""Frames of tempograms made at a time: librosa's take some 20 kB a frame, and its beat tracker makes one only
+to know its mean. Blocks give the same numbers."""
+_TEMPO_SECONDS = 8.0
+"""Length of the windows that the tempo is measured in, as in `librosa.feature.tempo`."""
 
 
 class AudioSettings(Config):
@@ -101,14 +106,14 @@ def audio_features(
         found = separate(samples, settings.rate)
         mfcc = librosa.feature.mfcc(S=librosa.power_to_db(found.mel, ref=np.max), n_mfcc=_MFCC)
         notes = _constant_q(found.harmonic, settings.rate, octaves)
-        onsets = rhythm.onset_strength(found.percussive_mel)
+        onsets = onset_strength(found.percussive_mel)
         columns = [
             mfcc,
             librosa.feature.delta(mfcc, width=3),
             librosa.feature.chroma_cqt(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
             onsets[None],
-            rhythm.flags(_beat_frames(onsets, settings), len(onsets))[None],
-            rhythm.tempogram(onsets, DIM - 54),
+            _flags(_beat_frames(onsets, settings), len(onsets))[None],
+            tempogram(onsets, DIM - 54),
         ]
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 
@@ -130,8 +135,8 @@ def baseline_features(
             onsets[None],
             librosa.feature.mfcc(S=level, n_mfcc=_MFCC),
             librosa.feature.chroma_cens(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
-            rhythm.flags(picked, len(onsets))[None],
-            rhythm.flags(_beat_frames(onsets, settings), len(onsets))[None],
+            _flags(picked, len(onsets))[None],
+            _flags(_beat_frames(onsets, settings), len(onsets))[None],
         ]
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 
@@ -143,7 +148,7 @@ def beats(
     settings = settings or AudioSettings()
     samples = _prepared(samples, rate, settings)
     with _no_remarks():
-        onsets = rhythm.onset_strength(separate(samples, settings.rate).percussive_mel)
+        onsets = onset_strength(separate(samples, settings.rate).percussive_mel)
         return np.asarray(_beat_frames(onsets, settings) / settings.fps)
 
 
@@ -200,9 +205,52 @@ def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArra
 
 
 def _beat_frames(onsets: NDArray[np.float32], settings: AudioSettings) -> NDArray[np.int64]:
-    return rhythm.track_beats(
-        onsets, settings.rate, start_bpm=settings.start_bpm, tightness=settings.tightness
-    )
+    return track_beats(onsets, settings.rate, start_bpm=settings.start_bpm, tightness=settings.tightness)
+
+
+def onset_strength(mel: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Mel power [128, T] -> [T]: the median rise over the bands."""
+    librosa = load_librosa()
+    strength = librosa.onset.onset_strength(S=librosa.power_to_db(mel), aggregate=np.median)
+    return np.asarray(strength)
+
+
+def tempogram(onsets: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Onset strengths [T] -> [width, T]: autocorrelation around each frame, the largest value 1."""
+    return np.concatenate([block.astype(np.float32) for block in _tempograms(onsets, width)], axis=1)
+
+
+def track_beats(
+    onsets: NDArray[np.float32], rate: int, *, start_bpm: float, tightness: float
+) -> NDArray[np.int64]:
+    """`librosa.beat.beat_track`: frames of the beats of onset strengths [T], ascending."""
+    librosa = load_librosa()
+    if not onsets.any():
+        return np.empty(0, dtype=np.int64)
+    width = int(librosa.time_to_frames(_TEMPO_SECONDS, sr=rate, hop_length=HOP))
+    mean = sum(block.sum(axis=1, keepdims=True) for block in _tempograms(onsets, width)) / len(onsets)
+    tempo = librosa.feature.tempo(tg=mean, sr=rate, hop_length=HOP, start_bpm=start_bpm)
+    with np.errstate(divide="ignore"):  # at 5 frames a second a beat can be a frame, and 0 a step it refuses
+        _, found = librosa.beat.beat_track(
+            onset_envelope=onsets, sr=rate, hop_length=HOP, bpm=tempo, tightness=tightness
+        )
+    return np.asarray(found)
+
+
+def _flags(frames: NDArray[np.int64], count: int) -> NDArray[np.float32]:
+    """[count] of zeros, 1 at the frames."""
+    out = np.zeros(count, dtype=np.float32)
+    out[frames] = 1
+    return out
+
+
+def _tempograms(onsets: NDArray[np.float32], width: int) -> Iterator[NDArray[np.float64]]:
+    """[width, frames] of block after block."""
+    padded = np.pad(onsets, width // 2, mode="linear_ramp", end_values=0)
+    for start in range(0, len(onsets), _BLOCK):
+        stop = min(start + _BLOCK, len(onsets))
+        around = padded[start : stop + width - 1]
+        yield load_librosa().feature.tempogram(onset_envelope=around, win_length=width, center=False)
 
 
 @contextmanager

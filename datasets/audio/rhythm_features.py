@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.bands import ROWS, band_from, band_power
+from motionloom.datasets.audio.beat_net import ROWS, band_from, band_power
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.audio.tracker import Beats, track_power
 from motionloom.datasets.schema import UserError
@@ -42,7 +42,7 @@ _SMALLEST_RANGE = 6.0
 def rhythm_features(sound: Sound, fps: float, frames: int) -> NDArray[np.float32]:
     """A whole piece -> float32 [frames, 19]; row k is at k / fps seconds, the last one repeats at the end."""
     if frames < 1 or fps <= 0:
-        raise UserError(f"features cannot be lined up with {frames} frames at {fps:g} a second")
+        raise UserError(f"features cannot be aligned with {frames} frames at {fps:g} a second")
     power = band_power(sound)
     beats = track_power(power)
     at = np.minimum(np.arange(frames) / fps, max(0.0, sound.seconds))

@@ -63,7 +63,7 @@ class Sound:
     analysed: dict[tuple[float, float, int, float | None], NDArray[np.float32]] = field(
         default_factory=dict, repr=False
     )
-    """Features of the piece from a second on, at frames a second, by width (`lineup.features_of`)."""
+    """Features of the piece from a second on, at frames a second, by width (`align_features.features_of`)."""
 
     def __post_init__(self) -> None:
         samples = np.asarray(self.samples, dtype=np.float32)
@@ -88,6 +88,11 @@ class Sound:
     @property
     def seconds(self) -> float:
         return len(self.samples) / self.rate
+
+    @property
+    def silent(self) -> bool:
+        """Whether the mean power is more than 70 dB below full scale [ours]."""
+        return float(np.square(self.samples).mean()) < 1e-7
 
     def slice(self, start: float, end: float | None = None) -> Sound:
         """From second `start` to second `end`, or as far as there is sound; the samples are not copied."""

@@ -1,9 +1,9 @@
-"""Beats and downbeats of music: what the network hears (`beat_net`), decoded into one steady pulse.
+"""Beats and downbeats of music: activations of the beat network (`beat_net`), decoded into one steady pulse.
 
-Beats are the best path through rows and tempi (55 to 215 beats a minute): a beat wants a high activation,
-the rows between two beats want low ones, and the distance of two beats is that of the two before, give or
-take a little. So the pulse goes on through a break, and follows a band that hurries. Bars are then the best
-way to count the beats by three or by four.
+Beats are the best path through rows and tempi (55 to 215 beats a minute), by dynamic programming: activation
+is high on a beat and low between two, and the distance of two beats is nearly that of the two before. So the
+pulse goes on through a break, and follows a band that hurries. Bars are then the best way to count the beats
+by three or by four.
 
 Times lie between rows: a beat is at the centre of its activation's peak.
 """
@@ -11,12 +11,12 @@ Times lie between rows: a beat is at the centre of its activation's peak.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.bands import ROWS, band_power
-from motionloom.datasets.audio.beat_net import activations, levels, load_beat_net
+from motionloom.datasets.audio.beat_net import ROWS, activations, band_power, levels, load_beat_net
 from motionloom.datasets.audio.sound import Sound
 
 SLOWEST, FASTEST = 55.0, 215.0
@@ -28,15 +28,15 @@ PERIODS = np.arange(int(60 * ROWS / FASTEST) + 1, int(60 * ROWS / SLOWEST) + 1)
 _OFTEN = (0.02, 0.98)
 """Activations are kept between these: one row alone never decides."""
 _UNEVEN = 40.0
-"""What it costs to change the tempo, for each e-fold."""
+"""Cost of changing the tempo, in nats for each e-fold."""
 _EAGER = 1.0
-"""What each beat gains beside what is heard, in nats: beats that are faint count too."""
+"""Gain of each beat beside its activation, in nats: faint beats count too."""
 _MODERATE = 2.0
-"""What it costs, each beat, to be an octave away from 120 beats a minute; more by the square."""
+"""Cost of each beat at an octave from 120 beats a minute, in nats; it grows by the square."""
 _ROUNDING = 0.4
-"""What it costs to go to the next period, as beats do whose distance lies between two."""
+"""Cost of going to the next period, as beats do whose distance lies between two."""
 _SLIP = 8.0
-"""What it costs to begin a bar out of turn, in nats."""
+"""Cost of beginning a bar out of turn, in nats."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,35 +55,49 @@ class Beats:
     """0..1: how much more the beats sound like beats than the rows between them do."""
 
 
+NO_BEAT = 0.15
+"""Confidence below which hardly a beat is heard: white noise has 0.07 to 0.14, three real songs 0.25, 0.45
+and 0.85. No test for music: a bare drum or a quiet stretch of a song may have less, speech up to 0.25."""
+_confidences: WeakKeyDictionary[Sound, float] = WeakKeyDictionary()
+
+
+def beat_confidence(sound: Sound) -> float:
+    """Return `Beats.confidence` of the piece that a sound is cut from, computed once."""
+    piece = sound.piece or sound
+    if piece not in _confidences:
+        _confidences[piece] = track(piece).confidence
+    return _confidences[piece]
+
+
 def track(sound: Sound) -> Beats:
-    """Beats of a whole piece; none where it is shorter than two of the slowest."""
+    """Return the beats of a whole piece; none where it is shorter than two of the slowest."""
     return track_power(band_power(sound))
 
 
 def track_power(power: NDArray[np.float32]) -> Beats:
-    """The same by the power [T, 64] of a piece's bands."""
+    """Return the beats of a piece by the power [T, 64] of its bands."""
     return decode(activations(load_beat_net(), levels(power)))
 
 
-def decode(heard: NDArray[np.float32]) -> Beats:
-    """Probabilities [T, 2] of beats and downbeats -> beats."""
-    rows = beat_rows(heard[:, 0])
-    places, meter = bar_places(_peak(heard[:, 1], rows))
-    times = _between_rows(heard[:, 0], rows) / ROWS
-    return Beats(times, places, meter, heard[:, 0].copy(), _confidence(heard[:, 0], rows))
+def decode(probabilities: NDArray[np.float32]) -> Beats:
+    """Return the beats of probabilities [T, 2] of beats and downbeats."""
+    beat, downbeat = probabilities[:, 0], probabilities[:, 1]
+    rows = beat_rows(beat)
+    places, meter = bar_places(_peak(downbeat, rows))
+    return Beats(_between_rows(beat, rows) / ROWS, places, meter, beat.copy(), _confidence(beat, rows))
 
 
 def beat_rows(activation: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Activations [T] -> rows of the beats, ascending; none where T is less than two of the slowest beats."""
+    """Return the rows of the beats of activations [T], ascending; none where T is below two slowest beats."""
     periods = PERIODS
     if len(activation) < 2 * periods[-1]:
         return np.empty(0, dtype=np.int64)
     kept = np.clip(activation, *_OFTEN).astype(np.float64)
-    # The score of no beat at all is taken off. Beside the piece beats cost nothing, so that the first and the
-    # last are within their period from its ends.
+    # Log odds: the score of no beat at all is taken off. Beats beside the piece cost nothing, so that the
+    # first and the last may lie anywhere within their period from its ends.
     gain = np.pad(np.log(kept) - np.log1p(-kept) + _EAGER, periods[-1])
     change = _change_cost(periods)
-    # score[t, i]: of the best beats up to one at row t after which the next follows in periods[i] rows.
+    # Viterbi: score[t, i] is of the best beats up to one at row t, the next being periods[i] rows later.
     score = np.zeros((len(gain), len(periods)), dtype=np.float32)
     came = np.zeros((len(gain), len(periods)), dtype=np.int8)
     columns = np.arange(len(periods))
@@ -91,6 +105,7 @@ def beat_rows(activation: NDArray[np.float32]) -> NDArray[np.int64]:
         best = score[row - periods, columns][:, None] - change
         came[row] = best.argmax(axis=0)
         score[row] = best[came[row], columns] + gain[row]
+    # The best end is a beat in the padding behind the piece; from there the path is followed back.
     after = len(gain) - int(periods[-1])
     back, now = divmod(int(score[after:].argmax()), len(periods))
     rows, row = [], after + back
@@ -103,27 +118,28 @@ def beat_rows(activation: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def bar_places(downbeats: NDArray[np.float32]) -> tuple[NDArray[np.int64], int]:
-    """Downbeat activations of the beats [K] -> places in the bar [K] and the meter that explains them best.
+    """Return places in the bar [K] and the meter that explain the beats' downbeat activations [K] best.
 
     Bars go on through the piece; where music was cut, one may begin out of turn.
     """
     kept = np.clip(downbeats, *_OFTEN).astype(np.float64)
     on, off = np.log(kept), np.log1p(-kept)
-    found = {meter: _count_bars(on, off, meter) for meter in METERS}
-    meter = max(METERS, key=lambda one: found[one][1])
-    return found[meter][0], meter
+    counts = {meter: _count_bars(on, off, meter) for meter in METERS}
+    meter = max(METERS, key=lambda one: counts[one][1])
+    return counts[meter][0], meter
 
 
 def _count_bars(
     on: NDArray[np.float64], off: NDArray[np.float64], meter: int
 ) -> tuple[NDArray[np.int64], float]:
-    """Places [K] of beats with these log-probabilities of being a downbeat or none, and their score."""
+    """Return places [K] of beats, by log-probabilities `on` and `off` of a downbeat, and their score."""
     count = len(on)
     came = np.zeros((count, meter), dtype=np.int64)
     score = np.zeros(meter)
     turn = (np.arange(meter) - 1) % meter
     for beat in range(count):
         if beat:
+            # A beat follows its turn, or the best place of all where a slip costs less than it gains.
             slipped = int(score.argmax())
             late = score[slipped] - _SLIP > score[turn]
             came[beat] = np.where(late, slipped, turn)
@@ -139,7 +155,7 @@ def _count_bars(
 
 
 def _change_cost(periods: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[from, to] between periods: little to a neighbour, much to another tempo, more to an unusual one."""
+    """Return costs [from, to] of periods: little to a neighbour, much to another or an unusual tempo."""
     apart = np.abs(np.log(periods[:, None] / periods[None]))
     steps = np.abs(periods[:, None] - periods[None])
     change = np.where(steps == 0, 0.0, np.where(steps == 1, _ROUNDING, _ROUNDING + _UNEVEN * apart))
@@ -147,13 +163,13 @@ def _change_cost(periods: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _peak(values: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float32]:
-    """The largest of each row and its neighbours."""
+    """Return the largest value of each row and its two neighbours."""
     near = np.clip(rows[:, None] + np.arange(-1, 2), 0, len(values) - 1)
     return np.asarray(values[near].max(axis=1))
 
 
 def _between_rows(values: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Centres of the peaks around rows, at most a row away; rows without a peak stay."""
+    """Return the centres of the peaks around rows, at most a row away; rows without a peak stay."""
     places = np.arange(-2, 3)
     near = np.clip(rows[:, None] + places, 0, len(values) - 1)
     weight = values[near].astype(np.float64)
@@ -163,7 +179,7 @@ def _between_rows(values: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArr
 
 
 def _confidence(activation: NDArray[np.float32], rows: NDArray[np.int64]) -> float:
-    """The mean at the beats, less the mean of what lies midway between two."""
+    """Return the mean at the beats, less the mean midway between two."""
     if len(rows) < 2:
         return 0.0
     middle = (rows[1:] + rows[:-1]) // 2

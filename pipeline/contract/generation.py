@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
 
 
+_JUDGED = 3.0
+"""Seconds that a sound must last for its beats to be remarked on: a few of the slowest."""
+
+
 @dataclass(frozen=True)
 class Prompt:
     """What one motion is conditioned on, as a person gives it and a viewer shows it."""
@@ -42,8 +46,8 @@ class Prompt:
     @property
     def given(self) -> dict[str, object]:
         text = self.text if self.text.strip() else None
-        # Words are not spoilt by a sound that is no music; without any, the sound says how long to stand.
-        sound = None if text is not None and self.unheard else self.sound
+        # Words are not spoilt by silence; without any, the silence says how long to stand.
+        sound = None if text is not None and self.silent else self.sound
         own = {"text": text, "audio": sound}
         pairs = [*own.items(), *self.conditions.items()]
         return {name: value for name, value in pairs if value is not None}
@@ -59,24 +63,25 @@ class Prompt:
         return min((length for length in found if length is not None), default=None)
 
     @property
-    def unheard(self) -> str:
-        """Why its sound is no music, in a few words; empty where it is, or there is none."""
-        if self.sound is None:
-            return ""
-        from motionloom.datasets.audio.heard import heard
-
-        return heard(self.sound).sentence
+    def silent(self) -> bool:
+        """Whether it brings a sound in which nothing is heard."""
+        return self.sound is not None and self.sound.silent
 
     @property
     def stands(self) -> bool:
-        """Whether nothing drives it but a sound that is no music."""
-        return self.modalities == {"audio"} and not self.conditions and bool(self.unheard)
+        """Whether nothing drives it but silence."""
+        return self.modalities == {"audio"} and not self.conditions and self.silent
 
     @property
     def remark(self) -> str:
-        """One sentence on a sound that is no music; else empty."""
-        does = "the figure stands" if self.stands else "its words alone drive the motion"
-        return f"{self.unheard}: {does}" if self.unheard else ""
+        """One sentence on a sound that is silent, or has hardly a beat; else empty."""
+        if self.silent:
+            return f"nothing is heard: {'the figure stands' if self.stands else 'its words drive the motion'}"
+        if self.sound is None or self.sound.seconds < _JUDGED:
+            return ""
+        from motionloom.datasets.audio.tracker import NO_BEAT, beat_confidence
+
+        return "hardly a beat is heard in the sound" if beat_confidence(self.sound) < NO_BEAT else ""
 
     def with_words(self, text: str) -> Prompt:
         return replace(self, text=text)

@@ -113,8 +113,8 @@ class MotionModel(
         """Motions for captions, sounds or both, in order; equal arguments give equal motions.
 
         A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
-        a motion is as long as its sound, or else the model decides. To a sound that is no music it stands, or
-        does what the words say, and it warns. `sampling` is a `SamplingConfig` or a
+        a motion is as long as its sound, or else the model decides. To silence it stands, or does what the
+        words say, and it warns, as of a sound with hardly a beat. `sampling` is a `SamplingConfig` or a
         mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused; of a caption
         that is far from all it was trained on, it warns. What `sampling` leaves out is as the model's export
         recommends, or the default. `seed_motion` is for models that go on from a motion, with whose last

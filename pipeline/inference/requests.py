@@ -56,7 +56,7 @@ def require_words(captions: Iterable[str], name: str = "captions") -> None:
 
 
 def remarks_of(prompts: Iterable[Prompt]) -> list[str]:
-    """What there is to say of prompts whose sound is no music, each once."""
+    """Return the remarks on the prompts' sounds, each once."""
     return list(dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark))
 
 

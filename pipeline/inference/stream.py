@@ -175,7 +175,7 @@ class MotionStream(Iterator[MotionChunk]):
             self._face.condition(segment.prompt, segment.prompt.words)
 
     def _look(self, prompt: Prompt) -> None:
-        """Give notice of words that the model does not know, and of a sound that is no music."""
+        """Give notice of words that the model does not know, and of a sound without a beat."""
         if self._notice is None:
             return
         if prompt.remark and prompt.remark not in self._noticed:

@@ -145,7 +145,7 @@ def notes_of(
     model: MotionModel, asked: MotionRequest, sound: Sound | None, motion: GeneratedMotion | None = None
 ) -> dict[str, list[str]]:
     """What a person should know of the motion: captions that are unlike all that the model knows, what could
-    be said of the body instead, that a sound is no music, and that the motion does something else.
+    be said of the body instead, that a sound has no beat, and that the motion does something else.
     """
     unknown = model.unknown(asked.captions, asked.faces)
     nearest = [text for one in unknown if one.caption in asked.captions for text in one.nearest]

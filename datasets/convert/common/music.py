@@ -75,8 +75,8 @@ def piece_of_music(
     folder: Path, sound: str, settings: AudioSettings | None, fps: float, rate: int
 ) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
     """Features of a whole music file at `fps` (where settings are given), samples at `rate` (unless 0)."""
+    from motionloom.datasets.audio.align_features import rows_at
     from motionloom.datasets.audio.features import audio_features
-    from motionloom.datasets.audio.lineup import rows_at
     from motionloom.datasets.audio.sound import read_sound, resample_sound
 
     if settings is None and not rate:

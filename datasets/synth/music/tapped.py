@@ -19,8 +19,7 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from motionloom.datasets.audio.bands import BANDS, ROWS, band_power
-from motionloom.datasets.audio.beat_net import levels
+from motionloom.datasets.audio.beat_net import BANDS, ROWS, band_power, levels
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.loading.plan import BatchPlan

@@ -1,4 +1,4 @@
-"""A calm stand: what the figure does while no music is heard, and no words say what to do [ours].
+"""A calm stand: what the figure does while nothing is heard, and no words say what to do [ours].
 
 No network knows how to do nothing. So the frames of such a stretch are those of a person who stands with
 lowered arms and breathes, in the layout's own columns; what is before and after it is blended in.

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import torch
 from pydantic import Field
 
-from motionloom.datasets.audio.bands import BANDS, ROWS
-from motionloom.datasets.audio.beat_net import WEIGHTS, BeatNet, BeatNetConfig, write_beat_net
+from motionloom.datasets.audio.beat_net import BANDS, ROWS, WEIGHTS, BeatNet, BeatNetConfig, write_beat_net
 from motionloom.datasets.synth.music.tapped import TappedBatches
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve

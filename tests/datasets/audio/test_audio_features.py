@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio import rhythm, spectra
+from motionloom.datasets.audio import features, spectra
 from motionloom.datasets.audio.features import (
     AudioSettings,
     audio_features,
@@ -111,7 +111,7 @@ def test_pieces_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
     want, low = audio_features(samples, 30720), baseline_features(samples, 30720)
     for size in (1, 7, 45, 1000):
         monkeypatch.setattr(spectra, "_PIECE", size)
-        monkeypatch.setattr(rhythm, "_BLOCK", size)
+        monkeypatch.setattr(features, "_BLOCK", size)
         np.testing.assert_allclose(audio_features(samples, 30720), want, rtol=0, atol=5e-4)
         np.testing.assert_allclose(baseline_features(samples, 30720), low, rtol=0, atol=5e-4)
 
@@ -136,8 +136,8 @@ def test_beats_equal_librosas(seed: int, monkeypatch: pytest.MonkeyPatch) -> Non
     onsets[: len(onsets) // 5] *= seed % 2
     rate, bpm = int(fps * 512), float(rng.uniform(60, 200))
     _, want = librosa.beat.beat_track(onset_envelope=onsets, sr=rate, start_bpm=bpm, tightness=80)
-    monkeypatch.setattr(rhythm, "_BLOCK", 300)
-    np.testing.assert_array_equal(rhythm.track_beats(onsets, rate, start_bpm=bpm, tightness=80), want)
+    monkeypatch.setattr(features, "_BLOCK", 300)
+    np.testing.assert_array_equal(features.track_beats(onsets, rate, start_bpm=bpm, tightness=80), want)
 
 
 @pytest.mark.parametrize("fps", [5.0, 7.5, 60.0, 240.0])
@@ -145,8 +145,8 @@ def test_the_shortest_sound(fps: float) -> None:
     settings = AudioSettings(fps=fps)
     noise = np.random.default_rng(0).uniform(-1, 1, 6 * 512).astype(np.float32)
     for frames in range(3, 8):
-        for features, width in ((audio_features, 438), (baseline_features, 35)):
-            found = features(noise[: (frames - 1) * 512], settings.rate, settings)
+        for make, width in ((audio_features, 438), (baseline_features, 35)):
+            found = make(noise[: (frames - 1) * 512], settings.rate, settings)
             assert found.shape == (frames, width) and np.isfinite(found).all()
 
 

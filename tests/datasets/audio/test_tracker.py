@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from motionloom.datasets.audio import tracker
-from motionloom.datasets.audio.bands import ROWS, band_from, band_power
 from motionloom.datasets.audio.beat_net import (
+    ROWS,
     BeatNet,
     BeatNetConfig,
     activations,
+    band_from,
+    band_power,
     levels,
     read_beat_net,
     write_beat_net,
@@ -46,12 +48,14 @@ def test_beats_of_a_metronome_are_found_and_counted(genre: str, bpm: int) -> Non
     assert np.abs(bars[:, None] - strong).min(axis=1).max() < 0.03
 
 
-def test_noise_and_silence_are_no_music() -> None:
-    noise = np.random.default_rng(0).standard_normal(10 * RATE).astype(np.float32)
-    music = tracker.track(even_song("house", 124)).confidence
-    assert tracker.track(Sound(np.clip(0.2 * noise, -1, 1), RATE)).confidence < 0.3 < 0.5 < music
-    assert tracker.track(Sound(np.zeros_like(noise), RATE)).confidence < 0.1
-    assert not len(tracker.track(Sound(np.zeros(RATE, dtype=np.float32), RATE)).times)
+def test_noise_and_silence_have_hardly_a_beat() -> None:
+    samples = np.random.default_rng(0).standard_normal(10 * RATE).astype(np.float32)
+    noise, silence = Sound(np.clip(0.2 * samples, -1, 1), RATE), Sound(np.zeros_like(samples), RATE)
+    assert tracker.beat_confidence(noise) < tracker.NO_BEAT < 0.5
+    assert tracker.beat_confidence(even_song("house", 124).slice(3.0, 5.0)) > 0.5, "by the whole piece"
+    assert tracker.beat_confidence(silence) < 0.1
+    assert not len(tracker.track(silence.slice(0.0, 1.0)).times)
+    assert silence.silent and Sound(1e-4 * noise.samples, RATE).silent and not noise.silent
 
 
 def test_gain_moves_no_beat() -> None:

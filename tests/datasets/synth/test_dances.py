@@ -7,8 +7,8 @@ from collections import Counter, defaultdict
 import numpy as np
 import pytest
 
+from motionloom.datasets.audio.align_features import settings_at
 from motionloom.datasets.audio.features import audio_features, beats
-from motionloom.datasets.audio.lineup import settings_at
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, facing
 from motionloom.datasets.synth.dances import DanceConditions, DanceConfig, beats_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.datasets.audio import lineup
+from motionloom.datasets.audio import align_features
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.dances import DanceConfig
@@ -33,13 +33,13 @@ def heard(sounds: list[Sound]) -> list[np.ndarray]:
 
 
 def test_a_slice_is_heard_as_its_piece_is(song: Sound) -> None:
-    whole = lineup.motion_frame_features(song, None, FPS, round(song.seconds * FPS))
+    whole = align_features.motion_frame_features(song, FPS, round(song.seconds * FPS))
     part = song.slice(4.0, 8.5)
     assert part.piece is song
     (found,) = heard([part])
     assert np.array_equal(found, whole[80:170])
     # Heard alone it would be another music: the tempogram alone spans many seconds.
-    alone = lineup.motion_frame_features(Sound(part.samples, RATE), None, FPS, 90)
+    alone = align_features.motion_frame_features(Sound(part.samples, RATE), FPS, 90)
     assert np.abs(alone - whole[80:170])[:, 54:].mean() > 0.01
 
 
@@ -50,19 +50,19 @@ def test_a_slice_of_a_slice_and_one_between_two_frames(song: Sound) -> None:
     assert np.array_equal(heard([inner.resampled(8_000)])[0], heard([inner])[0])
     between = song.slice(4.02, 8.52)
     moved = song.slice(0.02)
-    rows = lineup.motion_frame_features(Sound(moved.samples, RATE), None, FPS, round(moved.seconds * FPS))
+    rows = align_features.motion_frame_features(Sound(moved.samples, RATE), FPS, round(moved.seconds * FPS))
     assert np.array_equal(heard([between])[0], rows[80:170])
 
 
 def test_pieces_are_heard_once(song: Sound, monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[float] = []
-    real = lineup.motion_frame_features
+    real = align_features.motion_frame_features
 
     def counted(sound: Sound, *rest: object) -> np.ndarray:
         calls.append(sound.seconds)
         return real(sound, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(lineup, "motion_frame_features", counted)
+    monkeypatch.setattr(align_features, "motion_frame_features", counted)
     song = Sound(song.samples, song.rate)
     heard([song, song, song.slice(1.0, 3.0)])
     heard([song.slice(3.0, 5.0)])
