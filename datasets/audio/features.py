@@ -11,9 +11,6 @@
 | 53       | 1 on a beat of that onset strength |
 | 54:438   | tempogram: autocorrelation of the onset strength at lags of 0 .. 383 frames |
 
-`baseline_features`, 35 numbers a frame (AI Choreographer, EDGE): 0 onset strength (mean), 1:21 MFCC, 21:33
-smoothed chroma (CENS), 33 note onsets, 34 beats.
-
 Notable choices:
 - The frame rate is what is chosen; the sound is resampled to 512 samples a frame, as published: 60 frames a
   second are 30720 Hz, 7.5 are 3840 Hz.
@@ -35,14 +32,13 @@ from pydantic import Field, field_validator
 
 from motionloom.datasets.audio.compiled import load_librosa
 from motionloom.datasets.audio.sound import resample_sound
-from motionloom.datasets.audio.spectra import HOP, mel_power, separate, tuning
+from motionloom.datasets.audio.spectra import HOP, separate, tuning
 from motionloom.datasets.schema import Config, UserError
 
 DIM = 438
 BEAT = 53
 """The column of beats."""
 
-BASELINE_DIM = 35
 VERSION = 2
 """Raised whenever the same sound and settings give other numbers: cached features are then made again."""
 
@@ -73,7 +69,7 @@ class AudioSettings(Config):
     """Octaves of chroma from C1. Default: 7, or as many as fit below half the sample rate (5 at 7.5 fps)."""
 
     start_bpm: float = Field(default=120.0, gt=0)
-    """Tempo that beat tracking leans to; published 35-d features use the BPM in the name of AIST music."""
+    """Tempo that beat tracking leans to."""
 
     tightness: float = Field(default=100.0, gt=0)
     """How evenly beats must be spaced."""
@@ -114,29 +110,6 @@ def audio_features(
             onsets[None],
             _flags(_beat_frames(onsets, settings), len(onsets))[None],
             tempogram(onsets, DIM - 54),
-        ]
-    return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
-
-
-def baseline_features(
-    samples: NDArray[np.float32], rate: int, settings: AudioSettings | None = None
-) -> NDArray[np.float32]:
-    """Mono samples [n] at `rate` Hz -> float32 [T, 35]; published with a `start_bpm` for each music."""
-    settings = settings or AudioSettings()
-    samples = _prepared(samples, rate, settings)
-    octaves = _octaves(settings)
-    librosa = load_librosa()
-    with _no_remarks():
-        level = librosa.power_to_db(mel_power(samples, settings.rate))
-        onsets = librosa.onset.onset_strength(S=level)
-        notes = _constant_q(samples, settings.rate, octaves)
-        picked = librosa.onset.onset_detect(onset_envelope=onsets, sr=settings.rate)
-        columns = [
-            onsets[None],
-            librosa.feature.mfcc(S=level, n_mfcc=_MFCC),
-            librosa.feature.chroma_cens(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
-            _flags(picked, len(onsets))[None],
-            _flags(_beat_frames(onsets, settings), len(onsets))[None],
         ]
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 

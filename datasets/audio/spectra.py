@@ -76,12 +76,6 @@ def separate(samples: NDArray[np.float32], rate: int) -> Spectra:
     return Spectra(mel, percussive_mel, harmonic[: len(samples)])
 
 
-def mel_power(samples: NDArray[np.float32], rate: int) -> NDArray[np.float32]:
-    """Mono samples [n] -> mel power [128, T]."""
-    found = [_mel(_magnitude(piece.samples), rate)[:, piece.inside] for piece in _pieces(samples)]
-    return np.concatenate(found, axis=1)
-
-
 def tuning(samples: NDArray[np.float32], rate: int, bins: int) -> float:
     """`librosa.estimate_tuning`: how far the music is from A = 440 Hz, in bins (`bins` an octave)."""
     librosa = load_librosa()

@@ -10,13 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio import features, spectra
-from motionloom.datasets.audio.features import (
-    AudioSettings,
-    audio_features,
-    baseline_features,
-    beats,
-    fitting_octaves,
-)
+from motionloom.datasets.audio.features import AudioSettings, audio_features, beats, fitting_octaves
 from motionloom.datasets.schema import UserError
 
 
@@ -71,14 +65,6 @@ def test_438_columns_equal_the_golden_ones(golden: dict[str, NDArray]) -> None:
     np.testing.assert_allclose(beats(samples, 30720), np.flatnonzero(want[:, 53]) / 60)
 
 
-def test_35_columns_equal_the_golden_ones(golden: dict[str, NDArray]) -> None:
-    samples = golden["syn_wav"].astype(np.float32) / 32768
-    found = baseline_features(samples, 30720, AudioSettings(start_bpm=120))
-    np.testing.assert_allclose(found, golden["syn_feat35_60fps"], rtol=0, atol=1e-3)
-    slow = baseline_features(golden["syn_wav_15360"], 15360, AudioSettings(fps=30))
-    np.testing.assert_allclose(slow, golden["syn_feat35_30fps"], rtol=0, atol=1e-3)
-
-
 def test_sound_of_another_rate_is_resampled(golden: dict[str, NDArray]) -> None:
     samples = golden["syn_wav"].astype(np.float32) / 32768
     found = audio_features(samples, 30720, AudioSettings(fps=7.5))
@@ -108,12 +94,11 @@ def test_pieces_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where a piece ends with the sound: 180 frames are 4 pieces of 45, the last one is a fifth."""
     samples = song(3.0, 30720, seed=2)
     assert len(samples) == 180 * 512
-    want, low = audio_features(samples, 30720), baseline_features(samples, 30720)
+    want = audio_features(samples, 30720)
     for size in (1, 7, 45, 1000):
         monkeypatch.setattr(spectra, "_PIECE", size)
         monkeypatch.setattr(features, "_BLOCK", size)
         np.testing.assert_allclose(audio_features(samples, 30720), want, rtol=0, atol=5e-4)
-        np.testing.assert_allclose(baseline_features(samples, 30720), low, rtol=0, atol=5e-4)
 
 
 @pytest.mark.parametrize("columns", [1, 3, 15, 16, 17, 31, 100])
@@ -145,9 +130,8 @@ def test_the_shortest_sound(fps: float) -> None:
     settings = AudioSettings(fps=fps)
     noise = np.random.default_rng(0).uniform(-1, 1, 6 * 512).astype(np.float32)
     for frames in range(3, 8):
-        for make, width in ((audio_features, 438), (baseline_features, 35)):
-            found = make(noise[: (frames - 1) * 512], settings.rate, settings)
-            assert found.shape == (frames, width) and np.isfinite(found).all()
+        found = audio_features(noise[: (frames - 1) * 512], settings.rate, settings)
+        assert found.shape == (frames, 438) and np.isfinite(found).all()
 
 
 def test_mistakes_are_named() -> None:
