@@ -29,7 +29,7 @@ from motionloom.datasets.audio.features import beats as librosa_beats
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.audio.tracker import track
 from motionloom.datasets.synth.music.performance import render_song
-from motionloom.datasets.synth.music.tapped import RENDER_RATE, SongPoolConfig
+from motionloom.pipeline.stages.networks.beats.songs import RENDER_RATE, SongsConfig
 
 Times = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ def agreed_f(runs: list[Times], found: Times, *, any_tempo: bool) -> float:
 
 def rendered(count: int) -> Record:
     """F against true beats, averaged over songs."""
-    pool = SongPoolConfig(songs=max(2, count), seed=SEED)
+    pool = SongsConfig(songs=max(2, count), seed=SEED)
     found: dict[str, list[float]] = {column.figure: [] for column in COLUMNS}
     for number in range(count):
         song = pool.song(number)

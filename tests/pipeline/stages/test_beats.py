@@ -9,12 +9,13 @@ import numpy as np
 import torch
 
 from motionloom.datasets.audio.beat_net import read_beat_net
-from motionloom.datasets.synth.music.tapped import SongPoolConfig, TappedBatches, TappedSong, _targets
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.stages.networks.beats import put_into_package
+from motionloom.pipeline.stages.networks.beats.songs import AnnotatedSong, SongsConfig
+from motionloom.pipeline.stages.networks.beats.stage import put_into_package
+from motionloom.pipeline.stages.networks.beats.training import SongBatches, _targets
 
 RECIPE = """
-name: taps
+name: beats
 seed: 1
 hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
 stages:
@@ -28,8 +29,8 @@ stages:
 
 
 def test_a_few_steps_lower_the_loss_and_the_weights_can_be_shipped(tmp_path: Path) -> None:
-    (tmp_path / "taps.yaml").write_text(RECIPE)
-    run_recipe(tmp_path / "taps.yaml", tmp_path / "run")
+    (tmp_path / "beats.yaml").write_text(RECIPE)
+    run_recipe(tmp_path / "beats.yaml", tmp_path / "run")
     stage = tmp_path / "run" / "stages" / "beats"
     rows = [json.loads(line) for line in (stage / "metrics.jsonl").read_text().splitlines()]
     losses = [row["train/loss"] for row in rows if "train/loss" in row]
@@ -40,13 +41,13 @@ def test_a_few_steps_lower_the_loss_and_the_weights_can_be_shipped(tmp_path: Pat
 
 
 def test_batches_repeat_and_their_targets_are_the_beats(tmp_path: Path) -> None:
-    pool = SongPoolConfig(songs=2, song_seconds=12.0, played=False)
-    songs = [TappedSong.of(pool.song(number)) for number in range(2)]
+    pool = SongsConfig(songs=2, song_seconds=12.0, played=False)
+    songs = [AnnotatedSong.of(pool.song(number)) for number in range(2)]
     songs[0].save(tmp_path / "song.npz")
-    songs[0] = TappedSong.load(tmp_path / "song.npz")
-    one, again = (TappedBatches(songs, 300, 2, seed=5)[3] for _ in range(2))
+    songs[0] = AnnotatedSong.load(tmp_path / "song.npz")
+    one, again = (SongBatches(songs, 300, 2, seed=5)[3] for _ in range(2))
     assert torch.equal(one["levels"], again["levels"]) and torch.equal(one["targets"], again["targets"])
-    plain = TappedBatches(songs, 300, 2, seed=5, augment=False)[0]["targets"].numpy()
+    plain = SongBatches(songs, 300, 2, seed=5, augment=False)[0]["targets"].numpy()
     beats = sum(5.0 / pool.song(number).beat for number in range(2))  # in 300 rows of each
     assert abs(plain[..., 0].sum() / 2 - beats) <= 2  # each beat is 1 + 1/2 + 1/2
     assert (plain[..., 1] <= plain[..., 0] + 1e-6).all()  # a downbeat is a beat

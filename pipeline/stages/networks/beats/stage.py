@@ -1,10 +1,10 @@
-"""The stage that trains the network of beats (`datasets/audio/beat_net.py`) on songs whose beats are known.
+"""Stage `beats`: trains the beat network (`datasets/audio/beat_net.py`) on songs whose beats are known.
 
 The weights in the package are those of the recipe `beats`:
 
     motionloom run ude-beats -o runs/beats
-    python -c "from motionloom.pipeline.stages.networks import beats; from pathlib import Path; \\
-        beats.put_into_package(Path('runs/beats/stages/beats'))"
+    python -c "from motionloom.pipeline.stages.networks.beats import stage; from pathlib import Path; \\
+        stage.put_into_package(Path('runs/beats/stages/beats'))"
 """
 
 from __future__ import annotations
@@ -16,17 +16,16 @@ import torch
 from pydantic import Field
 
 from motionloom.datasets.audio.beat_net import BANDS, ROWS, WEIGHTS, BeatNet, BeatNetConfig, write_beat_net
-from motionloom.datasets.synth.music.tapped import TappedBatches
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Inputs, register
-from motionloom.pipeline.stages.data.songs import SongPool
+from motionloom.pipeline.stages.networks.beats.songs import SongPool
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts, load_weights
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
-    from motionloom.models.training.beats import BeatsModule
+    from motionloom.pipeline.stages.networks.beats.training import BeatsModule
 
 _NO_MOTION = LayoutFacts(name="none", fps=ROWS, family="none")
 
@@ -47,7 +46,7 @@ class BeatsConfig(TrainedStageConfig):
 
 
 class BeatsInputs(Inputs):
-    """What it takes."""
+    """Songs to learn from."""
 
     songs: SongPool
 
@@ -68,18 +67,20 @@ class BeatsStage(TrainedStage[BeatsConfig, BeatsInputs, BeatNet]):
         return BeatNet(BeatNetConfig.parse(facts.config, facts.where))
 
     def module(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int) -> BeatsModule:
-        from motionloom.models.training.beats import BeatsModule
+        from motionloom.pipeline.stages.networks.beats.training import BeatsModule
 
         return BeatsModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
     def batches(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int, log: Log) -> Batches:
+        from motionloom.pipeline.stages.networks.beats.training import SongBatches
+
         trained, kept = (inputs.songs.songs(validation=which) for which in (False, True))
         rows = config.rows
 
-        def train(batch: int, rank: int, world: int) -> TappedBatches:
-            return TappedBatches(trained, rows, batch, seed, rank, world)
+        def train(batch: int, rank: int, world: int) -> SongBatches:
+            return SongBatches(trained, rows, batch, seed, rank, world)
 
-        return Batches(train, lambda: TappedBatches(kept, rows, min(16, len(kept)), seed, augment=False))
+        return Batches(train, lambda: SongBatches(kept, rows, min(16, len(kept)), seed, augment=False))
 
     def example(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, batch: int) -> Example:
         rows = config.rows
