@@ -24,7 +24,7 @@ PRESENT_ALL = HANDS | FACE
 Split = Literal["train", "val", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
 MotionType = Literal["float32", "float16"]
-"""How shards store motion."""
+"""Number type of motion in shards."""
 
 MANIFEST_FILE, INDEX_FILE = "manifest.json", "index.npz"
 """In the folder of a data set, beside its shards."""
@@ -151,7 +151,7 @@ class ClipMeta(Config):
     has_face: bool = True
     mirror_of: str | None = None
     truth: dict[str, Any] | None = None
-    """What a synthetic clip really does (action, direction, side, count, hand, face)."""
+    """True content of a synthetic clip (action, direction, side, count, hand, face)."""
     song: str | None = None
     """The piece of music of a recorded dance, by the source's name; several clips may have one."""
 
@@ -193,11 +193,11 @@ class AuditRow(Config):
     what: str
     stated: float
     by: str
-    """Where it is stated."""
+    """Place where it is stated."""
     found: float
     taken: float
     why: str = ""
-    """Why the others were left out."""
+    """Reasons for which the others were left out."""
 
 
 class Manifest(Config):
@@ -221,7 +221,7 @@ class Manifest(Config):
     """Settings the audio features were made with; a model trained on them keeps these."""
     notes: list[str] = []
     audit: list[AuditRow] = []
-    """What the makers of the source say there is, for sources with published numbers."""
+    """Numbers that the makers of the source state, for sources that have published ones."""
     excluded: dict[str, str] = {}
     """Ids of clips that readers skip, and why: what `motionloom data clean` was told to leave out."""
 
@@ -241,7 +241,7 @@ class Decisions(Config):
 
     @classmethod
     def of(cls, root: Path) -> Decisions:
-        """Those that were made about a data set; none where there is no file of them."""
+        """Read the decisions about a data set; none where it has no file of them."""
         path = root / CLEANED_FILE
         return cls.load_json(path) if path.is_file() else cls()
 

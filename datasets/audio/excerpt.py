@@ -30,7 +30,7 @@ class Excerpt:
 
     @classmethod
     def named(cls, name: Path | str) -> Excerpt:
-        """What a name means; `UserError`, naming it, for times that are none."""
+        """Parse a name; `UserError`, naming it, for times that are none."""
         whole, found = Path(name), _PART.fullmatch(str(name))
         if found is None or whole.exists():
             return cls(whole)

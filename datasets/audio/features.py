@@ -90,7 +90,7 @@ class AudioSettings(Config):
 def audio_features(
     samples: NDArray[np.float32], rate: int, settings: AudioSettings | None = None
 ) -> NDArray[np.float32]:
-    """Mono samples [n] at `rate` Hz -> float32 [1 + n' // 512, 438], n' the length at the settings' rate.
+    """Return features of mono samples [n] at `rate` Hz, [1 + n' // 512, 438], n' at the settings' rate.
 
     `UserError` for sound of fewer than three frames, or more octaves than fit.
     """
@@ -117,7 +117,7 @@ def audio_features(
 def beats(
     samples: NDArray[np.float32], rate: int, settings: AudioSettings | None = None
 ) -> NDArray[np.float64]:
-    """Times of the beats in seconds, ascending: those that column 53 of `audio_features` marks."""
+    """Return the times of the beats in seconds, ascending: those that column 53 of `audio_features` marks."""
     settings = settings or AudioSettings()
     samples = _prepared(samples, rate, settings)
     with _no_remarks():
@@ -126,7 +126,7 @@ def beats(
 
 
 def fitting_octaves(rate: int, most: int = 7) -> int:
-    """As many octaves above C1 as fit below half the rate, at most `most`; 0 where not even one does."""
+    """Return how many octaves above C1 fit below half the rate, at most `most`; 0 where not even one does."""
     librosa = load_librosa()
     for octaves in range(most, 0, -1):
         # Tuning moves the filters by less than half a bin.
@@ -228,7 +228,7 @@ def _tempograms(onsets: NDArray[np.float32], width: int) -> Iterator[NDArray[np.
 
 @contextmanager
 def _no_remarks() -> Iterator[None]:
-    """Without librosa's warnings of short sounds and of mel bands without a bin: both are as published."""
+    """Silence librosa's warnings of short sounds and of mel bands without a bin: both are as published."""
     with warnings.catch_warnings():
         for remark in ("n_fft=", "Empty filters", "Trying to estimate"):
             warnings.filterwarnings("ignore", message=remark, category=UserWarning)

@@ -40,7 +40,7 @@ _SMALLEST_RANGE = 6.0
 
 
 def rhythm_features(sound: Sound, fps: float, frames: int) -> NDArray[np.float32]:
-    """A whole piece -> float32 [frames, 19]; row k is at k / fps seconds, the last one repeats at the end."""
+    """Return features of a whole piece, float32 [frames, 19]; row k is at k / fps s, the last one repeats."""
     if frames < 1 or fps <= 0:
         raise UserError(f"features cannot be aligned with {frames} frames at {fps:g} a second")
     power = band_power(sound)
@@ -58,7 +58,7 @@ def rhythm_features(sound: Sound, fps: float, frames: int) -> NDArray[np.float32
 
 
 def beats_of_rows(rows: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
-    """Features [F, 19] -> seconds of the beats that their phases pass; none where no beat was found."""
+    """Return seconds of the beats that the phases of features [F, 19] pass; none where no beat was found."""
     if len(rows) < 2 or not rows[:, :2].any():
         return np.empty(0)
     turns = np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2 * np.pi)
@@ -123,7 +123,7 @@ def _dynamics(
 
 
 def _balance(power: NDArray[np.float32]) -> tuple[float, float]:
-    """How bright the piece is and how much bass it has, -1..1: shares of decibels above the silence."""
+    """Return brightness and bass of the piece, -1..1: shares of decibels above the silence."""
     mean = power.mean(axis=0)
     if mean.max() <= 0:
         return 0.0, 0.0
@@ -134,7 +134,7 @@ def _balance(power: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _decibels(power: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Of rows [T], smoothed over a tenth of a second, above the silence of the piece."""
+    """Return rows [T] in decibels above the silence of the piece, smoothed over a tenth of a second."""
     loudest = float(power.max(initial=0.0))
     if loudest <= 0:
         return np.zeros(len(power))
@@ -158,7 +158,7 @@ def _onsets(power: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _moving_mean(values: NDArray[np.floating], width: int) -> NDArray[np.float64]:
-    """Of the rows [T] around each, fewer at the ends."""
+    """Return means of the rows [T] around each, fewer at the ends."""
     sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
     rows = np.arange(len(values))
     first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))

@@ -77,8 +77,8 @@ class Sound:
 
     @classmethod
     def read(cls, path: Path | str, rate: int | None = None) -> Sound:
-        """A sound file or a part of one, as `song.mp3@0:30-1:00` (`excerpt.py`), at its own sample rate or
-        another one; `UserError` as of `read_sound`, and where the file is shorter.
+        """Read a sound file or a part of one, as `song.mp3@0:30-1:00` (`excerpt.py`), at its own sample rate
+        or another one; `UserError` as of `read_sound`, and where the file is shorter.
         """
         part = Excerpt.named(path)
         samples, found = read_sound(part.path, rate=rate)
@@ -95,7 +95,7 @@ class Sound:
         return float(np.square(self.samples).mean()) < 1e-7
 
     def slice(self, start: float, end: float | None = None) -> Sound:
-        """From second `start` to second `end`, or as far as there is sound; the samples are not copied."""
+        """Return the sound from second `start` to `end`, or to its own end; the samples are not copied."""
         first = round(max(0.0, start) * self.rate)
         last = len(self.samples) if end is None else round(max(0.0, end) * self.rate)
         if first >= min(last, len(self.samples)):
@@ -107,7 +107,7 @@ class Sound:
         return Sound(self.samples[first:last], self.rate, self.piece or self, begin)
 
     def resampled(self, rate: int) -> Sound:
-        """The same sound at another sample rate."""
+        """Return the sound at another sample rate."""
         samples = np.clip(resample_sound(self.samples, self.rate, rate), -1.0, 1.0)
         return Sound(samples, rate, self.piece, self.begin)
 
@@ -310,7 +310,7 @@ def _check_wave_chunks(file: BinaryIO, name: str, size: int) -> None:
 
 
 def _missing_mp3_bytes(file: BinaryIO, head: bytes, size: int) -> int:
-    """Bytes that an MP3 lacks of the length stated in its first frame; 0 where none is stated.
+    """Return the bytes that an MP3 lacks of the length stated in its first frame; 0 where none is stated.
 
     libsndfile fills what is missing with silence.
     """

@@ -1,4 +1,4 @@
-"""What features need of a sound's spectra: mel power, harmonic and percussive shares, tuning.
+"""Spectra of a sound: mel power, harmonic and percussive shares, tuning.
 
 Everything is librosa's; two things are arranged here:
 

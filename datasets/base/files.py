@@ -78,7 +78,7 @@ def _takes_bytes(path: Path) -> bool:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """The same as an open binary file."""
+    """Open a binary file that moves to `path`, as by `atomic_path`."""
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         yield file
 
@@ -131,7 +131,7 @@ def sha256_of_json(value: object) -> str:
 
 
 def sorted_header(raw: bytes) -> bytes:
-    """The same safetensors file, its header's keys in order: the library writes metadata in random order."""
+    """Return a safetensors file with its header's keys in order; the library writes them in random order."""
     end = 8 + int.from_bytes(raw[:8], "little")
     header = json.dumps(json.loads(raw[8:end]), sort_keys=True, separators=(",", ":")).encode()
     header += b" " * (-len(header) % 8)

@@ -1,4 +1,4 @@
-"""What the system refuses, in words: a full disk, no permission, a file in the way.
+"""Sentences for errors of the system: a full disk, no permission, a file in the way.
 
 Libraries pass such an error on in their own ways; `sentence_of` knows those of torch, safetensors and numpy.
 """

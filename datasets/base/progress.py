@@ -1,4 +1,4 @@
-"""How far long work is: a bar on a terminal, elsewhere a line now and then, both with the time left."""
+"""Progress of long work: a bar on a terminal, elsewhere a line now and then, both with the time left."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def duration(seconds: float) -> str:
 
 
 class Pace:
-    """When a line is due, and how long the rest will take at the speed so far."""
+    """Decides when a line is due, and estimates the time that the rest takes at the speed so far."""
 
     def __init__(self, total: int, first: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
         self.total, self.first, self._clock = total, first, clock

@@ -1,1 +1,1 @@
-"""From shards to training batches."""
+"""Training batches of shards."""

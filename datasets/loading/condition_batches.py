@@ -34,7 +34,7 @@ from motionloom.datasets.text.cache import TextCache
 _CAPTION, _CROP, _DROP = 2, 3, 4
 
 Captioned = Literal["body", "face"]
-"""What the captions are about that every clip must have."""
+"""Subject of the captions that every clip must have."""
 
 
 class ConditionBatch(MotionBatch):
@@ -57,11 +57,11 @@ class ConditionBatch(MotionBatch):
 
 
 class ConditionedClips:
-    """What training and evaluation share: which clips qualify, and making a batch of them.
+    """Clips that qualify, and batches of them: shared by training and evaluation.
 
-    `stats` normalise the motion, or are crops that read it otherwise. `readers` are what reads each modality,
-    by name; others are left out. With `captioned` only clips with a
-    caption qualify; for "face" captions are those about the face and `columns` by default the face's.
+    `stats` normalise the motion, or are crops that read it otherwise. `readers` read each modality, by name;
+    others are left out. With `captioned` only clips with a caption qualify; for "face" captions are those
+    about the face and `columns` by default the face's.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class ConditionedClips:
                 f"body parts that are asked for; lower min_frames or choose other data"
             )
         self.present = np.zeros((len(dataset), len(self.readers)), dtype=np.bool_)
-        """What every clip of the dataset comes with of the modalities that are read, [n, M]."""
+        """Which of the modalities that are read every clip of the dataset has, [n, M]."""
         for column, member in enumerate(self.members.values()):
             self.present[:, column] = dataset.has(member)
 

@@ -24,7 +24,7 @@ def danced_joints(layout: MotionLayout) -> int:
 
 
 def joints_of_dance(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:
-    """Those of features [T, D] in their own units, [T, N, 3]."""
+    """Return the joints [T, N, 3] of features [T, D] in their own units."""
     return joints24_of(features) if layout.name == "smpl75" else joints_of(features, layout)
 
 

@@ -1,4 +1,4 @@
-"""How many rows of a batch come with which modalities: the plan of such batches.
+"""Plan of batches whose rows come with different sets of modalities.
 
 A clip's kind is the set of modalities that it comes with. `Balance` says how often each kind is drawn:
 exactly its share of every epoch, spread evenly over the batches, as a pure function of (seed, k) like
@@ -39,7 +39,7 @@ def kind_of(key: str) -> Kind:
 
 
 def key_of(kind: Kind) -> str:
-    """How recipes write a kind."""
+    """Return a kind as recipes write it."""
     return "+".join(name for name in MODALITIES if name in kind) or NONE
 
 
@@ -71,14 +71,13 @@ Balance = Annotated[dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_we
 """Weights of the kinds of clips among the rows; kinds that are not named are never drawn."""
 
 Drop = Annotated[dict[str, Annotated[float, Field(ge=0, le=1)]], AfterValidator(_rates)]
-"""How often a clip comes without some of its modalities: rates of leaving a set of them out, by kind. A row
-never loses all that it has, nor two sets."""
+"""Rates of leaving sets of modalities out, by kind. A row never loses all that it has, nor two sets."""
 
 
 def drop_some(
     drop: Mapping[str, float], present: NDArray[np.bool_], names: Sequence[str], draws: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """What rows come with after dropping.
+    """Return which modalities rows have after dropping, bool [B, M].
 
     Args:
         drop: Rates by kind.
@@ -97,7 +96,7 @@ def drop_some(
 
 
 class KindPlan:
-    """Which clips every global batch holds.
+    """Clips of every global batch, by kind.
 
     Args:
         clips: Clips to draw from [n], ascending.

@@ -60,7 +60,7 @@ class FeatureStats:
         return values * std + mean
 
     def with_root(self, gain: float) -> FeatureStats:
-        """Those by which the columns of the root come out `gain` times as large."""
+        """Return statistics by which the columns of the root come out `gain` times as large."""
         std = self.std.copy()
         for name in ROOT:
             if self.layout.has(name):
@@ -69,7 +69,7 @@ class FeatureStats:
 
     @staticmethod
     def unit(layout: MotionLayout) -> FeatureStats:
-        """Those that change nothing: mean 0, std 1."""
+        """Return statistics that change nothing: mean 0, std 1."""
         return FeatureStats(np.zeros(layout.dim, np.float32), np.ones(layout.dim, np.float32), layout)
 
     def save(self, path: Path) -> None:
@@ -94,7 +94,7 @@ class FeatureStats:
 
     @staticmethod
     def of_arrays(mean: Path, std: Path, layout: MotionLayout) -> FeatureStats:
-        """From a release's `.npy` files [D] of a layout's columns; `UserError` where a file is not that."""
+        """Read a release's `.npy` files [D] of a layout's columns; `UserError` where a file is not that."""
         found = []
         for path in (mean, std):
             try:
@@ -162,7 +162,7 @@ class Moments:
         return Moments(count, mean, m2)
 
     def counted(self, times: float) -> Moments:
-        """As if every row stood there so many times."""
+        """Return the moments of every row repeated so many times."""
         return Moments(self.count * times, self.mean, self.m2 * times)
 
     @property

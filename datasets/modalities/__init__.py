@@ -1,1 +1,1 @@
-"""What motion can be conditioned on: a record for each modality in a file of its own, and their table."""
+"""Modalities that motion can be conditioned on: a record in a file of its own for each, and their table."""

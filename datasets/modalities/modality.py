@@ -39,7 +39,7 @@ def save_columns(path: Path, mean: Columns, std: Columns, frames: int, **about: 
 
 
 def load_columns(path: Path, stage: str) -> tuple[Columns, Columns, int, dict[str, str]]:
-    """What `save_columns` wrote; `UserError` when it is not that. `stage` is what to run again."""
+    """Read what `save_columns` wrote; `UserError` when it is not that. `stage` is the one to run again."""
     try:
         with safe_open(path, framework="numpy") as stored:
             mean, std, about = stored.get_tensor("mean"), stored.get_tensor("std"), stored.metadata() or {}
@@ -96,7 +96,7 @@ class FrameStats:
 
 
 class Clips(Protocol):
-    """What a record asks of a data set of clips (`shards/clips.py`)."""
+    """The part of a data set of clips that a record reads (`shards/clips.py`)."""
 
     @property
     def where(self) -> str: ...
@@ -143,7 +143,7 @@ class Modality(ABC):
     a stage of the modality's name computes them."""
 
     def reader(self, prepared: object) -> object:
-        """What `batch` reads by, from what the modality's stage gives."""
+        """Return the reader that `batch` takes, made from the output of the modality's stage."""
         return prepared
 
     @abstractmethod
@@ -227,7 +227,7 @@ class FrameModality(Modality):
         return np.asarray(given, np.float32)
 
     def normalise(self, prepared: object, condition: Condition) -> Condition:
-        """By the statistics; zero where the mask is false."""
+        """Return the condition normalised by the statistics; zero where the mask is false."""
         import torch
 
         if not isinstance(prepared, FrameStats):

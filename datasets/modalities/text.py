@@ -20,7 +20,7 @@ _WORDS = 24
 
 
 class _Prepared(Protocol):
-    """What a text stage gives."""
+    """Output of a text stage."""
 
     @property
     def cache(self) -> TextCache: ...
@@ -29,7 +29,7 @@ class _Prepared(Protocol):
 
 
 class TextModality(Modality):
-    """What a caption says."""
+    """Captions as words and sentences."""
 
     name = "text"
     members = ("texts.json",)

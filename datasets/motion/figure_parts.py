@@ -33,7 +33,7 @@ _OF: dict[FigurePart, tuple[str, ...]] = {"all": PIECES, "upper": _UPPER, "hands
 
 
 def pieces_of(parts: Iterable[FigurePart], but: Iterable[FigurePart] = ()) -> NDArray[np.bool_]:
-    """Which `PIECES` some parts are, bool [7], without those of `but`."""
+    """Return the `PIECES` of some parts, bool [7], without those of `but`."""
     without = {piece for part in but for piece in _OF.get(part, (part,))}
     found = {piece for part in parts for piece in _OF.get(part, (part,))} - without
     return np.array([piece in found for piece in PIECES])
@@ -41,7 +41,7 @@ def pieces_of(parts: Iterable[FigurePart], but: Iterable[FigurePart] = ()) -> ND
 
 @lru_cache(maxsize=8)
 def piece_joints(layout: MotionLayout) -> NDArray[np.int64]:
-    """Number of the piece that every joint is of [N]."""
+    """Return the number of every joint's piece [N]."""
     return np.array([PIECES.index(_piece_of(name, n)) for n, name in enumerate(layout.skeleton.joints)])
 
 
@@ -56,7 +56,7 @@ def _piece_of(joint: str, number: int) -> str:
 
 @lru_cache(maxsize=8)
 def piece_columns(layout: MotionLayout) -> NDArray[np.int64]:
-    """Number of the piece that every column of motion features is of [D]."""
+    """Return the number of every column's piece [D], of motion features."""
     joints = piece_joints(layout)
     columns = np.full(layout.dim, LOWER)
     for field, width, first in (("positions", 3, 1), ("rotations_6d", 6, 1), ("velocities", 3, 0)):
@@ -69,7 +69,7 @@ def piece_columns(layout: MotionLayout) -> NDArray[np.int64]:
 
 @lru_cache(maxsize=8)
 def step_columns(layout: MotionLayout) -> NDArray[np.bool_]:
-    """Which columns hold a step to the next frame [D]."""
+    """Return which columns hold a step to the next frame, bool [D]."""
     found = np.zeros(layout.dim, dtype=np.bool_)
     for field in ("root_yaw_velocity", "root_xz_velocity", "velocities", "foot_contacts"):
         if layout.has(field):

@@ -1,4 +1,4 @@
-"""Is a clip's frame rate the one that is stated? By the physics of a fall and of a step.
+"""Check of a stated frame rate by the physics of a fall and of a step.
 
 In flight a body falls with gravity, whatever it does: at a stated rate that is k times the true one it falls
 with k² times as much. And a leg swings through a step like the pendulum it is, in 0.3 to 0.6 s: sprinters
@@ -43,7 +43,7 @@ Floats = NDArray[np.floating]
 
 
 def wrong_rate(joints: Floats, fps: float) -> str:
-    """Why a stated rate cannot be true, with the evidence; empty where nothing speaks against it.
+    """Return why a stated rate cannot be true, with the evidence; empty where nothing speaks against it.
 
     `joints` [T, N, 3] in metres, Y up, the first 22 those of the body skeleton, at `fps`.
     """
@@ -67,7 +67,7 @@ def wrong_rate(joints: Floats, fps: float) -> str:
 
 
 def _falls(joints: Floats, fps: float) -> list[float]:
-    """Downward acceleration in m/s² of every flight: both feet leave the floor, and come back to it."""
+    """Return the downward acceleration in m/s² of every flight: both feet leave the floor and come back."""
     feet = np.concatenate([joints[:, _ANKLES, 1] - _ANKLE_METRES, joints[:, _BALLS, 1]], axis=1).min(axis=1)
     feet = feet - np.percentile(feet, 5)
     height = joints[:, : len(_WEIGHTS), 1] @ _WEIGHTS
@@ -86,7 +86,7 @@ def _falls(joints: Floats, fps: float) -> list[float]:
 
 
 def _swings(joints: Floats, fps: float) -> list[float]:
-    """Seconds of every swing of a leg through a step."""
+    """Return the seconds of every swing of a leg through a step."""
     found = []
     for ankle in _ANKLES:
         path = joints[:, ankle][:, [0, 2]]
@@ -99,6 +99,6 @@ def _swings(joints: Floats, fps: float) -> list[float]:
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First index and end of every run of true values."""
+    """Return first index and end of every run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -27,12 +27,12 @@ MAX_BYTES = 2**30
 
 @dataclass(frozen=True)
 class ArrayHeader:
-    """What the header of an array states."""
+    """Shape and type that an array's header states."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     start: int
-    """Bytes before the data."""
+    """Bytes in front of the data."""
     fortran: bool = False
 
     @property

@@ -30,8 +30,8 @@ UPRIGHT = 0.5
 bowing figures stay within for most of a clip."""
 
 FLOOR_METRES = 0.3
-"""How far the lowest joint may be from the floor in the median frame: jumps are shorter than half a clip, and
-joints of feet lie up to 0.1 m above their soles."""
+"""Largest distance of the lowest joint from the floor in the median frame: jumps are shorter than half a
+clip, and joints of feet lie up to 0.1 m above their soles."""
 
 MOST = 0.5
 """Share of the clips that must be people standing on a floor."""
@@ -63,8 +63,8 @@ _STRETCHES = [
     (_PELVIS, _NECK, 1.0),
     (_NECK, _HEAD, 1.0),
 ]
-"""What a height is made of: (joint, joint, how often it counts). The trunk is one stretch: noise would make
-its five short bones longer, and bending hardly makes it shorter."""
+"""Stretches of a height: (joint, joint, how often it counts). The trunk is one stretch: noise would make its
+five short bones longer, and bending hardly makes it shorter."""
 
 
 def _length(joints: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -95,7 +95,7 @@ class FigureMeasure:
     forward: float | None
     """Cosine between the way the figure goes and the way it faces; None where it stays in its place."""
     toes: float
-    """How far the feet point to where the figure faces, -1 to 1: negative where left and right are
+    """Cosine of the feet's direction and the figure's, -1 to 1: negative where left and right are
     swapped."""
 
 
@@ -135,7 +135,7 @@ Kind = Literal["size", "lying", "upside down", "floating", "below the floor", "l
 
 @dataclass(frozen=True)
 class Oddity:
-    """What many clips have in common that people standing on a floor have not."""
+    """Return the faults that many clips have in common, which people standing on a floor have not."""
 
     kind: Kind
     clips: int
@@ -146,7 +146,7 @@ class Oddity:
 
     @property
     def share(self) -> float:
-        """Of the clips that were measured."""
+        """Medians over the clips that were measured."""
         return self.clips / self.of
 
     @property
@@ -194,11 +194,11 @@ class PlausibilityStats:
 
     @property
     def backwards(self) -> int:
-        """Of these, clips in which it goes backwards."""
+        """Number of these clips in which it goes backwards."""
         return int((self._columns()[4] < _BACKWARDS).sum())
 
     def oddities(self, *, floor_at_zero: bool = False) -> list[Oddity]:
-        """What more than a few of the clips have, the most serious first.
+        """Return faults of more than a few of the clips, the most serious first.
 
         `floor_at_zero` for canonical motion, whose floor must be at height 0.
         """

@@ -88,7 +88,7 @@ class Skeleton:
         return np.array([self.joints.index(n) for n in names])
 
     def with_lengths_of(self, joints: NDArray[np.floating]) -> Skeleton:
-        """The same rest directions with the median bone lengths of a motion [T, N, 3] in metres."""
+        """Return the skeleton with the median bone lengths of a motion [T, N, 3] in metres."""
         parents = np.array(self.parents[1:])
         measured = np.median(np.linalg.norm(joints[:, 1:] - joints[:, parents], axis=-1), axis=0)
         own = np.linalg.norm(self.offsets[1:], axis=-1)

@@ -1,4 +1,4 @@
-"""How the bytes of a clip are reached: in a mapped file, or in whole shards in memory.
+"""Access to the bytes of a clip: in a mapped file, or in whole shards in memory.
 
 An access is made for one split and answers `member(shard, clip, column)` with a buffer and the byte in it
 where the member starts. Whole shards are read front to back through WebDataset: the index says which clips a
@@ -175,7 +175,7 @@ class _Hashed:
         self._sha256 = hashlib.sha256()
 
     def starts_with(self, head: bytes) -> bool:
-        """Whether the stream begins so; reads nothing off it."""
+        """Return whether the stream begins so; reads nothing off it."""
         assert isinstance(self._file, io.BufferedReader)
         return self._file.peek(len(head))[: len(head)] == head
 

@@ -29,7 +29,7 @@ _LOCKS = ".locks"
 
 
 class CacheConfig(Config):
-    """Where shards from a server are kept on this machine. Folders are read in place, without a cache."""
+    """Cache of a server's shards on this machine. Folders are read in place, without a cache."""
 
     folder: str | None = None
     """A folder that processes and runs may share; unset means `motionloom/shards` in the user's cache."""
@@ -50,7 +50,7 @@ class FileCache:
         self.limit = config.limit
 
     def find(self, name: str) -> BinaryIO | None:
-        """A cached file, opened and marked as used now; None when it is not there."""
+        """Open a cached file and mark it as used now; None when it is not cached."""
         path = self.folder / name
         try:
             file = path.open("rb")
@@ -62,7 +62,7 @@ class FileCache:
         return file
 
     def get(self, name: str, size: int, make: Callable[[Path], object]) -> BinaryIO:
-        """The file `name`, opened. `make` writes it to the path it is given when it is not there yet.
+        """Open the file `name`. `make` writes it to the path that it gets when it is not cached yet.
 
         `size` (bytes, 0 if unknown) is made room for.
         """

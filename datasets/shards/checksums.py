@@ -29,7 +29,7 @@ class LocalShard(NamedTuple):
 
 
 def state_of(path: Path) -> list[int]:
-    """What changes when somebody writes to a file or puts another in its place; empty: none is there.
+    """Return size, times and inode, which change when somebody writes or replaces a file; empty without one.
 
     The time of the last change of any kind (ctime) is the system's own: a copy that restores the time of the
     last write, as rsync does, is seen, and so are files of two machines that lie under one path.
@@ -66,7 +66,7 @@ def require_intact(shard: LocalShard, *, content: bool = True) -> None:
 def problems(
     shards: Sequence[LocalShard], threads: int, done: Callable[[], object] = lambda: None
 ) -> list[str]:
-    """What is wrong with shards, in their order; `done` is called for each that has been compared.
+    """Return the faults of shards, in their order; `done` is called for each that has been compared.
 
     Hashing runs outside the interpreter's lock.
     """

@@ -30,7 +30,7 @@ class ClipDataset(Protocol):
 
     @property
     def present(self) -> NDArray[np.uint8]:
-        """What every clip holds beside its body, bits of `ClipMeta.present`, [n]."""
+        """Parts that every clip holds beside its body, bits of `ClipMeta.present`, [n]."""
         ...
 
     @property
@@ -39,7 +39,7 @@ class ClipDataset(Protocol):
         ...
 
     def has(self, member: str) -> NDArray[np.bool_]:
-        """Which clips hold a member such as `texts.json`, [n]."""
+        """Return which clips hold a member such as `texts.json`, [n]."""
         ...
 
     def motion(self, i: int) -> NDArray[np.float32]:
@@ -69,7 +69,7 @@ class ClipDataset(Protocol):
         ...
 
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
-        """How a batch plan over `clips` (ascending numbers; all when None) is to be ordered and mixed."""
+        """Return the order and mix of a batch plan over `clips` (ascending numbers; all when None)."""
         ...
 
     def parts(self) -> Sequence[tuple[ClipDataset, float]]:

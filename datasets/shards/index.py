@@ -1,4 +1,4 @@
-"""Where everything is: one JSON index per shard, one `index.npz` for the whole dataset.
+"""Places of all members: one JSON index per shard, one `index.npz` for the whole dataset.
 
 `NAME-SPLIT-000000.index.json` (`ShardIndex`) is readable and stands beside its tar; its presence means the
 tar is whole. `index.npz` holds the same offsets as flat arrays, one set per split (`train.frames`, ...), so
@@ -44,7 +44,7 @@ _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "id_bytes": (np.uint8, 1),
 }
 _MOST_ID_BYTES = 4096
-"""Of one clip's id."""
+"""Largest size of one clip's id."""
 
 
 class ClipEntry(Config):
@@ -65,7 +65,7 @@ class ClipEntry(Config):
 
 
 class Written(NamedTuple):
-    """What the writer knows of a clip and its tar does not."""
+    """Facts of a clip that the writer knows and its tar does not."""
 
     id: str
     held: int

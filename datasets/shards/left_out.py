@@ -1,4 +1,4 @@
-"""What was left out of a data set: by reason, counted, and listed in a file beside the shards.
+"""Clips left out of a data set: by reason, counted, and listed in a file beside the shards.
 
 Reasons differ from clip to clip in names and numbers (`0.67 s, shorter than 1 s`); those that differ in
 nothing else are one group: twenty identical messages are one line.

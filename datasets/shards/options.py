@@ -1,4 +1,4 @@
-"""How a data set is written, and how it is read."""
+"""Settings of writing and reading a data set."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Part:
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """What a data set is: everything of its manifest that is known before the first clip is converted."""
+    """Everything of a data set's manifest that is known before the first clip is converted."""
 
     name: str
     layout: MotionLayout
@@ -47,9 +47,9 @@ class DatasetFacts:
     converter: str
     converter_version: int
     options: dict[str, object]
-    """What the output depends on, as plain JSON; never a local path."""
+    """Everything that the output depends on, as plain JSON; never a local path."""
     motion_type: MotionType = "float32"
-    """How `motion.npy` is stored."""
+    """Number type of `motion.npy`."""
     licences: dict[str, int] = field(default_factory=dict)
     """Clips under each licence, for sources that mix several."""
     audio: dict[str, object] | None = None
@@ -60,7 +60,7 @@ class DatasetFacts:
     audit: Sequence[AuditRow] = ()
 
     def made_from(self) -> dict[str, object]:
-        """What the bytes of every clip depend on, beside its own source."""
+        """Return everything that the bytes of every clip depend on, beside its own source."""
         layout = self.layout
         options = {key: value for key, value in self.options.items() if key != SOURCE_CHECKSUM}
         return {
@@ -74,13 +74,13 @@ class DatasetFacts:
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """How a data set is written. Only `seed` and `clips_per_shard` show in the shards."""
+    """Settings of writing a data set. Only `seed` and `clips_per_shard` show in the shards."""
 
     workers: int = 1
     """Processes."""
     clips_per_shard: int = 256
     seed: int = 0
-    """Of the order in which clips go to shards."""
+    """Seed of the order in which clips go to shards."""
     strict: bool = False
     """Stop at the first item that fails, instead of leaving it out."""
     progress: bool = True

@@ -239,7 +239,7 @@ class ShardDataset:
         return buffer[start : start + size]
 
     def _row(self, i: int) -> int:
-        """Where clip `i` is in the index, among those that are skipped."""
+        """Return the row of clip `i` in the index, which counts excluded clips too."""
         if not 0 <= i < len(self._rows):
             raise IndexError(f"clip {i} of {len(self)}")
         return int(self._rows[i])

@@ -1,4 +1,4 @@
-"""Where the files of a data set lie: a folder, a web server or an S3 bucket, behind one interface.
+"""Stores of a data set's files: a folder, a web server or an S3 bucket, behind one interface.
 
 Only the schemes of `SCHEMES` are opened, and the check comes before anything else: no `pipe:`, no chained or
 shell URL ever reaches a library. Requests go through fsspec and are repeated by `persist`. Credentials
@@ -249,7 +249,7 @@ def persist(what: str, action: Callable[[], T], *, first: bool = False) -> T:
 
 
 def _refusal(error: Exception) -> str | None:
-    """Why repeating cannot help, or None when it may."""
+    """Return why repeating cannot help, or None when it may."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "the disk of the cache folder is full; free space or lower the cache's gigabytes"
     if isinstance(error, TimeoutError):

@@ -63,7 +63,7 @@ def plan_shards(
     describe: Callable[[T], str],
     depends_on: Callable[[T], object] | None = None,
 ) -> list[ShardTask[T]]:
-    """Which items go to which shard, in which order: known before the first one is converted.
+    """Return the shards with their items in order: known before the first one is converted.
 
     With `depends_on`, what the content of an item is, they are ordered by a hash of their names: when others
     come and go, those that stay keep their neighbours, so that a shard finds them in few old ones.
@@ -204,7 +204,7 @@ def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -
 
 
 def finished_shard(task: ShardTask[Any], *, verify: bool = True) -> Result | None:
-    """What an earlier run made of `task` from the same inputs, or None when it must be made.
+    """Return an earlier run's result of `task` from the same inputs, or None when it must be made.
 
     `verify` reads the tar and compares its sha256; else its size will do.
     """

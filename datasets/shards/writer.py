@@ -147,7 +147,7 @@ class DatasetWriter(Generic[T]):
             self._news = self._changes(sources, {item.name for task in tasks for item in task.items})
 
     def _changes(self, before: set[str], now: set[str]) -> str:
-        """What differs from the shards of an earlier run, in words."""
+        """Return the differences from the shards of an earlier run, in words."""
         tasks = [self._tasks[at] for at in self._todo]
         again = [item.name for task in tasks for item in task.items if item.made_from not in task.kept]
         new = sum(name not in before for name in again)
@@ -157,7 +157,7 @@ class DatasetWriter(Generic[T]):
 
     @property
     def progress_line(self) -> str:
-        """What an earlier run has finished, in one line; empty when there is nothing yet."""
+        """One line on the shards that an earlier run has finished; empty when there are none."""
         if self._news:
             return self._news
         made = len(self._tasks) - len(self._todo)

@@ -1,4 +1,4 @@
-"""Who may use the server: host names, origins, security headers, and bodies within limits.
+"""Access to the server: host names, origins, security headers, and bodies within limits.
 
 A page of another site in the same browser must not reach the model. Under its own name it is refused by
 `Origin` (`OwnPage`); under a name that it has made to point at this machine (DNS rebinding) by `Host`

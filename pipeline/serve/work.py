@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Busy(Exception):  # noqa: N818 - an answer, not a fault
-    """As many requests wait as may wait."""
+    """The largest allowed number of requests waits."""
 
 
 class Stopped(Exception):  # noqa: N818

@@ -74,7 +74,7 @@ _Loader.add_constructor("tag:yaml.org,2002:int", _int)
 
 
 _MOST_BYTES, _MOST_VALUES = 100_000, 20_000
-"""Of a file, and of what its aliases make of it; the longest recipe, resolved, has 15,000 bytes."""
+"""Limits of a file, and of what its aliases stand for; the longest resolved recipe has 15,000 bytes."""
 
 
 def load_yaml(text: str, where: str) -> Any:
@@ -146,7 +146,7 @@ def flatten(settings: Mapping[str, object], prefix: str = "") -> dict[str, objec
 
 
 def setting_text(value: object) -> str:
-    """As it would stand in a recipe, on one line."""
+    """Return a value as a recipe writes it, on one line."""
     if isinstance(value, str):
         return value or "(empty)"
     if value is None:

@@ -32,7 +32,7 @@ _KNEES = 0.05
 
 
 class FeetOptions(Config):
-    """When a foot stands, and how its correction comes and goes."""
+    """Thresholds of a standing foot, and the blending of its correction."""
 
     height: float = Field(0.05, gt=0, allow_inf_nan=False)
     """Metres above the floor below which a ball of the foot may stand; the floor is the balls' lowest place,
@@ -47,7 +47,7 @@ class FeetOptions(Config):
 
 @dataclass(frozen=True)
 class FeetReport:
-    """What planting the feet changed. Slides are means over all steps in which a foot stands."""
+    """Change by planting the feet. Slides are means over all steps in which a foot stands."""
 
     slide_before: float
     """Centimetres a second along the floor."""
@@ -55,7 +55,7 @@ class FeetReport:
     contact: float
     """Share of the frames in which a foot stands, the mean of both feet."""
     unplanted: FitError
-    """How far the figure was from the joints before its feet were planted."""
+    """Distance of the figure from the joints before its feet were planted."""
 
     def __str__(self) -> str:
         if not self.contact:
@@ -72,7 +72,7 @@ def foot_contacts(
     features: NDArray[np.floating] | None = None,
     layout: MotionLayout | None = None,
 ) -> NDArray[np.bool_]:
-    """When the left and the right foot stand [T, 2], from joints [T, N, 3] in metres.
+    """Return when the left and the right foot stand [T, 2], from joints [T, N, 3] in metres.
 
     `features` [T, D] of a `layout` with contact columns take the place of the speed.
     """
@@ -99,7 +99,7 @@ def plant_feet(
     fps: float,
     options: FeetOptions | None = None,
 ) -> tuple[RigidMotion, FeetReport]:
-    """The motion with its feet pinned while `contacts` [T, 2] say that they stand.
+    """Return the motion with its feet pinned while `contacts` [T, 2] say that they stand.
 
     `unfitted` [T, N, 3] are the joints before any fit, which the result's error is measured against.
     """
@@ -169,7 +169,7 @@ def _correction(ball: NDArray[np.float64], standing: NDArray[np.bool_], blend: i
 
 
 def _fade(way: NDArray[np.float64]) -> NDArray[np.float64]:
-    """From 1 at 0 to 0 at 1 and beyond, level at both ends."""
+    """Return a smooth step from 1 at 0 to 0 at 1 and beyond."""
     x = np.clip(way, 0, 1)
     return np.asarray(1 - x * x * (3 - 2 * x), dtype=np.float64)
 

@@ -22,10 +22,10 @@ Number = TypeVar("Number", np.float64, np.complex128)
 _PINNED, _FREE, _BENDS = 1000.0, 1.0, 0.05
 """Weights of joints: that must be somewhere, of the rest, and of knees and elbows, which may bend."""
 _ROUNDS = 3
-"""Of aiming past a pin by as much as it was missed."""
+"""Rounds of aiming past a pin by as much as it was missed."""
 
 Pinned = Mapping[tuple[int, int], Sequence[float]]
-"""Where joints must be, in metres, by frame and joint."""
+"""Places of pinned joints, in metres, by frame and joint."""
 
 
 def eased(values: NDArray[Number], known: NDArray[np.bool_]) -> NDArray[Number]:
@@ -125,8 +125,8 @@ def _nearest_pinned(skeleton: Skeleton, pinned: Sequence[int]) -> list[int | Non
 def _track(
     joint: int, missing: Mapping[tuple[int, int], NDArray[np.float64]], still: NDArray[np.bool_], blend: int
 ) -> NDArray[np.float64]:
-    """By how much a joint is moved in every frame [T, 3]: at its pins all of it, nothing `blend` frames away
-    from them and where the figure must stand `still`.
+    """Return the displacement of a joint in every frame [T, 3]: at its pins all of it, nothing `blend` frames
+    away from them and where the figure must stand `still`.
     """
     knots = np.array([frame for frame, one in missing if one == joint])
     frames = len(still)

@@ -166,7 +166,7 @@ def share_twist(rotations: Floats, skeleton: Skeleton) -> Floats:
 
 
 def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
-    """The same motions on one skeleton of their mean bones; errors are against the given figures."""
+    """Return the motions on one skeleton of their mean bones; errors are against the motions that came in."""
     own = [motion.skeleton for motion in motions]
     if all(skeleton == own[0] for skeleton in own):
         return list(motions)

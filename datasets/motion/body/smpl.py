@@ -54,7 +54,7 @@ class BodyModel:
     directions: NDArray[np.float64]
     """Change of the rest joints [N, 3, B] with each shape value."""
     statement: dict[str, Any]
-    """What made the joints, as plain JSON for the manifest."""
+    """The origin of the joints, as plain JSON for the manifest."""
 
     @staticmethod
     def neutral(skeleton: SkeletonName) -> BodyModel:

@@ -26,7 +26,7 @@ FPS = 120.0
 """An AMC file does not say its frame rate; the public collections have this one."""
 
 JOINED = b"\n\0\n"
-"""What stands between the two texts where both are read as one."""
+"""Separator of the two texts where both are read as one."""
 
 _CHANNELS = ("Zrotation", "Xrotation", "Yrotation")
 _ROOT = ("Xposition", "Yposition", "Zposition", *_CHANNELS)
@@ -38,7 +38,7 @@ class _Bone:
     """A bone of the ASF; the root has no length."""
 
     end: Floats
-    """From its start to its end [3], in centimetres, in the rest pose."""
+    """Vector from its start to its end [3], in centimetres, in the rest pose."""
     axis: tuple[str, tuple[float, ...]]
     """Order of the local frame's angles, and the angles in degrees."""
     dof: tuple[str, ...]
@@ -87,7 +87,7 @@ def count_frames(amc: bytes, name: str) -> int:
 
 
 def _marks(amc: bytes, where: str) -> list[tuple[int, int]]:
-    """Where the lines are that number the frames."""
+    """Return the places of the lines that number the frames."""
     marks = [mark.span() for mark in _FRAME.finditer(amc)]
     if not marks:
         raise UserError(f"{where}: no frames; an AMC file numbers each on a line of its own")

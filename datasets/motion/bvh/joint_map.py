@@ -61,7 +61,7 @@ class _About(Config):
 
 
 def skeleton_key(joints: Sequence[str], parents: Sequence[int]) -> str:
-    """What clips with one skeleton share: names and parents of their joints. Bone lengths may differ."""
+    """Names and parents of the joints that clips with one skeleton share. Bone lengths may differ."""
     return sha256_of_json([list(joints), list(parents)])[:16]
 
 
@@ -78,7 +78,7 @@ class JointMap:
     """`skeleton_key` of the only files that it is for; empty for all that have its joints."""
     unit: Unit | None = None
     up: Up | None = None
-    """What its files are measured in, where it says so."""
+    """Unit of its files, where it is stated."""
     ends: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     """End Sites that the files do not have, by their joints."""
 

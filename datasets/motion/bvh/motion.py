@@ -39,7 +39,7 @@ WRITTEN_ORDER = "ZXY"
 CENTIMETRES = 100.0
 
 END = "End Site of {}"
-"""What the End Site of a joint is called where it counts as a joint."""
+"""Name of a joint's End Site where that counts as a joint."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class BvhMotion:
         return len(self.values)
 
     def with_ends(self, made: Mapping[str, Sequence[float]] | None = None) -> BvhMotion:
-        """The same with its End Sites as joints without channels behind the others, named as `END` says.
+        """The figure with End Sites as joints without channels behind the others, named as `END` says.
 
         `made` are other End Sites of joints, in multiples of the distance from their parents.
         """
@@ -142,7 +142,7 @@ class BvhMotion:
 
 @dataclass(frozen=True)
 class _ChannelColumns:
-    """Where in a row of values each kind of channel stands."""
+    """Return the places of each kind of channel in a row of values."""
 
     positions: tuple[list[int], list[int], list[int]]
     """Joints, axes and columns of all position channels."""

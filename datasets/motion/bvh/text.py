@@ -34,7 +34,7 @@ _NUMBER = re.compile(rb"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 @dataclass(frozen=True)
 class MotionSection:
-    """Where the MOTION section lies in the bytes, and what its two header lines say."""
+    """Place of the MOTION section in the bytes, and the numbers of its two header lines."""
 
     start: int
     body: int

@@ -22,7 +22,7 @@ _neutral = cache(BodyModel.neutral)
 
 
 def joints_of(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:
-    """Columns [..., T, D] of `layout`, in their own units -> joints [..., T, N, 3] in metres.
+    """Return joints [..., T, N, 3] in metres of columns [..., T, D] of `layout` in their own units.
 
     The columns are all of the layout's, or those of its body and hands (`layout.part("bodyhand")`). Features
     begin above the origin with heading +Z; raw parameters stay in their own axes, where
@@ -101,7 +101,7 @@ class JointFlow:
         self._angle, self._turning = 0.0, 0.0
         """Sum of the turns before the last frame, and the turn that followed it."""
         self._root, self._going = 0j, 0j
-        """The same of the root's way, z + i x; of `h3d` the step is not turned yet."""
+        """Sum and step of the root's way, z + i x; of `h3d` the step is not turned yet."""
 
     def __call__(self, features: NDArray[np.floating]) -> NDArray[np.float64]:
         """The next columns [T, D] in their own units -> joints [T, N, 3] in metres."""

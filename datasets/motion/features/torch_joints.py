@@ -1,4 +1,4 @@
-"""`joints_of` in torch, with gradients: for losses and guidance that are said of joints in metres."""
+"""`joints_of` in torch, with gradients: for losses and guidance on joints in metres."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def torch_way(features: Tensor, layout: MotionLayout) -> tuple[Tensor, Tensor, T
 
 
 def present_joints(present: Tensor, layout: MotionLayout) -> Tensor:
-    """Which joints clips hold, bool [B, N], of the columns of body and hands that they hold, bool [B, D]."""
+    """Return which joints clips hold, bool [B, N], by their columns of body and hands, bool [B, D]."""
     if layout.family == "raw":
         return present.new_ones(len(present), layout.num_joints)
     positions = present[:, layout.without_face().slice("positions")][:, ::3]
