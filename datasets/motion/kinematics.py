@@ -50,6 +50,7 @@ def forward_kinematics(
     joints = np.empty((3, 1, count, *lead))
     joints[:, 0, 0] = np.moveaxis(np.broadcast_to(root, (*lead, 3)), -1, 0)
     for children in levels(parents):
+        # Joints of one depth do not depend on each other: one product for all of them.
         above = [parents[child] for child in children]
         turned = world[:, :, above]
         world[:, :, children] = multiply(turned, local[:, :, children])
@@ -84,6 +85,7 @@ def joints_to_rotations(joints: NDArray[np.floating], skeleton: Skeleton) -> NDA
         if single:
             ends = np.concatenate([children[joint] for joint in single])
             world[:, :, single] = _swing_bones(rest[ends], bones[:, ends], world[:, :, single])
+        # Several bones fix the rotation; one leaves the twist open, which stays the parent's.
         for joint in level:
             if len(children[joint]) > 1:
                 ends = children[joint]

@@ -111,6 +111,7 @@ class NpzFile:
                 f"{self.label}: array '{name}' of shape {list(header.shape)} takes {header.end:,} bytes; "
                 f"more than {limit:,} are not read"
             )
+        # The stream is opened anew: the header has been read off the first one, and zips do not seek cheaply.
         with self._open(name) as stream:
             return np.asarray(npy_format.read_array(stream, allow_pickle=False))
 

@@ -106,6 +106,7 @@ def measure(joints: NDArray[np.floating], fps: float) -> FigureMeasure:
     trunk = body[:, _HEAD] - body[:, _PELVIS]
     up = np.median(trunk / np.maximum(np.linalg.norm(trunk, axis=-1, keepdims=True), 1e-9), axis=0)
     up /= max(float(np.linalg.norm(up)), 1e-9)
+    # The floor is the lowest joint of all frames, also of those that are not measured: jumps begin on it.
     lowest = body[..., 1].min(axis=-1)
     floor = float(np.asarray(joints)[:, :BODY_JOINTS, 1].min())
     heading = np.exp(1j * facing(body))
@@ -135,7 +136,7 @@ Kind = Literal["size", "lying", "upside down", "floating", "below the floor", "l
 
 @dataclass(frozen=True)
 class Oddity:
-    """Return the faults that many clips have in common, which people standing on a floor have not."""
+    """A fault that many clips have in common and people standing on a floor have not."""
 
     kind: Kind
     clips: int
@@ -146,7 +147,7 @@ class Oddity:
 
     @property
     def share(self) -> float:
-        """Medians over the clips that were measured."""
+        """Share of the measured clips."""
         return self.clips / self.of
 
     @property
@@ -214,6 +215,7 @@ class PlausibilityStats:
                 share = f"{number} of {total} clips ({number / total:.0%})"
                 found.append(Oddity(kind, number, total, f"{share} {text}"))
 
+        # Written so that NaN counts as odd: a comparison with NaN is false.
         count(
             "size",
             ~((height >= small) & (height <= tall)),

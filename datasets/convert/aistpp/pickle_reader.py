@@ -136,7 +136,7 @@ def _require_bounded(raw: bytes) -> None:
         if number >= MAX_OPCODES:
             raise _Refused(f"more than {MAX_OPCODES} pickle instructions")
         # Python before 3.14 makes room for all memo places below the one that is named (gh-115952).
-        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and argument > MAX_OPCODES:
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > MAX_OPCODES:
             raise _Refused(f"memo place {argument}")
 
 

@@ -102,6 +102,7 @@ class _Solver:
             new_place = place[rows] + step
             new_joints, new_world = forward_kinematics(new_local, new_place, self.offsets, self.parents)
             new_cost = self._cost(new_joints, rows)
+            # A step that makes a frame worse is not taken but tried again, shorter, by more damping.
             better = new_cost <= cost[rows]
             gain = cost[rows] - new_cost
             small = np.abs(gain) < _STILL + 1e-6 * cost[rows]
@@ -143,6 +144,8 @@ class _Solver:
         hessian = weight[..., None, None] * np.eye(3)
         gradient = weight[..., None] * (points - self.targets[:, rows])
         solved: list[tuple[_Level, Floats, Floats, Floats]] = []
+        # From the leaves up: each joint's turn is eliminated, and what is left of its children's cost, a
+        # quadratic function of the joint's own displacement, is added to its own.
         for level in reversed(self.levels):
             owner, children = level.owner, level.children
             bones = points[children] - points[np.asarray(level.joints)[owner]]
@@ -163,6 +166,7 @@ class _Solver:
         # The root is as firm as its own weight; a root that counts for nothing still hangs on its bones.
         move[0] = -np.linalg.solve(hessian[0] + 1e-12 * np.eye(3), gradient[0][..., None])[..., 0]
         spin = np.zeros_like(points)
+        # From the root down: displacements are known now, so turns follow, and from these the children's.
         for level, bones, ratio, rest in reversed(solved):
             turned = -((ratio @ move[level.joints][..., None])[..., 0] + rest)
             spin[level.joints] = turned

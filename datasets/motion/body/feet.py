@@ -86,6 +86,7 @@ def foot_contacts(
         slow = _speeds(balls, fps) < options.speed
     shortest = max(1, round(options.shortest * fps))
     standing = low & slow
+    # Gaps first: a contact that flickers is one contact, and only then may a short one be dropped.
     for foot in range(2):
         standing[:, foot] = _without_short_runs(standing[:, foot], shortest, gaps=True)
         standing[:, foot] = _without_short_runs(standing[:, foot], shortest, gaps=False)

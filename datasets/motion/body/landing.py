@@ -81,6 +81,8 @@ def reached(
     figure = fit_rigid(joints, skeleton)
     missing = {key: np.asarray(place) - joints[key] for key, place in pinned.items()}
     out = joints
+    # The solver trades pins against bones, so it falls short of them by a little. Each round aims past a pin
+    # by what was missed.
     for _ in range(_ROUNDS):
         targets = figure.joints.copy()
         weights = np.where(fixed, _PINNED, _FREE)
@@ -90,7 +92,9 @@ def reached(
         changes = {joint: _track(joint, missing, still, blend) for joint in pinned_joints}
         for joint in pinned_joints:
             moved |= changes[joint].any(axis=1)
+            # Elbows and knees give way, so that a hand or foot is reached by bending, not by moving the body.
             weights[:, skeleton.parents[joint]] = np.minimum(weights[:, skeleton.parents[joint]], _BENDS)
+        # Fingers follow their wrist, and toes their ankle.
         for joint, above in enumerate(_nearest_pinned(skeleton, pinned_joints)):
             if above is not None:
                 targets[:, joint] += np.where(fixed[:, joint, None], 0.0, changes[above])
@@ -107,6 +111,8 @@ def reached(
             weights[rows],
         )
         posed = type(figure).posed(figure.skeleton, turned, root, targets[rows])
+        # The fitted figure's change is added to the joints that came in, whose bones may stretch: so what
+        # no pin moves stays to the bit.
         out = joints.copy()
         out[rows] += np.where(fixed[rows][..., None], 0.0, posed.joints - figure.joints[rows])
         for key, place in pinned.items():

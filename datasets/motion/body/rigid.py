@@ -124,6 +124,8 @@ def measured_skeleton(
     bones = points.copy()
     bones[:, 1:] -= points[:, parents[1:]]
     offsets = own.offsets.copy()
+    # The shape of a pelvis is the median of its bones seen from the pelvis, whose rotation depends on the
+    # shape: alternate until both agree.
     for _ in range(_ROUNDS):
         turned = joints_to_rotations(points, own)
         _, world = forward_kinematics(turned, points[:, 0], own.offsets, own.parents)

@@ -108,6 +108,7 @@ def _turned(bone: _Bone, numbers: Floats | None, frames: int, degree: float) -> 
     if numbers is None or not columns:
         return np.zeros((frames, 3))
     order = "".join(bone.dof[column][1] for column in columns)
+    # ASF states a bone's rotation M in axes of its own, C, which BVH does not have.
     axis = Rotation.from_euler(*bone.axis, degrees=True)
     turn = axis * Rotation.from_euler(order, numbers[:, columns] * degree, degrees=True) * axis.inv()
     with warnings.catch_warnings():  # at a gimbal lock one of the many equal answers is as good as another
@@ -127,6 +128,7 @@ def _skeleton(text: bytes, where: str) -> _Skeleton:
         bones = _bones(sections, unit, degree)
     except (ValueError, IndexError, KeyError, ZeroDivisionError) as error:
         raise UserError(f"{where}: a bone or unit cannot be read ({error})") from None
+    # Bones are numbered in the order of the hierarchy, in which parents must come first.
     parents = {"root": -1}
     for line in sections["hierarchy"]:
         for child in line[1:]:
@@ -161,6 +163,7 @@ def _bones(sections: dict[str, list[list[str]]], unit: float, degree: float) -> 
     axis = (root.get("axis", ["XYZ"])[0].lower(), angles)
     bones = {"root": _Bone(np.zeros(3), axis, tuple(word.lower() for word in root["order"]))}
     fields: dict[str, list[str]] = {}
+    # A bone ends where the next one's id begins; one more id ends the last.
     for line in [*sections["bonedata"], ["id"]]:
         if line[0] == "id" and fields:
             direction = np.array([float(word) for word in fields["direction"][:3]])
@@ -183,6 +186,7 @@ def _frames(text: bytes, bones: dict[str, _Bone], where: str) -> tuple[dict[str,
     if stray or "root" not in moved or max(Counter(moved).values()) > 1:
         wrong = f"bone '{stray[0][:40]}' is not in its .asf" if stray else "needs `root` and each bone once"
         raise UserError(f"{where}: frame 1: {wrong}; is the .asf another subject's?")
+    # The first frame says which bones move; all others must name the same, so that columns can be cut out.
     widths = [len(bones[bone].dof) for bone in moved]
     starts = np.cumsum([0, *(1 + width for width in widths)])
     for number, words in enumerate(frames, 1):

@@ -96,6 +96,7 @@ class JointMap:
             raise UserError(
                 f"{path}: a joint map needs a key named after the skeleton '{target}'; found {keys}"
             )
+        # Rows carry index and name: a row that was moved or lost while editing by hand is found.
         skeleton = Skeleton.named(target)
         try:
             rows = _ROWS.validate_python(data[target])

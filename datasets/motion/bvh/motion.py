@@ -142,7 +142,7 @@ class BvhMotion:
 
 @dataclass(frozen=True)
 class _ChannelColumns:
-    """Return the places of each kind of channel in a row of values."""
+    """Places of each kind of channel in a row of values."""
 
     positions: tuple[list[int], list[int], list[int]]
     """Joints, axes and columns of all position channels."""
@@ -210,10 +210,12 @@ def write_bvh(path: Path, skeleton: Skeleton, rotations: NDArray, root: NDArray,
         raise UserError(f"{path}: the motion holds NaN or infinite values; a BVH file cannot")
     if not fps > 0:
         raise UserError(f"{path}: fps = {fps} must be above 0")
+    # A row lists the channels in the order of the hierarchy, which is not that of the skeleton's joints.
     order = _depth_first(skeleton)
     values = np.concatenate(
         [root * CENTIMETRES, _euler_degrees(rotations[:, order]).reshape(frames, -1)], axis=1
     )
+    # Nine decimals: frame times of 1/30 and 1/29.97 s must come back as the rates that they were.
     lines = [
         "HIERARCHY",
         *_hierarchy_lines(skeleton, 0, 0),

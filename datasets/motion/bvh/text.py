@@ -110,6 +110,7 @@ def _frame_rate(text: bytes, where: str) -> float:
             "the frame rate would be meaningless"
         )
     fps = 1 / float(exact)
+    # A written frame time is cut or rounded; it means a whole rate where that rate, written so, is the same.
     whole = round(fps)
     if whole:
         digit = Decimal(1).scaleb(max(int(exact.as_tuple().exponent), -12))
@@ -123,6 +124,7 @@ def read_values(data: bytes, start: int, frames: int, width: int, where: str) ->
     body = data[start:].rstrip()
     if not body:
         raise UserError(f"{where}: the header says {frames} frames, 0 found")
+    # Numbers are counted by line before they are parsed, so that a short row is named and nothing shifts.
     text = np.frombuffer(body, dtype=np.uint8)
     visible = text > 32
     starts = np.flatnonzero(visible & np.r_[True, ~visible[:-1]])
@@ -237,6 +239,7 @@ class _HierarchyParser:
         """One brace or one statement."""
         block = self.open[-1] if self.open else None
         in_joint = block is not None and block >= 0
+        # Every statement opens a block that must follow at once, closes one, or belongs to the open one.
         if self.pending is not None:
             if key != "{":
                 raise self._error(f"expected '{{' before '{piece[:60]}'")
@@ -256,7 +259,7 @@ class _HierarchyParser:
             offset = self._offset(words)
             if in_joint:
                 self.offsets[block] = offset
-            else:
+            else:  # an End Site's: of its joint, which is the block around it
                 self.out.ends.setdefault(self.open[-2], offset)
         elif key == "CHANNELS" and block is not None and in_joint:
             self.channels[block] = self._channel_names(words)

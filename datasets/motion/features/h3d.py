@@ -64,6 +64,7 @@ def encode_h3d(
     world = uniform_joints(joints, layout.skeleton, offsets)
     angle = _published_heading(world)
     unturn = np.exp(-1j * angle)
+    # Axes first: every step below is then one run over contiguous frames.
     points = np.ascontiguousarray(np.moveaxis(world, (-1, -2), (0, 1)))
     plane = points[2] + 1j * points[0]
     step = np.diff(plane, axis=-1)
@@ -72,6 +73,8 @@ def encode_h3d(
     lead, frames = world.shape[:-3], world.shape[-3] - 1
     rows = np.zeros((layout.dim, *lead, frames), dtype=np.float32)
     rows[layout.slice("root_yaw_velocity")] = np.arcsin(np.sin(-0.5 * np.diff(angle, axis=-1)))
+    # The published code turns the root's step by the heading of the frame that it leads to, and all other
+    # steps by that of the frame that they start from.
     root = rows[layout.slice("root_xz_velocity")]
     seen = step[0] * unturn[..., 1:]
     root[0], root[1] = seen.imag, seen.real
@@ -134,12 +137,13 @@ def rotations_6d(
     axes = directions.T.reshape(3, -1, *(1,) * angle.ndim)
     bones = points[:, 1:] - points[:, parents]
     length = np.sqrt(bones[0] ** 2 + bones[1] ** 2 + bones[2] ** 2)
-    if not length.all():
+    if not length.all():  # a bone without length has no direction: as at rest
         bones = np.where(length > 0, bones, axes)
         length = np.where(length > 0, length, 1.0)
     bones /= length
     world = swing(axes, bones)
 
+    # Published chains each start from the root's heading, whatever the parent's rotation is (quirk 6).
     above = np.empty_like(world)
     above[:, :, starts] = _about_y(-angle)[:, :, None]
     above[:, :, ~starts] = world[:, :, parents[~starts] - 1]

@@ -110,6 +110,7 @@ class JointFlow:
         if self.layout.family == "raw":
             return joints_of(features, self.layout)  # raw parameters say where each frame stands
         body = _without_face(features, self.layout)
+        # Sums go on from the last chunk by the same additions as over the whole motion: no rounding differs.
         yaw = np.asarray(body[:, self._body.slice("root_yaw_velocity")][:, 0], dtype=np.float64)
         published = self.layout.family == "h3d"
         angle = _carried(self._angle, self._turning, yaw)
