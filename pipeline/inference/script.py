@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from motionloom.datasets.audio.excerpt import Excerpt
-from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.audio.sound import Excerpt, Sound
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.store.yaml import read_yaml

@@ -107,7 +107,7 @@ def generate_motions(
     from one script. `samples` motions of each. `seed_motion` is a clip to go on from. `figure` are the keys
     of `FigureOptions`.
     """
-    from motionloom.datasets.audio.excerpt import Excerpt
+    from motionloom.datasets.audio.sound import Excerpt
     from motionloom.pipeline.contract.generation import SeededGenerator
     from motionloom.pipeline.inference.bundle import unknown_captions
     from motionloom.pipeline.inference.notes import doubts
