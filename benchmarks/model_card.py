@@ -41,8 +41,8 @@ from motionloom.datasets.synth.actions.truth import FACES, HANDS, takes_part
 from motionloom.datasets.synth.captions import body_captions
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of, truth_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.evaluation.answers import most_alike, nearest_texts
 from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
+from motionloom.pipeline.evaluation.reference_baselines import most_similar, nearest_texts
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
@@ -153,7 +153,7 @@ def lookups(truths: Sequence[Truth], config: SynthConfig) -> dict[str, list[Trut
     words = {index: np.random.default_rng([config.seed, index, 3]) for index in train}
     texts = [body_captions(plans[k], words[k], config.captions, True, config.wordings)[0] for k in train]
     found = {
-        NEAREST_LABELS: most_alike(
+        NEAREST_LABELS: most_similar(
             [plans[k].record(hands=True, face=True) for k in train], [t.truth or {} for t in truths]
         ),
         NEAREST_WORDS: nearest_texts(texts, [t.caption for t in truths]),

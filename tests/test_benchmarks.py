@@ -16,8 +16,8 @@ import pytest
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import synthesize
-from motionloom.pipeline.evaluation.answers import by_labels
 from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
+from motionloom.pipeline.evaluation.reference_baselines import by_nearest_labels
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.recipe import load_recipe
 
@@ -85,7 +85,9 @@ stages:
             np.testing.assert_array_equal(getattr(truth, name), value, err_msg=name)
     train = ShardDataset.open(tmp_path / "shards", "train")
     found = card.lookups(made, config)
-    for own, theirs, wanted_of in zip(found[NEAREST_LABELS], by_labels(train, made), made, strict=True):
+    for own, theirs, wanted_of in zip(
+        found[NEAREST_LABELS], by_nearest_labels(train, made), made, strict=True
+    ):
         said = {k: v for k, v in wanted_of.truth.items() if v is not None}
         alike = [sum(one.truth.get(k) == v for k, v in said.items()) for one in (own, theirs)]
         assert alike[0] == alike[1]

@@ -17,7 +17,7 @@ from motionloom.datasets.shards.left_out import grouped
 from motionloom.pipeline.cli.convert import convert_app, say, say_manifest
 from motionloom.pipeline.cli.options import AsJson, plain, print_json
 from motionloom.pipeline.launch.console import make_console
-from motionloom.pipeline.render.labels import label
+from motionloom.pipeline.render.charts import label
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ def face(
 
     Example: `motionloom data face take.csv take.npz`
     """
-    from motionloom.pipeline.render.body.face_take import convert_face
+    from motionloom.pipeline.render.body.face import convert_face
 
     require_file_place(out)
     frames, fps = convert_face(source, out, arkit_bases)
@@ -217,12 +217,9 @@ def report(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The page; default ROOT/report.html.")
     ] = None,
-    check: Annotated[
-        bool, typer.Option("--check", help="Also check the whole set, and show what was found.")
-    ] = False,
     clips: Annotated[int, typer.Option(help="Clips to watch, at most.")] = 12,
 ) -> None:
-    """One self-contained page about a data set: counts, captions, features, rejected clips, clips to watch.
+    """One self-contained page about a data set: counts, captions, rejected clips, clips to watch.
 
     Example: `motionloom data report shards -o shards.html`
     """
@@ -230,7 +227,7 @@ def report(
 
     console, path = make_console(), out or root / "report.html"
     require_file_place(path)
-    write_data_report(root, path, check=check, clips=clips, progress=console.is_terminal)
+    write_data_report(root, path, clips=clips, progress=console.is_terminal)
     console.print(str(path), markup=False, soft_wrap=True)
 
 

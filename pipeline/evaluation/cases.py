@@ -25,7 +25,7 @@ from motionloom.pipeline.render.viewer import ViewerMotion
 
 FILE_NAME = "cases.safetensors"
 EACH = 3
-"""Of the worst, and of the best."""
+"""Clips kept as the worst, and as the best."""
 _KINDS = {
     "reconstruction": (
         "mm",
@@ -40,12 +40,12 @@ _KINDS = {
         "them, by TMA's latents of length 1 (0: equal, 2: opposite); beside it the recorded motion.",
     ),
 }
-"""What was made -> unit of its error, title, and what is said of it."""
+"""Kind of motion -> unit of its error, title, and note on the page."""
 
 
 @dataclass(frozen=True)
 class Clips:
-    """Motions to watch."""
+    """A titled group of motions for the report's viewer."""
 
     title: str
     note: str
@@ -57,7 +57,7 @@ class Case:
     """A clip, and what was made of it or for its caption."""
 
     of: str
-    """Of `_KINDS`."""
+    """Key of `_KINDS`."""
     place: str
     """"worst 1", "best 2", ..."""
     id: str
@@ -105,7 +105,7 @@ def write_cases(folder: Path, cases: Sequence[Case], layout: MotionLayout) -> di
 
 
 def read_cases(folder: Path, found: Sequence[Mapping[str, Any]]) -> list[Case]:
-    """Those that an evaluation kept, by its `cases` in `metrics.json`; none where their file is not there."""
+    """The cases that an evaluation kept, by `cases` of its `metrics.json`; none where the file is missing."""
     path = folder / FILE_NAME
     if not found or not path.is_file():
         return []

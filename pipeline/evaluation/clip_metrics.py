@@ -37,12 +37,12 @@ class Performance:
     joints: Joints
     """[T, N, 3] in metres."""
     recorded: Joints
-    """What was recorded for the same caption or song."""
+    """The motion recorded for the same caption or song."""
     fps: float
     face: NDArray[np.float32] | None = None
-    """Expressions [T, 50]."""
+    """Expression values [T, 50]."""
     truth: Mapping[str, Any] | None = None
-    """What a synthetic clip is known to do (`ClipMeta.truth`)."""
+    """Attributes that a synthetic clip is known to have (`ClipMeta.truth`)."""
     beats: NDArray[np.float64] | None = None
     """Seconds of the beats of the music."""
 
@@ -174,7 +174,7 @@ CAPTION_METRICS: tuple[ClipMetric, ...] = (
         tuple(Metric(f"agreement.{name}", name.replace("_", " "), "higher", "share") for name in _ASPECTS),
     ),
 )
-"""Of motions made for captions."""
+"""Metrics of motions generated for captions."""
 
 BEAT_ALIGN = ClipMetric(
     "Beat Align (higher is better)",
@@ -204,7 +204,7 @@ DANCE_METRICS: tuple[ClipMetric, ...] = (
         ),
     ),
 )
-"""Of dances to music."""
+"""Metrics of dances to music."""
 
 
 def measure_clip(metrics: Sequence[ClipMetric], performance: Performance) -> Row:

@@ -19,7 +19,7 @@ from motionloom.datasets.synth.dances import beats_of
 from motionloom.pipeline.contract.generation import SeededGenerator
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.render.score import Score, Segment
+from motionloom.pipeline.render.sound import Score, Segment
 
 SOUND = "audio.flac"
 """The member of a clip that holds its sound."""
@@ -35,7 +35,7 @@ class DanceClip:
     song: str
     """Clips to one song have one name here; the clip's own id where the data do not say."""
     motion: NDArray[np.float32]
-    """What the data store of it [T, D]."""
+    """Features [T, D] as the data store them."""
     joints: NDArray[np.float64]
     """[T, N, 3] in metres."""
     fps: float
@@ -52,7 +52,7 @@ class DanceClip:
 
     @property
     def title(self) -> str:
-        """What is danced, for people."""
+        """Genre and song, for people."""
         genre = (self.truth or {}).get("genre")
         return f"{genre}, song {self.song}" if genre else self.song
 
@@ -61,7 +61,7 @@ class DanceClip:
         return Score(self.sound, self.beats.tolist(), (Segment(0.0, self.seconds, self.title, "music"),))
 
     def cut(self, frames: int) -> DanceClip:
-        """Its first `frames`."""
+        """The first `frames` of the clip, with their sound and beats."""
         seconds = frames / self.fps
         inside = self.beats[self.beats < seconds]
         sound = self.sound.slice(0.0, seconds)
@@ -70,7 +70,7 @@ class DanceClip:
         return replace(self, motion=motion, joints=joints, sound=sound, beats=inside, music=music)
 
     def after(self, frames: int) -> DanceClip:
-        """What follows its first `frames`; itself after none."""
+        """The clip without its first `frames`, with the sound and beats that remain."""
         if not frames:
             return self
         seconds = frames / self.fps
@@ -143,7 +143,7 @@ def dances_of(
 
 
 def song_of(dataset: ClipDataset, index: int) -> str:
-    """What a clip dances to: the piece that its source names, the synthetic song, else the clip's own id."""
+    """The song of a clip: the piece that its source names, the synthetic song, else the clip's own id."""
     meta = dataset.meta(index)
     song = meta.song if meta.song is not None else (meta.truth or {}).get("song")
     return dataset.ids[index] if song is None else str(song)

@@ -58,7 +58,7 @@ def _over_repeats(values: NDArray[np.float64]) -> tuple[float | None, str]:
 
 
 def _quantile(count: int) -> float:
-    """Of Student's t, for the mean of `count` values."""
+    """Quantile of Student's t for a two-sided 95 % interval of the mean of `count` values."""
     from scipy.special import stdtrit  # half a second that commands without figures need not wait
 
     return float(stdtrit(count - 1, 0.5 + LEVEL / 2))
@@ -66,7 +66,7 @@ def _quantile(count: int) -> float:
 
 @lru_cache(maxsize=8)
 def _resamples(count: int) -> NDArray[np.float64]:
-    """How often each of `count` clips is drawn, [RESAMPLES, count]; the same for all figures."""
+    """Counts of a bootstrap, [RESAMPLES, count]: draws of each of `count` clips; the same for all figures."""
     drawn = np.random.default_rng(count).multinomial(count, np.full(count, 1 / count), size=RESAMPLES)
     return drawn.astype(np.float64)
 

@@ -71,7 +71,7 @@ class Estimate:
     value: float
     interval: float | None = None
     over: str = ""
-    """What the interval is over: clips or repeats."""
+    """The units that the interval is over: clips or repeats."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Metric:
 
 @dataclass(frozen=True)
 class Figure:
-    """One number."""
+    """A measured number with its interval, unit and protocol."""
 
     name: str
     value: float
@@ -100,9 +100,9 @@ class Figure:
     group: str = ""
     """The table that it is shown in. All figures of a group have one protocol."""
     title: str = ""
-    """Its column there."""
+    """Title of its column in that table."""
     over: str = ""
-    """What the interval is over: clips or repeats."""
+    """The units that the interval is over: clips or repeats."""
     note: str = ""
     """Why the figure is not to be trusted."""
 
@@ -164,21 +164,21 @@ def facts(values: Mapping[str, Any]) -> dict[str, Fact]:
 
 
 def decodings_of(protocol: Protocol) -> int:
-    """How often each draw of tokens was decoded."""
+    """Decodings of each draw of tokens."""
     return int(protocol.get("decodings") or 1)
 
 
 @dataclass(frozen=True)
 class FigureFile:
-    """What an evaluation has written: the figures, and what they are about."""
+    """The figures that an evaluation has written, and the stages that they are about."""
 
     kind: str
     """The kind of evaluation: evaluate, evaluate_dances, retrieval."""
     figures: tuple[Figure, ...]
     about: Mapping[str, Any] = field(default_factory=dict)
-    """What was evaluated and what judged: stages by role, their checksums, the seed."""
+    """Stages evaluated and judges, by role, with their checksums, and the seed."""
     details: Mapping[str, Any] = field(default_factory=dict)
-    """Of the worst and the best, which are kept beside the figures (`cases.py`)."""
+    """Descriptions of the worst and best clips, which are kept beside the figures (`cases.py`)."""
 
     def of(self, name: str, row: str = MODEL) -> Figure | None:
         """One figure; None where it was not measured."""
@@ -293,7 +293,7 @@ def print_tables(figures: Iterable[Figure], console: Console) -> None:
 
 
 def say_difference(protocols: Mapping[str, Protocol]) -> str:
-    """How the protocols of figures, by label, differ, in one sentence; nothing where they are equal."""
+    """A sentence on how the protocols of figures, by label, differ; empty where they are equal."""
     parts = []
     for name in dict.fromkeys(name for protocol in protocols.values() for name in protocol):
         values = {label: protocol.get(name) for label, protocol in protocols.items()}
@@ -309,7 +309,7 @@ def heading(column: Figure) -> str:
 
 
 def remarks(figures: Sequence[Figure]) -> list[str]:
-    """What a group of figures has to say of itself: clips, candidates, intervals, doubts."""
+    """Remarks on a group of figures: clips, candidates, intervals, and notes on figures not to be trusted."""
     protocol = figures[0].protocol
     out = (
         [f"{protocol['clips']} {protocol.get('split', '')} clips".replace("  ", " ")]

@@ -1,4 +1,4 @@
-"""Those by whose latents motion is judged: TMA, and an evaluator that no generator was trained with."""
+"""Judges of motion by their latents: TMA, and an evaluator that no generator was trained with."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from motionloom.pipeline.store.networks import LoadedTma, MotionJudge, embed_mot
 
 @dataclass(frozen=True)
 class Judge:
-    """What embeds captions and motions in one space; that of faces: captions of faces and expressions."""
+    """Embeds captions and motions in one space; a judge of faces embeds expressions and their captions."""
 
     motions: MotionJudge
     texts: Callable[[Sequence[Truth]], Tensor]

@@ -1,7 +1,7 @@
-"""What a judge's latents say of motions that were made for captions: retrieval, distribution, variety.
+"""Metrics of motions in a judge's latent space: retrieval, distance of distributions, variety.
 
-A metric is a function of `LatentRow`, called for what was generated and for every answer that needs no
-model, and a line in a list here. Definitions and whose they are: docs/evaluation.md.
+A metric is a function of `LatentRow`, called for generated motion and for every reference baseline, and a
+line in a list here. Definitions and whose they are: docs/evaluation.md.
 
 Legend: n clips, Z latent width.
 """
@@ -9,7 +9,7 @@ Legend: n clips, Z latent width.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -37,40 +37,51 @@ GUO_BATCH = 32
 PAIRS = 10
 """Pairs of samples of one caption that MModality compares at most (4.1.2)."""
 DRAWS = 5
-"""Draws of batches, at least, for motions that are there once."""
+"""Draws of batches, at least, for motions that exist once **[ours]**."""
 
 Values = dict[str, float]
 
 
 @dataclass(frozen=True)
-class Latents:
-    """Row by row of the same n clips, [n, Z] each, but for `others`."""
-
-    text: Tensor
-    """Of their captions."""
-    real: Tensor
-    """Of the recorded motions."""
-    made: Sequence[Tensor]
-    """Of the motions made for their captions, once a repeat."""
-    others: Tensor
-    """Of training clips, [m, Z]."""
-    still: Tensor
-    """Of the mean pose for as long as each clip."""
-    nearest: Mapping[str, Tensor] = field(default_factory=dict)
-    """Row -> of the training clips found for their captions."""
-
-
-@dataclass(frozen=True)
 class LatentRow:
-    """Latents [n, Z] of captions, of recorded motions and of those that are measured."""
+    """Latents [n, Z] of captions, of recorded motions and of the motions that are measured."""
 
     text: Tensor
     real: Tensor
     motion: Tensor
     seed: int
-    """Of the draws of batches and pairs."""
-    size: int
-    """Candidates of R-Precision."""
+    """Seed of the draws of batches and pairs."""
+    size: int = 0
+    """Number of candidates of R-Precision."""
+
+
+@dataclass(frozen=True)
+class Latents:
+    """Latents of n clips, [n, Z] each, but for `others`."""
+
+    text: Tensor
+    """Captions of the clips."""
+    real: Tensor
+    """Recorded motions of the clips."""
+    made: Sequence[Tensor]
+    """Motions generated for the captions, once a repeat."""
+    others: Tensor
+    """Training clips, [m, Z]."""
+    still: Tensor
+    """The mean pose, held as long as each clip."""
+    nearest: Mapping[str, Tensor] = field(default_factory=dict)
+    """Row of a table -> training clips retrieved for the captions."""
+
+    def row(self, seed: int, size: int = 0) -> LatentRow:
+        """The recorded motions, measured."""
+        return LatentRow(self.text, self.real, self.real, seed, size)
+
+    def of(self, clips: list[int]) -> Latents:
+        """The latents of some of the clips."""
+        made = [one[clips] for one in self.made]
+        nearest = {row: one[clips] for row, one in self.nearest.items()}
+        text, real, still = self.text[clips], self.real[clips], self.still[clips]
+        return Latents(text, real, made, self.others, still, nearest)
 
 
 @dataclass(frozen=True)
@@ -135,7 +146,7 @@ TMA_METRICS = (
         ),
     ),
 )
-"""Of text-motion alignment by TMA."""
+"""Text-motion alignment by TMA."""
 EVALUATOR_METRICS = (
     LatentMetric(
         guo_precision,
@@ -145,7 +156,7 @@ EVALUATOR_METRICS = (
         ),
     ),
 )
-"""The same by an evaluator, as Guo et al. define it."""
+"""Text-motion alignment by an evaluator, as Guo et al. define it."""
 SPREAD_METRICS = (
     LatentMetric(
         spread,
@@ -156,9 +167,7 @@ SPREAD_METRICS = (
         ),
     ),
 )
-"""Of how motions spread, by any judge."""
-_VARIETY = Metric("multimodality", "MModality")
-_CHOICE = tuple(Metric(f"tma.top-{k}", f"top-{k}", "higher") for k in (1, 5))
+"""Distance to recorded motion and variety, by any judge."""
 
 
 def judged_figures(
@@ -195,7 +204,7 @@ def judged_figures(
         out = _precision(role, title, TMA_METRICS, latents, facts, size, seed)
         first = sorted({caption: row for row, caption in reversed(list(enumerate(words)))}.values())
         if 1 < len(first) < len(words):
-            some = _at(latents, first)
+            some = latents.of(first)
             size = min(size, len(first))
             facts = {**protocol, "clips": len(first), "candidates": size, "captions": "different"}
             title = "TMA-R-Precision among different captions"
@@ -213,58 +222,66 @@ def _precision(
     size: int,
     seed: int,
 ) -> list[Figure]:
-    """Text and motion compared: of generated motion a draw of batches a repeat, of the others several."""
+    """Figures of captions and motions compared, beside recorded motion, the mean pose and chance."""
+    # One draw of batches for each repeat of generated motion; of what exists once, several draws.
     draws = max(len(latents.made), DRAWS)
     once = {RECORDED: latents.real, STILL: latents.still, **latents.nearest}
-    measured = {MODEL: latents.made} | {row: [found] * draws for row, found in once.items()}
-    rows = _measured(role, metrics, latents, measured, seed, size, decodings_of(protocol))
-    guess = {key: min(1.0, int(key[-1]) / size) for key in ("t2m_r1", "t2m_r2", "t2m_r3")}
-    guess |= {key.replace("t2m", "m2t"): share for key, share in guess.items()}
-    guess |= {f"top-{k}": min(1.0, k / size) for k in (1, 2, 3)}
-    rows[CHANCE] = _named(role, plain(guess))
+    motions = {MODEL: latents.made} | {row: [motion] * draws for row, motion in once.items()}
+    rows = _measured(role, metrics, latents.row(seed, size), motions, decodings_of(protocol))
+    rows[CHANCE] = _named(role, _chance(size))
     return group_figures(title, _columns(role, metrics), rows, protocol)
+
+
+def _chance(size: int) -> dict[str, Estimate]:
+    """Recall by guessing among `size` candidates, by the names of `recalls` and `guo_precision`."""
+    names = ("t2m_r", "m2t_r", "top-")
+    return plain({f"{name}{k}": min(1.0, k / size) for name in names for k in (1, 2, 3)})
 
 
 def _choice(
     latents: Latents, words: Sequence[str], protocol: Protocol, among: int, seed: int
 ) -> list[Figure]:
-    """UDE's accuracy: is a motion's own caption the nearest of `among`?"""
+    """Figures of UDE's accuracy (Table 1): whether a motion's own caption is the nearest of `among`."""
     # A caption that says the same as the own one is no wrong answer.
     same = torch.tensor([[one == other for other in words] for one in words])
     among = min(among, 1 + int((~same).sum(1).min()))
     if among < 2:
         return []
-    rows = {}
+
+    def accuracy(row: LatentRow) -> Values:
+        return accuracy_among(row.motion, row.text, candidates=among, same=same, seed=row.seed)
+
+    metric = LatentMetric(accuracy, tuple(Metric(f"top-{k}", f"top-{k}", "higher") for k in (1, 5)))
     once = {RECORDED: latents.real, **latents.nearest}
-    for row, motions in {MODEL: latents.made, **{row: [found] for row, found in once.items()}}.items():
-        each = [accuracy_among(m, latents.text, candidates=among, same=same, seed=seed) for m in motions]
-        rows[row] = _named("tma", set_estimates(each, decodings_of(protocol) if row == MODEL else 1))
+    motions = {MODEL: latents.made} | {row: [motion] for row, motion in once.items()}
+    rows = _measured("tma", (metric,), latents.row(seed), motions, decodings_of(protocol), draw=False)
     rows[CHANCE] = _named("tma", plain({f"top-{k}": min(1.0, k / among) for k in (1, 5)}))
-    return group_figures("Own caption the nearest, by TMA", _CHOICE, rows, {**protocol, "candidates": among})
+    facts = {**protocol, "candidates": among}
+    return group_figures("Own caption the nearest, by TMA", _columns("tma", (metric,)), rows, facts)
 
 
 def _spread(role: str, title: str, latents: Latents, protocol: Protocol, seed: int) -> list[Figure]:
-    """Distance to the recorded motions and variety, beside as many training clips and the mean pose."""
-    measured = {
+    """Figures of the distance to recorded motion and of variety, beside as many training clips and the mean
+    pose.
+    """
+    motions = {
         MODEL: latents.made, TRAINING: [latents.others], STILL: [latents.still], RECORDED: [latents.real]
     }  # fmt: skip
-    measured |= {row: [found] for row, found in latents.nearest.items()}
-    nested = decodings_of(protocol)
-    rows = _measured(role, SPREAD_METRICS, latents, measured, seed, 0, nested, draw=False)
+    motions |= {row: [motion] for row, motion in latents.nearest.items()}
+    rows = _measured(role, SPREAD_METRICS, latents.row(seed), motions, decodings_of(protocol), draw=False)
     for name in ("fid", "fid_unit"):
-        rows[RECORDED].pop(f"{role}.{name}", None)  # to themselves
+        rows[RECORDED].pop(f"{role}.{name}", None)  # the distance of recorded motion to itself says nothing
     if len(latents.made) > 1 and len(latents.real) > 1:
         several = torch.stack(list(latents.made), dim=1)
         value = multimodality(several, pairs=PAIRS, seed=seed)
         rows[MODEL][f"{role}.multimodality"] = Estimate(float(value))
-    metrics = (*SPREAD_METRICS, LatentMetric(lambda row: {}, (_VARIETY,)))
+    columns = [*_columns(role, SPREAD_METRICS), Metric(f"{role}.multimodality", "MModality")]
     facts = {**protocol, "training_clips": len(latents.others)}
+    # A covariance of so few rows does not have full rank.
     width = latents.real.shape[1]
     few = f"{len(latents.real)} motions for {width} columns, too few to be trusted"
     notes = {f"{role}.{name}": few for name in ("fid", "fid_unit") if len(latents.real) <= width}
-    return group_figures(
-        f"{title}: distance to recorded motion and variety", _columns(role, metrics), rows, facts, notes
-    )
+    return group_figures(f"{title}: distance to recorded motion and variety", columns, rows, facts, notes)
 
 
 def reconstructed_figures(
@@ -295,43 +312,39 @@ def reconstructed_figures(
         seed: Of the draws.
     """
     prefix, facts = f"reconstruction.{role}", {**protocol, "training_clips": len(others)}
-    rows: dict[str, dict[str, Estimate]] = {MODEL: {}}
-    if len(real) > 1:
-        rows[MODEL] |= plain({"fid": float(fid(real, made))})
-        rows[TRAINING] = plain({"fid": float(fid(real, others))}) if len(others) > 1 else {}
+    base = LatentRow(real if text is None else text, real, made, seed, min(size, len(real)))
+    rows = _measured(prefix, SPREAD_METRICS, base, {MODEL: [made], TRAINING: [others]})
     if text is not None:
-        size = min(size, len(text))
-        facts["candidates"] = size
-        for row, motions in ((MODEL, made), (RECORDED, real)):
-            draws = range(seed, seed + max(repeats, DRAWS))
-            each = [guo_precision(LatentRow(text, real, motions, draw, size)) for draw in draws]
-            rows[row] = rows.get(row, {}) | set_estimates(each)
-        rows[CHANCE] = plain({f"top-{k}": min(1.0, k / size) for k in (1, 2, 3)})
+        facts["candidates"] = base.size
+        motions = {row: [motion] * max(repeats, DRAWS) for row, motion in ((MODEL, made), (RECORDED, real))}
+        for row, estimates in _measured(prefix, EVALUATOR_METRICS, base, motions).items():
+            rows[row] = rows.get(row, {}) | estimates
+        rows[CHANCE] = _named(prefix, _chance(base.size))
     tops = (Metric(f"{prefix}.top-{k}", f"R-Precision top-{k}", "higher") for k in (1, 2, 3))
     columns = (Metric(f"{prefix}.fid", "FID", "lower"), *tops)
-    named = {row: _named(prefix, found) for row, found in rows.items()}
-    return group_figures(f"Reconstructed motion by {whose}'s latents", columns, named, facts)
+    return group_figures(f"Reconstructed motion by {whose}'s latents", columns, rows, facts)
 
 
 def _measured(
     role: str,
     metrics: Sequence[LatentMetric],
-    latents: Latents,
-    rows: dict[str, Sequence[Tensor]],
-    seed: int,
-    size: int,
-    nested: int,
+    base: LatentRow,
+    rows: Mapping[str, Sequence[Tensor]],
+    nested: int = 1,
     *,
     draw: bool = True,
 ) -> dict[str, dict[str, Estimate]]:
-    """Row -> estimates by name, of motions that are there once or more often."""
+    """Row -> estimates by name; the motions [n, Z] of a row take the place of `base.motion`, one a repeat.
+
+    With `draw` every repeat draws batches of its own; of the model, `nested` repeats are of the same tokens.
+    """
     out = {}
     for name, motions in rows.items():
-        each = []
+        repeats: list[Values] = []
         for number, motion in enumerate(motions):
-            row = LatentRow(latents.text, latents.real, motion, seed + (number if draw else 0), size)
-            each.append({key: value for metric in metrics for key, value in metric.measure(row).items()})
-        out[name] = _named(role, set_estimates(each, nested if name == MODEL else 1))
+            row = replace(base, motion=motion, seed=base.seed + number * draw)
+            repeats.append({key: value for metric in metrics for key, value in metric.measure(row).items()})
+        out[name] = _named(role, set_estimates(repeats, nested if name == MODEL else 1))
     return out
 
 
@@ -347,15 +360,8 @@ def _named(role: str, found: dict[str, Estimate]) -> dict[str, Estimate]:
     return {f"{role}.{name}": value for name, value in found.items()}
 
 
-def _at(latents: Latents, rows: list[int]) -> Latents:
-    """Of some of the clips."""
-    made = [one[rows] for one in latents.made]
-    nearest = {row: found[rows] for row, found in latents.nearest.items()}
-    return Latents(latents.text[rows], latents.real[rows], made, latents.others, latents.still[rows], nearest)
-
-
 def caption_distances(text: Tensor, motion: Tensor) -> Tensor:
-    """Of each text's latent [n, Z] from its motion's, both of length 1: [n], 0 to 2."""
+    """Distances [n], 0 to 2, of the texts' latents [n, Z] from their motions', all scaled to length 1."""
     out: Tensor = torch.linalg.vector_norm(_unit(text) - _unit(motion), dim=-1)
     return out
 

@@ -1,4 +1,4 @@
-"""How far a tokenizer's motions are from what was recorded, beside two trivial answers, in millimetres.
+"""Reconstruction errors of a tokenizer in millimetres, beside two reference baselines.
 
 As the papers count it (HumanTOMATO Tables 3, 6 and 7; `joint_errors`, equal to the public code): `mpjpe` with
 the root of each frame moved to the origin, `pa_mpjpe` after a similarity alignment of each frame, `accel` of
@@ -28,7 +28,6 @@ from motionloom.datasets.schema import HANDS, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
 from motionloom.pipeline.contract.units import Row
-from motionloom.pipeline.evaluation.answers import NearestClip, local_joints
 from motionloom.pipeline.evaluation.estimate import row_estimates, weighted
 from motionloom.pipeline.evaluation.figures import (
     MEAN_FACE,
@@ -41,20 +40,22 @@ from motionloom.pipeline.evaluation.figures import (
     Protocol,
     group_figures,
 )
+from motionloom.pipeline.evaluation.reference_baselines import NearestClip, local_joints
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_all, reconstruct_truth
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 FINGERS = (range(22, 37), range(37, 52))
 """Joints of `smplx52`, left and right."""
 
-ANSWERS = {"": MODEL, "_nearest_train_clip": NEAREST, "_mean_pose": STILL}
-"""What ends the name of a clip's error -> the row of a table."""
+_CLIP_ROWS = {"": MODEL, "_nearest_train_clip": NEAREST, "_mean_pose": STILL}
+_FACE_ROWS = {"": MODEL, "_mean": MEAN_FACE}
+"""End of the name of a clip's error -> the row of a table."""
 _PARTS = (("", ""), ("_body", ", body"), ("_hand", ", hands"))
 PUBLISHED = (
     *(
-        Metric(f"reconstruction.{name}{part}", f"{title}{said}", "lower", "mm")
+        Metric(f"reconstruction.{name}{part}", f"{title}{of}", "lower", "mm")
         for name, title in (("mpjpe", "MPJPE"), ("pa_mpjpe", "PA-MPJPE"), ("accel", "ACCEL"))
-        for part, said in _PARTS
+        for part, of in _PARTS
     ),
     Metric("reconstruction.bits_per_second", "bit/s"),
 )
@@ -72,13 +73,13 @@ FACES = (
 
 
 def clip_errors(
-    tokenizer: TrainedTokenizer, nearest: NearestClip, truth: Truth, found: NDArray[np.float32]
+    tokenizer: TrainedTokenizer, nearest: NearestClip, truth: Truth, rebuilt: NDArray[np.float32]
 ) -> Row:
-    """Both families of errors of one clip, through the tokenizer, as the mean pose (`_mean_pose`) and as the
-    nearest training clip (`_nearest_train_clip`); the papers' are weighted by frames.
+    """Both families of errors of one clip: of its reconstruction, of the mean pose (`_mean_pose`) and of the
+    nearest training clip (`_nearest_train_clip`). The papers' are weighted by frames.
 
-    `found` [T, D] is what the tokenizer makes of the clip (`reconstruct_truth`). Of a clip without hands the
-    body's joints alone count, and nothing in `_hand`.
+    `rebuilt` [T, D] is the tokenizer's reconstruction (`reconstruct_truth`). For a clip without hands only
+    the body's joints count, and there is no `_hand`.
     """
     layout = tokenizer.layout
     body = tokenizer.stats.mean[layout.part("bodyhand")].astype(np.float32)
@@ -86,7 +87,7 @@ def clip_errors(
     target = torch.from_numpy(truth.joints)
     constant = np.broadcast_to(body, truth.features.shape)
     compared = {
-        "": (local_joints(found, layout), joints_of(found, layout)),
+        "": (local_joints(rebuilt, layout), joints_of(rebuilt, layout)),
         "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
         "_nearest_train_clip": nearest.motion(truth.features, truth.present),
     }
@@ -110,7 +111,7 @@ def clip_errors(
 
 def clip_error_figures(clips: Sequence[Row], bits_per_second: float, protocol: Protocol) -> list[Figure]:
     """Figures of `clip_errors`: the papers' over all frames, ours over all clips."""
-    rows = _by_answer(row_estimates([clips]), "reconstruction", ANSWERS)
+    rows = _by_row(row_estimates([clips]), "reconstruction", _CLIP_ROWS)
     rows[MODEL]["reconstruction.bits_per_second"] = Estimate(bits_per_second)
     return [
         *group_figures("Reconstruction as the papers count it (lower is better)", PUBLISHED, rows, protocol),
@@ -123,29 +124,29 @@ def clip_error_figures(clips: Sequence[Row], bits_per_second: float, protocol: P
     ]
 
 
-def _by_answer(
-    found: Mapping[str, Estimate], prefix: str, answers: Mapping[str, str]
+def _by_row(
+    estimates: Mapping[str, Estimate], prefix: str, rows: Mapping[str, str]
 ) -> dict[str, dict[str, Estimate]]:
-    """Estimates by row, of names that end in what stands for the row."""
-    out: dict[str, dict[str, Estimate]] = {row: {} for row in answers.values()}
-    for name, value in found.items():
-        suffix = next(end for end in sorted(answers, key=len, reverse=True) if name.endswith(end))
-        out[answers[suffix]][f"{prefix}.{name.removesuffix(suffix)}"] = value
+    """Estimates by row of a table; the end of a name says the row (`rows`)."""
+    out: dict[str, dict[str, Estimate]] = {row: {} for row in rows.values()}
+    for name, value in estimates.items():
+        end = max((end for end in rows if name.endswith(end)), key=len)
+        out[rows[end]][f"{prefix}.{name.removesuffix(end)}"] = value
     return out
 
 
 def reconstruction_errors(
     tokenizer: TrainedTokenizer, train: ClipDataset, truths: Sequence[Truth]
 ) -> dict[str, float]:
-    """Mean errors over all of the clips `truths`, by the names of `clip_errors`, in mm."""
+    """Mean errors over all clips of `truths` in mm, by the names of `clip_errors`."""
     nearest = NearestClip(train)
     rebuilt = ((truth, reconstruct_truth(tokenizer, truth)) for truth in truths)
-    rows = [clip_errors(tokenizer, nearest, truth, found) for truth, found in rebuilt]
-    return {name: found.value for name, found in row_estimates([rows]).items()}
+    rows = [clip_errors(tokenizer, nearest, truth, features) for truth, features in rebuilt]
+    return {name: one.value for name, one in row_estimates([rows]).items()}
 
 
 def published_errors(made: Tensor, real: Tensor) -> dict[str, JointErrors]:
-    """Sums over the frames of positions [T, N, 3]: "" of all joints, "_body", and "_hand" where there are."""
+    """Sums over the frames of positions [T, N, 3]: "" of all joints, "_body", and "_hand" if any."""
     length = torch.tensor([len(real)])
     pair = (made[None], real[None], length)
     out = {"": joint_errors(*pair), "_body": joint_errors(*pair, joints=torch.arange(BODY_JOINTS))}
@@ -175,27 +176,28 @@ def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
 
 
 EXPRESSIONS = 50
+"""Values of an expression in Motion-X, the first 50 of FLAME."""
 
 
 def read_basis(path: Path) -> NDArray[np.float64]:
     """Floats [V, 3, 50] in metres: how far each vertex moves with each value of the expression."""
     try:
-        found = np.load(path, allow_pickle=False)
+        basis = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise UserError(f"{path}: cannot be read as an expression basis, .npy [V, 3, 50] ({error})") from None
-    shape = list(found.shape) if isinstance(found, np.ndarray) else "an archive of arrays"
-    if not isinstance(found, np.ndarray) or found.ndim != 3 or found.shape[1:] != (3, EXPRESSIONS):
+    shape = list(basis.shape) if isinstance(basis, np.ndarray) else "an archive of arrays"
+    if not isinstance(basis, np.ndarray) or basis.ndim != 3 or basis.shape[1:] != (3, EXPRESSIONS):
         raise UserError(
             f"{path}: an expression basis has the shape [V, 3, {EXPRESSIONS}], and this is {shape}"
         )
-    if not np.issubdtype(found.dtype, np.floating) or not np.isfinite(found).all():
+    if not np.issubdtype(basis.dtype, np.floating) or not np.isfinite(basis).all():
         raise UserError(f"{path}: an expression basis holds finite floats in metres")
-    return np.asarray(found, dtype=np.float64)
+    return np.asarray(basis, dtype=np.float64)
 
 
 def face_errors(tokenizer: TrainedTokenizer, truth: Truth, basis: NDArray[np.float64] | None = None) -> Row:
-    """Of one clip with a face, means weighted by its frames: length of the difference of the expressions (50
-    values) by a tokenizer of faces or of everything (`expression`), and of the mean expression (`_mean`).
+    """Errors of one clip with a face, weighted by its frames: the norm of the difference of the expressions
+    (50 values) by a tokenizer of faces or of everything (`expression`), and of the mean one (`_mean`).
 
     With a `basis` [V, 3, 50], metres of a head's vertices for each value, also the mean distance of the
     vertices in mm (`vertex`; v.-err. of Tables 2 and 6).
@@ -207,8 +209,8 @@ def face_errors(tokenizer: TrainedTokenizer, truth: Truth, basis: NDArray[np.flo
     made, mean = reconstruct_all(tokenizer, truth)[:, columns], tokenizer.stats.mean[columns]
 
     out, frames = Row(), float(len(real))
-    for suffix, answer in (("", made), ("_mean", mean)):
-        error = (answer - real).astype(np.float64)
+    for suffix, expression in (("", made), ("_mean", mean)):
+        error = (expression - real).astype(np.float64)
         out |= weighted(f"expression{suffix}", float(np.linalg.norm(error, axis=-1).sum()), frames)
         if basis is not None:
             moved = np.einsum("vce,te->tvc", basis, error)
@@ -219,13 +221,5 @@ def face_errors(tokenizer: TrainedTokenizer, truth: Truth, basis: NDArray[np.flo
 
 def face_figures(clips: Sequence[Row], protocol: Protocol) -> list[Figure]:
     """Figures of `face_errors`, over the frames of all clips with a face; without such clips none."""
-    found = row_estimates([clips])
-    rows = {
-        row: {
-            f"face.{name.removesuffix('_mean')}": value
-            for name, value in found.items()
-            if name.endswith("_mean") == mean
-        }
-        for row, mean in ((MODEL, False), (MEAN_FACE, True))
-    }
+    rows = _by_row(row_estimates([clips]), "face", _FACE_ROWS)
     return group_figures("Reconstruction of faces (lower is better)", FACES, rows, protocol)

@@ -1,8 +1,8 @@
-"""Clips of a data set by words and by likeness: TMA's embeddings of all clips, in 8 bits, in one file.
+"""Search a data set by text or by example: TMA's embeddings of all clips, in one file.
 
-A motion's embedding has length 1 and is stored as integers of -127 to 127 with one scale; cosines with a
-query are sums over them. The file beside the shards says which clips and which weights it was made of, and is
-made again for others. Words are read by the text encoder that the TMA was trained with; nothing is fetched.
+Embeddings have length 1 and are stored in half precision; clips are ranked by their cosine with a query. The
+file beside the shards says which clips and which weights it was made of, and is made again for others. The
+encoder that the TMA was trained with reads the text; nothing is fetched.
 """
 
 from __future__ import annotations
@@ -41,18 +41,19 @@ from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 from motionloom.pipeline.store.weights import MODEL_FILES
 
 INDEX_FILE = "search.npz"
-_VERSION = 1
+_VERSION = 2
 _BLOCK = 4096
 """Rows that are multiplied at a time: their floats stay in the processor's cache."""
 _BATCH = 256
 MISFIT = 0.5
-"""Share of a data set's captions that fit a motion better than all of its own, from which these are suspect:
-those of another clip, drawn at random, would do as well."""
+"""Share of other captions that fit a motion better than its own from which its own are suspect: above a half,
+the captions of a random clip would do as well."""
 _OTHERS = 500
 """Captions, evenly spread, that a motion's own are compared with."""
 _WRISTS = [Skeleton.named("smpl22").index(f"{side}_wrist") for side in ("left", "right")]
 
 Vectors = NDArray[np.float32]
+HalfVectors = NDArray[np.float16]
 
 
 class Hit(NamedTuple):
@@ -61,37 +62,23 @@ class Hit(NamedTuple):
     place: Place
     id: str
     score: float
-    """Cosine with what was asked for."""
+    """Cosine with the query."""
 
 
-@dataclass(frozen=True)
-class Codes:
-    """Vectors of length 1 in 8 bits: about `values` [n, Z] int8 times `scales` [n]."""
+def unit_rows(vectors: Vectors) -> HalfVectors:
+    """Vectors [n, Z] scaled to length 1, in half precision."""
+    lengths = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+    return np.asarray(vectors / lengths, np.float16)
 
-    values: NDArray[np.int8]
-    scales: Vectors
 
-    @staticmethod
-    def of(vectors: Vectors) -> Codes:
-        """Vectors [n, Z] of any length."""
-        unit = vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-        scales = np.maximum(np.abs(unit).max(axis=1, initial=0), 1e-12) / 127
-        return Codes(np.rint(unit / scales[:, None]).astype(np.int8), scales.astype(np.float32))
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    def vector(self, row: int) -> Vectors:
-        return np.asarray(self.values[row] * self.scales[row])
-
-    def cosines(self, query: Vectors) -> Vectors:
-        """With a query [Z] of any length -> [n]."""
-        unit = (query / max(float(np.linalg.norm(query)), 1e-12)).astype(np.float32)
-        out = np.empty(len(self), np.float32)
-        for start in range(0, len(self), _BLOCK):
-            block = slice(start, start + _BLOCK)
-            out[block] = self.values[block].astype(np.float32) @ unit
-        return out * self.scales
+def cosines(rows: HalfVectors, query: Vectors) -> Vectors:
+    """Cosines [n] of rows of length 1 [n, Z] with a query [Z] of any length."""
+    unit = (query / max(float(np.linalg.norm(query)), 1e-12)).astype(np.float32)
+    out = np.empty(len(rows), np.float32)
+    for start in range(0, len(rows), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        out[block] = rows[block].astype(np.float32) @ unit
+    return out
 
 
 def alignment_model(name: Path | str, device: str = "auto") -> tuple[LoadedTma, str]:
@@ -115,12 +102,13 @@ def alignment_model(name: Path | str, device: str = "auto") -> tuple[LoadedTma, 
 
 @dataclass(frozen=True)
 class Search:
-    """A data set's clips, embedded."""
+    """A data set and the embeddings of its clips."""
 
     splits: Splits
-    """With every clip, also those that are excluded, which are never found."""
+    """All clips, also excluded ones, which are never returned."""
     tma: LoadedTma
-    codes: Codes
+    vectors: HalfVectors
+    """Embeddings [n, Z] of length 1, in the order of `places`."""
     places: tuple[Place, ...]
     excluded: frozenset[str] = field(default_factory=frozenset)
 
@@ -132,20 +120,20 @@ class Search:
         clips = manifest.model_copy(update={"excluded": {}}).dump()
         made_from = sha256_of_json([_VERSION, clips, weights])
         places = tuple(Place(split, clip) for split, part in splits.items() for clip in range(len(part)))
-        codes = _stored(root / INDEX_FILE, made_from, len(places), tma.net.config.latent)
-        if codes is None:
-            codes = Codes.of(np.concatenate(list(_embedded(splits, places, tma, progress))))
+        vectors = _stored(root / INDEX_FILE, made_from, (len(places), tma.net.config.latent))
+        if vectors is None:
+            vectors = unit_rows(np.concatenate(list(_embedded(splits, places, tma, progress))))
             with atomic_file(root / INDEX_FILE) as file:
-                said = np.frombuffer(made_from.encode(), np.uint8)
-                np.savez(file, allow_pickle=False, made_from=said, values=codes.values, scales=codes.scales)
-        return Search(splits, tma, codes, places, frozenset(manifest.excluded))
+                key = np.frombuffer(made_from.encode(), np.uint8)
+                np.savez(file, allow_pickle=False, made_from=key, vectors=vectors)
+        return Search(splits, tma, vectors, places, frozenset(manifest.excluded))
 
     @cached_property
     def ids(self) -> list[str]:
         return [self.splits[place.split].ids[place.clip] for place in self.places]
 
     def words(self, text: str) -> Vectors:
-        """The embedding [Z] of words."""
+        """The embedding [Z] of a text."""
         if not text.strip():
             raise UserError("search: no words; say what the person does")
         return np.asarray(self._texts([text])[0])
@@ -154,7 +142,7 @@ class Search:
         """The embedding [Z] of a clip of the set, by its id."""
         if clip_id not in self.ids:
             raise UserError(f"no clip '{clip_id}' in this data set; its ids are in the answers of a search")
-        return self.codes.vector(self.ids.index(clip_id))
+        return self.vectors[self.ids.index(clip_id)].astype(np.float32)
 
     def motion(self, joints: NDArray[np.floating], fps: float) -> Vectors:
         """The embedding [Z] of joints [T, 22 or 52, 3] in metres, Y up."""
@@ -184,8 +172,9 @@ class Search:
         return values, fps or layout.fps
 
     def best(self, query: Vectors, count: int = 12, without: str = "") -> list[Hit]:
-        """The clips nearest to an embedding [Z], but the one with the id `without`."""
-        scores, hits = self.codes.cosines(query), list[Hit]()
+        """The clips nearest to an embedding [Z], the best first, except the one with the id `without`."""
+        scores, hits = cosines(self.vectors, query), list[Hit]()
+        # Enough candidates that excluded clips, were they the nearest, leave `count` others.
         some = min(len(scores), count + 1 + len(self.excluded))
         near = np.argpartition(-scores, some - 1)[:some] if some else np.zeros(0, int)
         for row in near[np.argsort(-scores[near], kind="stable")].tolist():
@@ -194,23 +183,24 @@ class Search:
         return hits[:count]
 
     def misfits(self) -> Iterator[tuple[Place, Fault]]:
-        """Clips whose captions fit them worse than most captions of the others do."""
+        """Yield the clips whose own captions fit them worse than most of the other captions do."""
         texts = [[c.text for c in self.splits[place.split].texts(place.clip)] for place in self.places]
         different = sorted({text for own in texts for text in own})
         if len(different) < 2:
             return
         row = {text: k for k, text in enumerate(different)}
-        vectors = Codes.of(self._texts(different))
+        captions = unit_rows(self._texts(different))
+        # A sample of all captions is enough to estimate a share, and keeps large sets fast.
         spread = np.unique(np.linspace(0, len(different) - 1, _OTHERS).round().astype(int))
-        others = Codes(vectors.values[spread], vectors.scales[spread])
         for at, (place, own) in enumerate(zip(self.places, texts, strict=True)):
             if own:
-                motion = self.codes.vector(at)
-                mine, theirs = [vectors.vector(row[text]) @ motion for text in own], others.cosines(motion)
-                share = float((theirs > max(mine)).mean())
+                motion = self.vectors[at].astype(np.float32)
+                mine = cosines(captions[[row[text] for text in own]], motion)
+                theirs = cosines(captions[spread], motion)
+                share = float((theirs > mine.max()).mean())
                 if share > MISFIT:
-                    said, best = own[int(np.argmax(mine))], different[int(spread[int(theirs.argmax())])]
-                    text = f"'{said}' fits worse than {share:.0%} of all captions, such as '{best}'"
+                    nearest, best = own[int(mine.argmax())], different[int(spread[int(theirs.argmax())])]
+                    text = f"'{nearest}' fits worse than {share:.0%} of all captions, such as '{best}'"
                     yield place, Fault("caption disagrees", text, share / MISFIT)
 
     def _texts(self, texts: Sequence[str]) -> Vectors:
@@ -218,7 +208,7 @@ class Search:
 
 
 def features_for(tma: LoadedTma, joints: NDArray[np.floating], fps: float) -> tuple[Vectors, int]:
-    """What a TMA reads of joints [T, 22 or 52, 3] of any frame rate, and which parts it then holds."""
+    """Return what a TMA reads of joints [T, 22 or 52, 3] of any frame rate, and the parts present in it."""
     layout, present = tma.layout, PRESENT_ALL
     if layout.num_joints > joints.shape[1]:
         present &= ~HANDS  # fingers stay at the wrists, and are not looked at
@@ -255,15 +245,13 @@ def _embedded(splits: Splits, places: Sequence[Place], tma: LoadedTma, progress:
             meter.advance(len(motions))
 
 
-def _stored(path: Path, made_from: str, clips: int, width: int) -> Codes | None:
-    """What a file holds of these clips and weights; None where it is of others, damaged, or not there."""
-    limit = clips * max(width, 8) + 4096
+def _stored(path: Path, made_from: str, shape: tuple[int, int]) -> HalfVectors | None:
+    """The stored embeddings of these clips and weights; None for others, a damaged file, or no file."""
     try:
         with NpzFile(path) as stored:
             if bytes(stored.array("made_from", limit=4096)) != made_from.encode():
                 return None
-            values, scales = (stored.array(name, limit=limit) for name in ("values", "scales"))
+            vectors = stored.array("vectors", limit=2 * shape[0] * shape[1] + 4096)
     except UserError:
         return None
-    fits = values.shape == (clips, width) and scales.shape == (clips,)
-    return Codes(values, scales) if fits and values.dtype == np.int8 and scales.dtype == np.float32 else None
+    return vectors if vectors.shape == shape and vectors.dtype == np.float16 else None

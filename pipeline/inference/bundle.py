@@ -53,7 +53,7 @@ from motionloom.pipeline.inference.requests import (
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model, say_model
-from motionloom.pipeline.render.score import Segment
+from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, owner_of

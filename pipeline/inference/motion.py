@@ -14,7 +14,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.render.score import Driver, Segment
+from motionloom.pipeline.render.sound import Driver, Segment
 
 # The writers read this class, so it names their module instead of importing it.
 _OUTPUTS = "motionloom.pipeline.inference.outputs"

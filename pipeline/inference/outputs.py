@@ -13,7 +13,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions, shown
 from motionloom.pipeline.inference.writers import WRITERS, OutputClip, Outputs, cell_of, writer_for
-from motionloom.pipeline.render.score import Score
+from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.render.viewer import viewer_page
 from motionloom.pipeline.store.files import require_folder
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from motionloom.pipeline.inference.motion import MotionChunk
     from motionloom.pipeline.inference.shown import FigureOptions, ShownMotion
     from motionloom.pipeline.render.body.glb import GlbClip
-    from motionloom.pipeline.render.score import Score
+    from motionloom.pipeline.render.sound import Score
     from motionloom.pipeline.render.viewer import ViewerMotion
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Found = TypeVar("Found")
 
 _PATIENCE = timedelta(days=30)
-"""How long the others wait for a stage that only the lead runs; a dead lead ends the wait at once."""
+"""Longest wait of the other ranks for a stage that only the lead runs; a dead lead ends it at once."""
 
 _COLLECTIVE = 1800
 """Seconds for which a process waits for the others, at least. A training that stalls ends itself earlier,
@@ -78,7 +78,7 @@ class Team:
             raise TeamError(str(error)) from None
 
     def gather(self, mine: Found) -> list[Found]:
-        """What every process gives, in the order of their ranks, in all of them."""
+        """Return in every process the values of all, in the order of their ranks."""
         if self.waiting is None:
             return [mine]
         found = [mine] * self.world
@@ -90,7 +90,7 @@ class Team:
 
 
 def lead_finds(find: Callable[[], Found]) -> Found:
-    """What `find` gives in the lead, in every process that trains with it.
+    """Return in every process what `find` returns in the lead.
 
     Files on a shared file system may look different to two nodes for a moment, and one process is enough to
     read gigabytes. Where no processes have met yet, each finds for itself.

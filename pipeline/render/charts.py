@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -19,7 +20,7 @@ WIDTH, HEIGHT = 640, 320
 LEFT, RIGHT, TOP, BOTTOM = 62, 24, 14, 46
 STRETCHES = 200
 COLOURS = 8
-"""Those of the page's style, `.s0` and so on."""
+"""Colours of the page's style, `.s0` to `.s7`."""
 
 
 @dataclass(frozen=True)
@@ -223,3 +224,39 @@ def _svg(title: str, parts: Sequence[str], hover: dict[str, object] | None) -> s
         + "".join(parts)
         + "</svg>"
     )
+
+
+# Keys as people read them.
+
+_SHORT = {
+    "align": "alignment",
+    "ce": "cross-entropy",
+    "commit": "commitment",
+    "dead": "dead codes",
+    "kl": "KL",
+    "rec": "reconstructed",
+    "recon": "reconstruction",
+    "resets": "reset codes",
+    "usage": "used codes",
+}
+"""Abbreviations of the training log -> words for a page."""
+_OF_STREAM = re.compile(r"((?:tokens_)?(?:accuracy|dead|penalty|perplexity|resets|usage))_(.+)")
+_LEVEL = re.compile(r"level(\d+)")
+_ONLY = "code"
+"""The stream of a tokenizer that has no other."""
+
+
+def label(key: str) -> str:
+    """An attribute, a feature or the value of one, in words."""
+    return key.replace("_", " ")
+
+
+def curve_label(key: str) -> str:
+    """A figure of a training log: "accuracy: body" for `accuracy_body`, "cross-entropy" for `ce`."""
+    found = _OF_STREAM.fullmatch(key)
+    figure, stream = found.groups() if found else (key, "")
+    words = " ".join(_SHORT.get(piece, piece) for piece in figure.split("_"))
+    if stream in ("", _ONLY):
+        return words
+    level = _LEVEL.fullmatch(stream)
+    return f"{words}: {f'level {level[1]}' if level else label(stream)}"

@@ -112,7 +112,7 @@ def lit(body: Body, vertices: Array, normals: Array, eye: Floats) -> Array:
 
 
 def detail_for(camera: Camera) -> Detail:
-    """How fine a mesh shows in the camera's picture."""
+    """Return the detail that is fine enough for the camera's picture."""
     height = camera.height * 1.7 / (2 * np.tan(FIELD_OF_VIEW / 2) * camera.distance)
     return "near" if height > _FINE else "far"
 
@@ -144,7 +144,7 @@ def draw_figure(
 
 
 class Ground:
-    """What a camera of one direction sees of the ground at height `level`, relative to its target.
+    """The ground at height `level` as a camera of fixed direction sees it, relative to its target.
 
     The target moves along the ground, `target_height` metres above 0.
     """
@@ -239,7 +239,7 @@ class Ground:
 
 
 def _darkness(flat: Floats, height: Floats, triangles: NDArray[np.int64], low: Floats, high: Floats) -> Array:
-    """How dark the ground is [64, 64] between its corners `low` and `high`."""
+    """Darkness of the shadow [64, 64] on the ground between the corners `low` and `high`."""
     from scipy.ndimage import gaussian_filter
 
     nearness = np.clip(1 - height / 0.5, 0, 1).astype(np.float32)
@@ -256,7 +256,7 @@ def _darkness(flat: Floats, height: Floats, triangles: NDArray[np.int64], low: F
 
 @dataclass(frozen=True)
 class Cover:
-    """What is seen at P pixels."""
+    """The triangle in front at each of P pixels."""
 
     pixels: NDArray[np.int64]
     """[P], counted along rows, each once."""

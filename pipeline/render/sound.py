@@ -15,9 +15,9 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, NamedTuple, Protocol, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +37,12 @@ class Soundtrack(Protocol):
 
     @property
     def samples(self) -> NDArray[np.float32]:
-        """[S] in -1..1."""
+        """Samples [S] in -1..1."""
         ...
 
     @property
     def rate(self) -> float:
-        """Samples a second."""
+        """Sample rate in Hz."""
         ...
 
 
@@ -140,3 +140,56 @@ def _mp3(samples: NDArray[np.float32]) -> bytes | None:
         for start in range(0, len(samples), _BLOCK):
             out.write(samples[start : start + _BLOCK])
     return file.getvalue()
+
+
+# The time line of a motion: its sound, its beats, and what drives it when.
+
+Driver = Literal["text", "music"]
+
+
+class Segment(NamedTuple):
+    """A stretch of a motion in seconds and what drives it: words, or the name of the music."""
+
+    start: float
+    end: float
+    label: str
+    kind: Driver = "text"
+
+
+Segments = Sequence[Segment | tuple[float, float, str]]
+"""Plain triples are text segments."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """Sound, beats and segments on the time line of one motion, in seconds from frame 0."""
+
+    sound: Soundtrack | None = None
+    beats: Sequence[float] = ()
+    segments: Segments = ()
+
+
+class ScoreData(TypedDict):
+    """Beats in seconds; segments [start, end, label, kind]."""
+
+    beats: list[float]
+    segments: list[tuple[float, float, str, str]]
+
+
+def score_data(beats: Sequence[float], segments: Segments, seconds: float, where: str) -> ScoreData:
+    """Beats and segments as plain JSON types, those past `seconds` left out; `UserError` names `where`."""
+    times = np.asarray(beats, np.float64)
+    if times.ndim != 1 or not np.isfinite(times).all():
+        raise UserError(f"{where}: beats must be a list of finite seconds, got shape {list(times.shape)}")
+    bands: list[tuple[float, float, str, str]] = []
+    for segment in (Segment(*s) for s in segments):
+        named = f"{where}: segment '{segment.label}'"
+        if not (np.isfinite([segment.start, segment.end]).all() and 0 <= segment.start < segment.end):
+            raise UserError(f"{named} must start at 0 s or later and end after it starts, got {segment[:2]}")
+        if segment.kind not in get_args(Driver):
+            raise UserError(f"{named} is of kind '{segment.kind}'; known: {', '.join(get_args(Driver))}")
+        if segment.start < seconds:
+            end = min(float(segment.end), seconds)
+            bands.append((float(segment.start), end, segment.label, segment.kind))
+    inside = np.unique(times[(times >= 0) & (times <= seconds)])
+    return {"beats": [round(float(t), 4) for t in inside], "segments": bands}

@@ -28,8 +28,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.embed import PoseData, mesh_data, packed, pose_data
 from motionloom.pipeline.render.body.face import FACE_CONTROLS, FACE_NEUTRAL
 from motionloom.pipeline.render.body.posing import human_skeleton, posing_of
-from motionloom.pipeline.render.score import ScoreData, Segments, score_data
-from motionloom.pipeline.render.sound import Soundtrack, embed_sounds
+from motionloom.pipeline.render.sound import ScoreData, Segments, Soundtrack, embed_sounds, score_data
 
 SCRIPTS = [
     "space",
@@ -203,7 +202,7 @@ def has_bodies(data: ViewerData) -> bool:
 
 
 def media_policy(sounding: bool) -> str:
-    """What a page's content policy adds for sound: media made by its own script, from no address."""
+    """The part of a page's content policy for sound: media made by its own script, from no address."""
     return "; media-src blob:" if sounding else ""
 
 

@@ -19,7 +19,7 @@ from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.results.data_page import watch
 
 BEFORE, SECONDS = 1.5, 5.0
-"""Of a clip the page shows so much, beginning so long before what is wrong with it."""
+"""The page shows `SECONDS` of a clip, from `BEFORE` seconds before its fault."""
 DECISIONS = "decisions.json"
 
 
@@ -44,7 +44,7 @@ def suspects_of(root: Path, model: str | None = None, *, progress: bool = False)
 
 
 def kinds_of(suspects: Mapping[Place, Suspect]) -> dict[str, int]:
-    """How many suspects there are of each kind, by their worst fault."""
+    """Number of suspects of each kind, by their worst fault."""
     return dict(Counter(suspect.faults[0].kind for suspect in suspects.values()).most_common())
 
 

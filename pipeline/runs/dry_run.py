@@ -1,4 +1,4 @@
-"""What a run would do and what its trainings take, before anything runs: tables for people, a record for
+"""The plan of a run and the cost of its trainings, before anything runs: tables for people, a record for
 programs (`motionloom run --dry-run`, with `--json`).
 
 Nothing that took long is replaced unless the user asks for it. Guarded are trainings, whatever they took, and
@@ -66,10 +66,10 @@ def estimate(recipe: Recipe, names: Collection[str] | None = None) -> dict[str, 
 
 @dataclass(frozen=True)
 class TrainingTime:
-    """How long a training will take."""
+    """Expected duration of a training."""
 
     seconds: float
-    """Of the steps that are left."""
+    """Seconds for the steps that are left."""
     own: bool
     """Whether the run itself has taken such steps; else they were tried out here."""
 
@@ -81,7 +81,7 @@ _TRIED_BYTES, _TRIED_PARAMETERS = 2 * 2**30, 10_000_000
 def training_times(
     recipe: Recipe, run: Path, rows: Sequence[PlannedStage], cards: Mapping[str, ModelCard]
 ) -> dict[str, TrainingTime]:
-    """Of the trainings in `rows`, by the run's own telemetry; else those of `cards` are tried out."""
+    """Durations of the trainings in `rows`, from the run's own telemetry; else small ones are tried out."""
     stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
     out = {}
     for row in (row for row in rows if row.stage.kind.trains):
@@ -100,7 +100,7 @@ def training_times(
 
 
 def estimate_table(cards: Mapping[str, ModelCard], times: Mapping[str, TrainingTime]) -> Table:
-    """For a terminal."""
+    """The estimates as a table for a terminal."""
     table = Table(title="what the trainings take (one process)", title_justify="left")
     for column in ("stage", "parameters", "batch", "steps", "time", "memory", "checkpoints", "tokens"):
         table.add_column(column, overflow="fold")
@@ -207,7 +207,7 @@ class Replaced:
     why: str
     trained: bool
     seconds: float | None
-    """What it took, as its `timing.json` says; None where that was not noted."""
+    """Duration from its `timing.json`; None where none was noted."""
 
     def say(self) -> str:
         work = "training" if self.trained else "work"

@@ -96,7 +96,7 @@ def context_of(
     team: Team,
     stage_cache: StageCache | None = None,
 ) -> StageContext:
-    """What a stage works with in `folder`."""
+    """The context of a stage that works in `folder`."""
     return StageContext(
         name=stage.name,
         recipe=recipe.name,
@@ -154,7 +154,7 @@ def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[Plann
 def _input(
     recipe: Recipe, run: Path, row: PlannedStage, rows: Mapping[str, PlannedStage], name: str
 ) -> InputStage:
-    """What an artifact says of an input; refuses one from outside that has changed since the plan."""
+    """The record of an input in an artifact; refuses one from outside that has changed since the plan."""
     if name in rows:
         return InputStage(stage=name, fingerprint=rows[name].fingerprint)
     folder = recipe.outside[name].folder

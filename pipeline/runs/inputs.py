@@ -23,7 +23,7 @@ _LIKE = "name the folder of a stage, like runs/other/stages/gpt"
 
 @dataclass
 class Sources:
-    """What a recipe's stages may be fed by: its own stages, and those outside that they name."""
+    """Possible inputs of a recipe's stages: its own stages, and stages outside that they name."""
 
     own: Sequence[Stage]
     where: str

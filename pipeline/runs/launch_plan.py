@@ -1,4 +1,4 @@
-"""What a recipe needs of a cluster: its stages in groups, one after the other, each with its own machines.
+"""A recipe cut into groups of stages for a cluster, one after the other, each with its own machines.
 
 SLURM schedules (`slurm.py`); this only describes. A group is one command, `motionloom run RECIPE -o OUT
 --until LAST`, whose selection covers exactly the stages of the group: the groups before have made what they
@@ -36,7 +36,7 @@ Line = Annotated[str, AfterValidator(_one_line)]
 
 
 class SlurmOptions(Config):
-    """What to ask SLURM for: `motionloom launch --cluster KEY=VALUE`."""
+    """Options of SLURM jobs: `motionloom launch --cluster KEY=VALUE`."""
 
     name: str | None = Field(None, pattern=r"^[a-z]([a-z0-9-]{0,28}[a-z0-9])?$")
     """Name of the jobs; by default made from the recipe's."""
@@ -46,9 +46,9 @@ class SlurmOptions(Config):
     light_partition: Line | None = None
     """Partition of the groups without GPUs."""
     account: Line | None = None
-    """Account to charge."""
+    """Account that is charged."""
     qos: Line | None = None
-    """Quality of service."""
+    """Quality of service of the jobs."""
     time_minutes: int = Field(1440, ge=1)
     """Time limit of a group that takes all machines."""
     light_minutes: int = Field(240, ge=1)
@@ -62,9 +62,9 @@ class SlurmOptions(Config):
     light_memory_gb: float = Field(32, gt=0)
     """Memory of a group of one process."""
     warn_seconds: int = Field(120, ge=60)
-    """How long before its time limit a job is queued again."""
+    """Seconds before its time limit at which a job is queued again."""
     requeues: int = Field(100, ge=0)
-    """How often one job may be queued again at its time limit; 0 lets it end there."""
+    """Times that one job may be queued again at its time limit; 0 lets it end there."""
     extra: dict[str, Line] = Field(default_factory=dict)
     """More options of sbatch: `extra.constraint=h100`."""
 
@@ -103,7 +103,7 @@ class SlurmOptions(Config):
 
 @dataclass(frozen=True)
 class Machines:
-    """What a group runs on."""
+    """Nodes, processes and limits of a group."""
 
     nodes: int
     processes: int
@@ -123,7 +123,7 @@ class Group:
     need: Need
     stages: tuple[str, ...]
     last: tuple[str, ...]
-    """Those of the stages that no other of the group needs."""
+    """Stages that no other stage of the group reads."""
     machines: Machines
     settings: tuple[str, ...]
     """Settings of `hardware`, as `--set` takes them."""
@@ -145,7 +145,7 @@ class LaunchPlan:
     groups: tuple[Group, ...]
 
     def job(self, group: Group) -> str:
-        """What a group's job is called."""
+        """Name of a group's job."""
         return f"{self.name}-{group.name}"
 
     def command(self, group: Group, recipe: str, program: Sequence[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""What happens to each stage of a recipe in a run folder, and why.
+"""The plan of a run: the action for each stage of a recipe in a run folder, and the reason.
 
 A stage's fingerprint covers its kind and version, its full resolved config, the seed, facts about outside
 files and the fingerprints of its inputs. A stage is finished when its folder holds an `artifact.json` with
@@ -76,7 +76,7 @@ class Started(Config):
 
     @staticmethod
     def find(folder: Path) -> Started | None:
-        """What was begun last in a stage's folder."""
+        """The stage that was last started in a folder."""
         path = folder / "started.json"
         return Started.load_json(path) if path.is_file() else None
 
@@ -89,11 +89,11 @@ class PlannedStage:
     action: Action
     reason: str
     started: Started
-    """What the stage's folder says of it from its beginning on."""
+    """Content of `started.json` in the stage's folder."""
     request: Request | None
     """The request for which the stage is run again: the selection names it (`--from`, `--force`)."""
     identities: Mapping[str, str]
-    """What its inputs from outside were when the plan was made."""
+    """Identities of its inputs from outside when the plan was made."""
 
     @property
     def fingerprint(self) -> str:
@@ -180,7 +180,7 @@ def selected(recipe: Recipe, select: Selection) -> set[str]:
 
 
 def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
-    """What a stage's fingerprint is the digest of."""
+    """The facts that a stage's fingerprint is the digest of."""
     facts = {
         "kind": stage.kind.name,
         "version": stage.kind.version,
@@ -293,7 +293,7 @@ def _descendants(recipe: Recipe, name: str) -> set[str]:
 
 
 def _extendable(stage: Stage, facts: Tree) -> dict[str, int | str] | None:
-    """What `started.json` keeps of a stage that trains: its steps, and a digest of the other facts."""
+    """Steps of a stage that trains and a digest of its other facts, for `started.json`."""
     if not isinstance(stage.config, TrainedStageConfig):
         return None
     fields = dict(facts["config"])

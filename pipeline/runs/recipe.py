@@ -54,7 +54,7 @@ class RecipeFile(Config):
     start: str | None = None
     """A trained model that stages go on from: one of the package, or the folder of an export or a run."""
     defaults: dict[str, Tree] = Field(default_factory=dict)
-    """What stages of a kind, or all that train (`trained`), share."""
+    """Settings that stages of a kind, or all that train (`trained`), share."""
     stages: dict[str, Tree]
 
     @field_validator("stages")
@@ -185,7 +185,7 @@ def _parse(entries: Mapping[str, dict[str, Any]], where: str) -> list[tuple[Stag
 
 
 def _check(stages: Sequence[Stage], sources: Sources, where: str) -> None:
-    """What each kind refuses in the company of the others."""
+    """Have each kind check its stage together with the others."""
     named = {stage.name: stage for stage in stages} | as_stages(sources.outside)
     for stage in stages:
         try:

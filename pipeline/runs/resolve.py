@@ -53,7 +53,7 @@ _TOP = ("name", "description", "seed", "data_seed", "hardware", START, "defaults
 _OWN = ("optim", "train")
 """Settings that a training does not take over from the model it starts from."""
 _COMPLETED_LATER = {"missing", "value_error"}
-"""What may be wrong with defaults, since a stage's own entry completes them."""
+"""Errors that defaults may have, since a stage's own entry completes them."""
 
 
 @dataclass
@@ -62,7 +62,7 @@ class Resolved:
 
     data: Tree
     where: str
-    """For messages."""
+    """Name of the recipe in messages."""
     removed: dict[str, str] = field(default_factory=dict)
     """Stages that a layer has left out, and the file or option that did."""
 

@@ -26,7 +26,7 @@ from motionloom.pipeline.store.data import local_shards
 _THREADS = 4
 """At most, in a process: more read no disk faster."""
 _WORTH_A_LINE = 5.0
-"""Seconds."""
+"""Seconds from which on a comparison is reported."""
 
 
 def verify_shards(context: StageContext, team: Team, run: Path) -> None:

@@ -1,1 +1,1 @@
-"""What stages leave on disk for each other."""
+"""Files that stages leave on disk for each other."""

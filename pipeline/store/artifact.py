@@ -40,7 +40,7 @@ class InputStage(Config):
     stage: str = Field(pattern=STAGE_NAME)
     fingerprint: str
     folder: str | None = None
-    """Of a stage outside the run: its folder, seen from that of the run. None: a stage of the run."""
+    """Folder of a stage outside the run, seen from the run's. None: a stage of the run itself."""
 
     @model_serializer(mode="wrap")
     def _only_what_is(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -54,7 +54,7 @@ class InputStage(Config):
         return (owner_of(stage) / self.folder).resolve()
 
     def now(self, stage: Path) -> str | None:
-        """What `fingerprint` would be of what is there now; None if nothing is."""
+        """The value of `fingerprint` for the stage that is there now; None if there is none."""
         place = self.place(stage)
         return fingerprint_now(place) if self.folder is None else identity_of(place)
 
@@ -144,7 +144,7 @@ def require_consistent(run: Path, stages: Iterable[str]) -> None:
 
 
 def fingerprint_now(folder: Path) -> str | None:
-    """Of what a stage's folder holds, finished or not; None if nothing is there."""
+    """Fingerprint of the stage in a folder, finished or not; None if there is none."""
     artifact = Artifact.find(folder)
     if artifact is not None:
         return artifact.fingerprint

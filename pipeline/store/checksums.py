@@ -27,7 +27,7 @@ class ComparedFile(Config):
 
     sha256: str
     states: list[State]
-    """What it was like (`state_of`): one on a shared file system, else one for each machine."""
+    """State of the file (`state_of`): one on a shared file system, else one for each machine."""
 
 
 class Compared(Config):
@@ -37,7 +37,7 @@ class Compared(Config):
 
     @staticmethod
     def read(path: Path) -> Compared:
-        """What is noted; nothing where there is no such note, or none that can be read."""
+        """The stored note; an empty one where none can be read."""
         try:
             return Compared.load_json(path)
         except (UserError, OSError):

@@ -48,7 +48,7 @@ class MixedStage(Config):
     stage: str = Field(pattern=STAGE_NAME)
     """Its name, which is its folder beside that of the mix."""
     folder: str | None = None
-    """Of a stage outside the run: its folder, seen from that of the mix."""
+    """Folder of a stage outside the run, seen from that of the mix."""
     weight: float = Field(gt=0, allow_inf_nan=False)
 
 
@@ -136,14 +136,14 @@ def _sources(folder: Path) -> list[tuple[Store, Manifest]]:
 
 @dataclass(frozen=True)
 class DataPreview:
-    """What is known of a data stage before it has run."""
+    """A data stage that has not run yet."""
 
     layout: MotionLayout
 
 
 @dataclass(frozen=True)
 class Data:
-    """What a data stage gives: its splits."""
+    """The splits of a data stage."""
 
     folder: Path
 

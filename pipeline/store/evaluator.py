@@ -24,15 +24,15 @@ class Words(NamedTuple):
     """Captions as a text encoder takes them."""
 
     features: Tensor
-    """[n, S, E]"""
+    """Token features [n, S, E]."""
     mask: Tensor
-    """bool [n, S]"""
+    """Real tokens, bool [n, S]."""
     classes: Tensor | None = None
     """One-hot [n, S, G], of words that come with classes."""
 
 
 class CaptionReader(Protocol):
-    """What turns captions into the words that an evaluator was trained on."""
+    """Turns captions into the words that an evaluator was trained on."""
 
     def read(self, captions: Sequence[str], tokens: Sequence[Sequence[str]]) -> Words:
         """`tokens`: the `word/POS` tags of each caption, empty where there are none."""
@@ -76,7 +76,7 @@ class LoadedEvaluator:
     """Mean and deviation of its motion."""
     words: CaptionReader
     facts: dict[str, object] = field(default_factory=dict)
-    """What else has to be known of its figures, for the protocol of an evaluation."""
+    """Further facts for the protocol of its figures."""
     part: Part = PART
 
     @property

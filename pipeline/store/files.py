@@ -49,7 +49,7 @@ def read_record(path: Path) -> dict[str, object]:
 
 
 def fingerprint_of(data: object) -> str:
-    """What tells one set of settings and inputs from another: sha256 of plain JSON data, hex.
+    """Fingerprint of settings and inputs: sha256 of plain JSON data, hex.
 
     Kept apart from `sha256_of_json`: it goes by the characters, not their escapes, and finished runs hold it.
     """

@@ -44,7 +44,7 @@ def owner_of(stage: Path) -> Path:
 
 
 def label_of(stage: Path) -> str:
-    """What people call a stage outside their run: `other:gpt`. No stage of a run is called so."""
+    """Label of a stage outside the run, `other:gpt`; no stage of a run has such a name."""
     place = stage.resolve()
     return f"{owner_of(place).name}:{place.name}"
 

@@ -35,7 +35,7 @@ class StageRecord:
     """A finished stage: its kind, its config with every default, and the stages that fed it, by role."""
 
     name: str
-    """Of a stage outside the run that was opened: the run's name and its own, `other:gpt`."""
+    """For a stage outside the run that was opened, with the run's name: `other:gpt`."""
     kind: str
     version: int
     fingerprint: str
@@ -56,7 +56,7 @@ class StageRecord:
 
 
 def not_here(export: Path, name: str) -> str:
-    """What to say of a stage that an export names and does not hold."""
+    """Message on a stage that an export names and does not hold."""
     fix = "copy the whole folder, or export the run again"
     return f"{export / BUNDLE_FILE}: its stage '{name}' is not here; {fix}"
 
@@ -129,21 +129,21 @@ class StageState:
     kind: str
     folder: Path
     settings: Mapping[str, object]
-    """What made it, of a finished stage; else what its recipe says."""
+    """Settings that made a finished stage; else those of the recipe."""
     progress: Progress
     inputs: Mapping[str, object] = field(default_factory=dict)
     """Roles that its recipe fills otherwise than by their names."""
     why: str = ""
-    """What makes a finished stage outdated."""
+    """Reason why a finished stage is outdated."""
     artifact: Artifact | None = None
     step: int | None = None
     """The last step of its training log."""
     steps: int | None = None
-    """Those that its settings ask for."""
+    """Steps in its settings."""
     seconds: float | None = None
-    """How long it took; of a training that was killed and went on, the last stretch."""
+    """Duration; for a training that was killed and resumed, of the last stretch."""
     hardware: str = ""
-    """What it ran on, where it was noted."""
+    """Machine that it ran on, where it was noted."""
 
     @property
     def usable(self) -> bool:

@@ -112,7 +112,7 @@ class PresentTokens:
     """Which tokens and columns of n clips were recorded, by the bits of `ClipMeta.present`."""
 
     bits: Tensor
-    """int64 [n]."""
+    """Bits of each clip, int64 [n]."""
     streams: Tensor
     """bool [4, K]: row b, streams of clips that hold the bits b."""
     columns: Tensor
@@ -224,16 +224,16 @@ class GptClips:
     """Clips of one split, n of them, and m different captions."""
 
     store: TokenStore
-    """Their tokens alone."""
+    """Tokens of these clips alone."""
     captions: list[list[TokenCaption]]
-    """Those of each clip, n lists."""
+    """Captions of each clip, n lists."""
     texts: list[str]
-    """All captions, [m]."""
+    """Texts of all different captions, [m]."""
     present: PresentTokens | None
     """Which of their tokens were recorded; None when all were."""
     sources: tuple[Source, ...]
     ids: tuple[str, ...]
-    """Their names."""
+    """Ids of the clips."""
     uncaptioned: int
     """Clips that were left out because they have no caption."""
 
@@ -292,7 +292,7 @@ def _caption(span: CaptionSpan, groups: int, unit: int, rows: dict[str, int]) ->
 
 @dataclass(frozen=True)
 class PresentTable:
-    """What clips with the bits b (row b, see `ClipMeta.present`) have of a tokenizer's input and output."""
+    """Parts of a tokenizer's input and output in clips; row b: clips with the bits b (`ClipMeta.present`)."""
 
     columns: Tensor
     """bool [4, C]: columns of the tokenizer."""

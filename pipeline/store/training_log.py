@@ -1,4 +1,4 @@
-"""What a training leaves behind beside its network: `metrics.jsonl`, `flight/rank_N.jsonl`, `crash/`.
+"""Logs of a training beside its network: `metrics.jsonl`, `flight/rank_N.jsonl`, `crash/`.
 
 The flight logs hold times and are no output.
 """

@@ -1,1 +1,1 @@
-"""What a training notes of itself: flight recorder, crash bundles, replays, branches, profiles."""
+"""The training loop of a stage: execution, checkpoints and resume, preemption, failures, telemetry, logs."""

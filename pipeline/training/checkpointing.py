@@ -1,4 +1,7 @@
-"""Checkpoint files: written beside the training, and in them every flipped bit is found before use.
+"""Checkpoints: what they hold, and files in which every flipped bit is found before use.
+
+Weights and optimizers are stored whole, in the format of one process, also by FSDP: a training may be resumed
+with another strategy or number of processes.
 
 A file is what `torch.save` writes, followed by a *seal* of 84 bytes, so that no kill, copy or deletion can
 part a checkpoint from its checksum:
@@ -15,16 +18,128 @@ import hashlib
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, BinaryIO, cast
+from typing import IO, Any, BinaryIO, TypedDict, cast
 
 import torch
-from torch import Tensor
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.distributed.checkpoint.state_dict import (
+    StateDictOptions,
+    get_model_state_dict,
+    get_optimizer_state_dict,
+    set_model_state_dict,
+    set_optimizer_state_dict,
+)
+from torch.distributed.tensor import DTensor
+from torch.optim import Optimizer
 
 from motionloom.datasets.base.files import HashingFile, atomic_file, sync_folder
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.training.checkpoint_state import Checkpoint
+from motionloom.models.training.distributed import rank, world_size
+from motionloom.models.training.stage_module import Means, StageModule
+from motionloom.pipeline.training.progress import LogState
+
+OptimizerState = dict[str, Any]
+"""As `Optimizer.state_dict` gives it."""
+
+
+class Checkpoint(TypedDict):
+    """Everything a training needs to continue after a step."""
+
+    global_step: int
+    steps: int
+    """Steps of the training that wrote it."""
+    state_dict: dict[str, Tensor]
+    optimizer_states: list[OptimizerState]
+    scaler: dict[str, object]
+    average: dict[str, Tensor] | None
+    log: LogState
+    row: list[list[Means]]
+    """Means of the log's next row so far, of each rank."""
+    validate: bool
+    """Whether a signal cut the validation of this step short: the resumed training begins with it."""
+
+
+def weights_of(module: StageModule) -> dict[str, Tensor]:
+    """Weights and buffers; of FSDP gathered on rank 0, a collective."""
+    if _is_sharded(module):
+        return cast(dict[str, Tensor], get_model_state_dict(module, options=_WHOLE))
+    return dict(module.state_dict())
+
+
+def load_weights(module: StageModule, state: dict[str, Tensor]) -> None:
+    """Load weights as `weights_of` returns them."""
+    if _is_sharded(module):
+        set_model_state_dict(
+            module, cast(dict[str, Any], state), options=StateDictOptions(full_state_dict=True)
+        )
+    else:
+        module.load_state_dict(state)
+
+
+def optimizer_state(module: StageModule, optimizer: Optimizer) -> OptimizerState:
+    """State with parameters by number; of FSDP gathered on rank 0, a collective."""
+    if not _is_sharded(module):
+        return optimizer.state_dict()
+    whole = cast(OptimizerState, get_optimizer_state_dict(module, optimizer, options=_WHOLE))
+    if not whole:  # ranks other than 0
+        return {}
+    # torch names parameters here and numbers them in one process: numbers fit any strategy.
+    return _renamed(whole, {name: number for number, name in enumerate(_names(module, optimizer))})
+
+
+def load_optimizer(module: StageModule, optimizer: Optimizer, state: OptimizerState) -> None:
+    """Load a state as `optimizer_state` returns it."""
+    if not _is_sharded(module):
+        optimizer.load_state_dict(state)
+        return
+    named = _renamed(state, dict(enumerate(_names(module, optimizer))))
+    set_optimizer_state_dict(module, optimizer, named, options=StateDictOptions(full_state_dict=True))
+
+
+def _renamed(state: OptimizerState, names: Mapping[str, int] | Mapping[int, str]) -> OptimizerState:
+    """The state with other keys for its parameters."""
+    groups = [{**one, "params": [names[key] for key in one["params"]]} for one in state["param_groups"]]
+    return {"state": {names[key]: values for key, values in state["state"].items()}, "param_groups": groups}
+
+
+def rows_of_ranks(module: StageModule) -> list[list[Means]]:
+    """Contributions of each rank to the next row of the log; a collective."""
+    rows = [module.row_state()] * world_size()
+    if world_size() > 1:
+        dist.all_gather_object(rows, module.row_state())
+    return rows
+
+
+def load_row(module: StageModule, rows: Sequence[list[Means]]) -> None:
+    """Continue the log's row; with another number of ranks each takes the mean of all."""
+    if len(rows) == world_size():
+        module.load_row(rows[rank()])
+        return
+    module.load_row(
+        [
+            {**means, "sums": torch.stack([row[place]["sums"] for row in rows]).mean(0)}
+            for place, means in enumerate(rows[0])
+        ]
+    )
+
+
+_WHOLE = StateDictOptions(full_state_dict=True, cpu_offload=True)
+
+
+def _is_sharded(module: nn.Module) -> bool:
+    return any(isinstance(param, DTensor) for param in module.parameters())
+
+
+def _names(module: nn.Module, optimizer: Optimizer) -> list[str]:
+    """Names of an optimizer's parameters, in its order."""
+    names = {id(param): name for name, param in module.named_parameters()}
+    return [names[id(param)] for group in optimizer.param_groups for param in group["params"]]
+
+
+# Files.
 
 _NAME = re.compile(r"step=(\d+)\.ckpt")
 _SEAL = re.compile(rb"\nmotionloom sha256 ([0-9a-f]{64})\n")
@@ -108,7 +223,7 @@ def snapshot(value: object) -> object:
 
 
 def write_checkpoint(checkpoint: object, path: Path) -> None:
-    """Write `checkpoint` and its seal: hashed on the way, synced, then renamed into place.
+    """Write `checkpoint` and its seal: hashed as it is written, synced, then renamed into place.
 
     Raises:
         UserError: The file could not be written (a full disk, most often); nothing half-written stays.
@@ -182,6 +297,7 @@ class _Sink(HashingFile):
 
 def _check_seal(path: Path) -> None:
     with path.open("rb") as file:
+        # The seal comes last, so a file that was cut short has none, wherever it was cut.
         size = file.seek(0, 2) - _SEAL_BYTES
         file.seek(max(0, size))
         seal = _SEAL.fullmatch(file.read())

@@ -28,10 +28,10 @@ class TrainConfig(Config):
     """Length and arithmetic of one training run."""
 
     steps: int = Field(1000, ge=1)
-    """Optimizer steps."""
+    """Number of optimizer steps."""
     seed: int | None = Field(None, ge=0)
-    """Of this training's first weights, batches and draws; null = the recipe's. Trainings of one recipe that
-    differ in it alone say how far a result is chance."""
+    """Seed of the first weights, batches and draws; null = the recipe's. Trainings that differ in it alone
+    show how far a result is chance."""
     batch_size: int = Field(256, ge=1)
     """Global batch, over all processes and accumulated parts."""
     accumulate: int = Field(1, ge=1)
@@ -44,7 +44,7 @@ class TrainConfig(Config):
     """
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
     strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)
-    """What several processes hold: each the whole network (`ddp`), or each a part of the weights, gradients
+    """Distribution over processes: each holds the whole network (`ddp`), or a part of the weights, gradients
     and optimizer state (`fsdp`: gpt stages, for networks that do not fit; not with compile or 16-mixed).
     One process holds all; the results are the same."""
     compile: bool = False

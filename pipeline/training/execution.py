@@ -1,4 +1,4 @@
-"""How a training is executed: devices, processes and precision, the module on them, and its loaders."""
+"""Execution of a training: devices, processes and precision, the module on them, and its loaders."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from motionloom.pipeline.training.preemption import unsignalled
 
 
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
-    """Apply the settings that concern how the network computes."""
+    """Apply the settings of the arithmetic: fused optimizer, accumulation, activation checkpoints."""
     module.fused = config.precision != "16-mixed"
     module.accumulate = config.accumulate
     for part in module.modules():
@@ -39,7 +39,8 @@ def prepare_module(module: StageModule, config: TrainConfig) -> None:
 
 
 SMALL = 10_000_000
-"""Parameters below which a second thread gains nothing, and loses much where others use the machine."""
+"""Parameters below which a second thread gains nothing, and loses much where others use the machine
+(measured)."""
 
 
 def set_threads(module: nn.Module, hardware: Hardware) -> None:

@@ -16,7 +16,7 @@ from motionloom.pipeline.launch.hardware import LoggerName
 from motionloom.pipeline.store.files import read_record, write_json
 
 FOLDER = "logs"
-"""Of a stage's folder; no result depends on it."""
+"""Folder of the loggers in a stage's folder; no result depends on it."""
 
 _SENT = "sent.json"
 """In that folder: what the loggers have. A kill may come between a checkpoint and the sending of its rows."""
@@ -54,7 +54,7 @@ class Loggers:
         self._loggers = []
 
     def identity(self, server: str, make: Callable[[], str] = lambda: uuid.uuid4().hex) -> str:
-        """What a server knows this training by; the same when it goes on after a kill."""
+        """The id of this training on a server; the same when it resumes after a kill."""
         path = self.folder / f"{server}.json"
         if not path.is_file():
             write_json(path, {"id": make()})

@@ -1,4 +1,4 @@
-"""What a training will take: parameters and memory of one process, found on fake tensors, and time.
+"""Cost of a training before it runs: parameters and memory of one process, on fake tensors, and time.
 
 The network is built and its loss computed on tensors that have shapes but no values, so the figures come from
 the code that will run, under the precision it will run in. Memory counts weights, gradients, the optimizer's
@@ -98,7 +98,7 @@ def _random(value: Any) -> Any:
 
 
 def _trained(module: StageModule) -> list[nn.Parameter]:
-    """What gets gradients and moments: the network, and those that it is trained against."""
+    """Parameters with gradients and moments: of the network, and of those that it is trained against."""
     nets = [module.net]
     if isinstance(module, PlayersModule):
         nets += [net for player in module.players() for net in player.nets]

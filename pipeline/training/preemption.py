@@ -23,15 +23,16 @@ import torch
 import torch.distributed as dist
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name))
-"""What a training answers by saving."""
+"""Signals at which a training saves and ends."""
 
 Handler = Callable[[int, FrameType | None], object] | int | None
 
 _BETWEEN = 0.5
-"""Seconds from one agreement of the ranks to the next."""
+"""Seconds from one agreement of the ranks to the next: far below any grace time, far above an all-reduce."""
 _GROWTH = 4
 """An interval in steps grows by no more than this at once: the first steps are slow."""
 _PATIENCE = timedelta(minutes=30)
+"""Longest wait for a rank; a validation batch or a checkpoint takes less."""
 
 
 class Signals:
@@ -102,6 +103,7 @@ class Agreement:
         """The signal, or 0, asked in any case."""
         if self.group is None:
             return self.signals.number
+        # One all-reduce carries both the signal and the pace; MAX lets any rank's signal win.
         seconds = time.monotonic() - self._time
         asked = torch.tensor([float(self.signals.number), seconds], dtype=torch.float64)
         dist.all_reduce(asked, dist.ReduceOp.MAX, self.group)

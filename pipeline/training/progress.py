@@ -1,4 +1,4 @@
-"""What a person sees while a stage trains, and the log that a killed run continues without a gap."""
+"""The progress bar of a training, and its log, which a killed run continues without a gap."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class StepProgress:
 
 
 class LogState(TypedDict):
-    """What a checkpoint holds of the log, as JSON."""
+    """Rows of the log in a checkpoint, as JSON."""
 
     rows: str
     gauges: str

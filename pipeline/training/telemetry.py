@@ -1,4 +1,4 @@
-"""Per-rank training telemetry: speed, step times and what each process waits for.
+"""Per-rank training telemetry: speed, step times, waits, and a profile of a few steps on request.
 
 A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, which the report draws.
 """
@@ -17,9 +17,11 @@ from pathlib import Path
 
 import torch
 import torch.distributed as dist
+from rich.console import Console
 from torch import Tensor
+from torch.profiler import profile, schedule
 
-from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.files import atomic_path, write_text
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
 from motionloom.pipeline.store.files import open_own
@@ -47,7 +49,7 @@ class WaitTimes(dict[str, float]):
             self[cause] += time.perf_counter() - begin
 
     def shares(self, before: Mapping[str, float], seconds: float) -> dict[str, float]:
-        """Of the last `seconds` what went by waiting since `before`, a copy made then; 0 to 1, by cause."""
+        """Shares of the last `seconds` spent waiting since `before`, a copy made then: 0 to 1, by cause."""
         return {cause: min(1.0, (now - before[cause]) / max(seconds, 1e-9)) for cause, now in self.items()}
 
 
@@ -63,7 +65,7 @@ class Telemetry:
         self._before = dict(self.waits)
         """Waits up to the last row."""
         self._seconds: list[float] = []
-        """Of the steps since the last row."""
+        """Seconds of the steps since the last row."""
         self._own: list[float] = []
         """Without the wait for the batch."""
         self._latest: deque[float] = deque(maxlen=100)
@@ -161,3 +163,31 @@ def _rss_mib() -> float:
     """The most memory this process has had so far."""
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most / 2**20 if sys.platform == "darwin" else most / 2**10
+
+
+# A profile by torch's profiler (`--profile`, `hardware.profile`).
+
+WARM_UP = 10
+"""Steps of a training before those that are profiled: kernels are chosen and caches filled in them."""
+
+
+def step_profiler(name: str, folder: Path, steps: int, left: int, console: Console) -> profile:
+    """Profiles `steps` steps after the first `WARM_UP`, or the last of a training with fewer steps `left`.
+
+    Each process leaves a trace in the stage's `flight/` folder, which Perfetto and Chrome open.
+    """
+    steps = min(steps, left)
+    before, path = min(WARM_UP, left - steps), folder / FLIGHT / f"profile_rank_{rank()}.json.gz"
+
+    def write(done: profile) -> None:
+        with atomic_path(path) as temporary:
+            whole = temporary.with_name(f"{temporary.name}.json.gz")  # torch packs what is called so
+            done.export_chrome_trace(str(whole))
+            whole.replace(temporary)
+        console.print(
+            f"    {name}: profile of {steps} steps in {path} (open it at ui.perfetto.dev)", soft_wrap=True
+        )
+
+    warm = min(1, before)
+    phases = schedule(wait=before - warm, warmup=warm, active=steps, repeat=1)
+    return profile(schedule=phases, on_trace_ready=write, record_shapes=True)

@@ -32,21 +32,19 @@ from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.process import Interrupted, TeamError
 from motionloom.pipeline.launch.team import lead_finds
 from motionloom.pipeline.store.training_log import CRASHES
-from motionloom.pipeline.training.checkpoint_state import (
+from motionloom.pipeline.training.checkpointing import (
+    BackgroundWriter,
     Checkpoint,
     load_optimizer,
     load_row,
     load_weights,
-    optimizer_state,
-    rows_of_ranks,
-    weights_of,
-)
-from motionloom.pipeline.training.checkpointing import (
-    BackgroundWriter,
     name_of,
+    optimizer_state,
     read_checkpoint,
     readable,
+    rows_of_ranks,
     step_of,
+    weights_of,
 )
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
 from motionloom.pipeline.training.execution import (
@@ -59,9 +57,8 @@ from motionloom.pipeline.training.execution import (
 from motionloom.pipeline.training.failures import FailureGuard, StallTimer
 from motionloom.pipeline.training.loggers import Loggers
 from motionloom.pipeline.training.preemption import Agreement, Signals
-from motionloom.pipeline.training.profiler import step_profiler
 from motionloom.pipeline.training.progress import MetricLog, StepProgress
-from motionloom.pipeline.training.telemetry import Telemetry
+from motionloom.pipeline.training.telemetry import Telemetry, step_profiler
 
 
 def fit(
@@ -101,7 +98,7 @@ def fit(
 
 
 class ResumePoint(NamedTuple):
-    """Where a training begins."""
+    """The checkpoint that a training resumes from."""
 
     checkpoint: Path | None
     """None for the beginning."""
@@ -180,10 +177,11 @@ class Training:
 
     def _run(self) -> None:
         module, steps = self.module, self.config.steps
+        # A signal cut the validation of this step short: its row comes before those of later steps.
         if self.validation_is_due:
             self._validate()
             if not self.validation_is_due:
-                self._save(again=True)
+                self._save(again=True)  # else a second kill would validate this step twice
             self._answer(self.agreement.now())
         batches = self.data.batches(module.step) if module.step < steps else iter(())
         while module.step < steps:
@@ -191,10 +189,11 @@ class Training:
             border = module.step % self.every == 0 or module.step == steps
             if self.validate_every and module.step % self.validate_every == 0:
                 self._validate()
-            if border:
+            if border:  # after the validation, so that the checkpoint holds its row
                 self._save()
             self._answer(self.agreement.now() if border else self.agreement.after_step())
         self._finish_writing()
+        # A signal during the last write: the run must not go on to the next stage.
         self._answer(self.agreement.now())
         self.log.finish()
 
@@ -238,12 +237,14 @@ class Training:
     def _validate(self) -> None:
         """Losses on all held-out batches, their means weighted by rows; a signal ends it after a batch."""
         module, loader = self.module, self.data.held_out()
+        # Weights that are not finite would make the validation a figure that nobody can read.
         self.failures.check(scaled=self.how.scaler is not None)
+        # Frozen parts stay in evaluation: modes are restored part by part.
         modes = [(part, part.training) for part in module.modules()]
         module.eval()
         sums: dict[str, Tensor] = {}
         rows, cut = 0, False
-        self.agreement.restart_pace()
+        self.agreement.restart_pace()  # batches of a validation take another time than steps
         with self.average.swapped(module.net) if self.average else nullcontext(), torch.no_grad():
             for number, batch in enumerate(loader):
                 batch = self.fabric.to_device(batch)
@@ -268,6 +269,7 @@ class Training:
         if not number:
             return
         self.signals.answered = True
+        # Saved whatever the step: `checkpoint_every` is what a kill may cost, a signal costs nothing.
         self._save()
         self._finish_writing()
         self.agreement.barrier()  # nobody leaves before the file is whole
@@ -278,9 +280,9 @@ class Training:
         step = self.module.step
         if step == self._saved and not again:
             return
-        self.failures.check(scaled=self.how.scaler is not None)
+        self.failures.check(scaled=self.how.scaler is not None)  # no checkpoint of a lost network
         with self.telemetry.waits.waiting_for("checkpoints"):
-            self._finish_writing()
+            self._finish_writing()  # at most one copy of the state is in memory
             state = self._state()
             if rank() == 0:
                 self.writer.write(state, self.folder / name_of(step))
@@ -311,6 +313,7 @@ class Training:
 
     def _load(self, state: Checkpoint, *, longer: bool) -> None:
         module, name = self.module, self.context.name
+        # Data and random draws need no state: both are functions of the seed and the step.
         module.step = state["global_step"]
         load_weights(module, state["state_dict"])
         for optimizer, one in zip(self.optimizers, state["optimizer_states"], strict=True):
@@ -337,7 +340,7 @@ def _at_least_float32(value: Tensor) -> Tensor:
 
 
 def _find_resume_point(context: StageContext, config: TrainConfig) -> ResumePoint:
-    """Done by the lead, once what a killed run was writing is gone; damaged checkpoints go too."""
+    """Return where to begin, called in the lead alone; temporary and damaged files are deleted."""
     folder = context.folder / "checkpoints"
     if folder.is_dir():
         remove_temporaries(folder)
@@ -347,14 +350,14 @@ def _find_resume_point(context: StageContext, config: TrainConfig) -> ResumePoin
     newest = found.checkpoint
     for path in folder.glob("*.ckpt"):
         if newest is not None and (step_of(path) or 0) > (step_of(newest) or 0):
-            path.unlink()  # passed over
+            path.unlink()  # damaged: the training writes this step again
     return found
 
 
 def resume_point(
     folder: Path, config: TrainConfig, log: Callable[[str], None] = warnings.warn
 ) -> ResumePoint:
-    """The newest good checkpoint; `log` gets why any was passed over."""
+    """The newest checkpoint that can be read; `log` receives why others were passed over."""
     for path, checkpoint in readable(folder, log):
         return ResumePoint(path, checkpoint["steps"] < config.steps)
     return ResumePoint(None)

@@ -73,7 +73,7 @@ def same_encoder(one: str, other: str, stages: Mapping[str, Stage]) -> bool:
 
 
 def _encoder(stage: Stage) -> object:
-    """What encodes words: the encoder that a text stage names, a folder by its place, or all that it says."""
+    """The encoder that a text stage names, a folder by its place, or the whole config."""
     if is_place(stage.name) and in_export(Path(stage.name)):
         return TextSource(Path(stage.name).resolve(), "", CPU, exported=True).encoder_name
     spec = getattr(stage.config, "encoder", None)

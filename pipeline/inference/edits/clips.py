@@ -34,7 +34,7 @@ def read_clip(path: Path) -> RecordedClip:
         return require_clip(_of_bvh(path))
     if ending == ".npz":
         return require_clip(_of_npz(path))
-    from motionloom.pipeline.render.body.glb_reader import read_glb
+    from motionloom.pipeline.render.body.glb import read_glb
 
     joints, fps, name = read_glb(path)
     return require_clip(RecordedClip(str(path), joints, fps, None, name))

@@ -25,7 +25,7 @@ _STILL = 1e-5
 
 
 class PoseData(TypedDict):
-    """What the page needs beside joint positions; arrays are base64."""
+    """Bones and rotations that the page needs beside joint positions; arrays are base64."""
 
     turning: list[int]
     """Joints that turn by themselves."""

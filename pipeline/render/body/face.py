@@ -1,4 +1,4 @@
-"""What moves the body's face: expression values to weights of its shapes.
+"""The body's face: from expression values to weights of its shapes.
 
 Only the synthetic source's basis has a public meaning (happy, sad, angry, surprised, blink; see
 `datasets.synth.face`). FLAME coefficients of licensed data follow another basis: their faces stay neutral
@@ -12,12 +12,18 @@ own expressions, or ARKit's 52 shapes.
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.body.arkit import ARKIT, ArkitBases, bounded_least_squares
+from motionloom.datasets.motion.body.live_link import ANGLES, FaceTake, read_face, write_face
+from motionloom.datasets.motion.layout import FACE_DIMS
+from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.face import APEX, BASIS, DETAIL
 from motionloom.pipeline.render.body.mesh import body_for
 
@@ -31,7 +37,7 @@ FACE_NEUTRAL = (0.0, 0.0, 1.0, 0.0, 0.0)
 EXPRESSIONS = ("happy", "sad", "angry", "surprised", "blink", "talk_open", "talk_wide", "talk_purse")
 """The shapes of the synthetic basis' columns at their apex, in the basis' order."""
 _EYE_OPEN = np.array([0.75, 0.7, 0.8, 1.6])
-"""How far each emotion leaves the eye open at its apex."""
+"""Opening of the eye at the apex of each emotion, 1 being neutral (fitted to the synthetic basis)."""
 BLINK_HEIGHT = 1.6
 """Length of a full blink along its column of the synthetic basis."""
 _WIDE_EYE = 1.6
@@ -134,3 +140,33 @@ def recorded_expression(weights: Values) -> Floats:
         [emotions * APEX, (np.clip(blink / opened, 0, 1) * BLINK_HEIGHT)[:, None], talk], axis=1
     )
     return np.asarray(along @ BASIS.T + left @ DETAIL.T)
+
+
+def convert_face(source: Path, out: Path, bases: Path | None = None) -> tuple[int, float]:
+    """Write expression columns (.npz) of a take (.csv), or a take of columns; returns frames and frame rate.
+
+    The npz holds `expression` [T, K], `angles` [T, 9] of head and eyes in radians, and `fps`. By the bases of
+    the package K is 50. `UserError` for other suffixes and for what the files hold wrongly.
+    """
+    own = None if bases is None else ArkitBases.read(bases)
+    if (source.suffix.lower(), out.suffix.lower()) == (".csv", ".npz"):
+        take = read_face(source)
+        values = recorded_expression(take.weights) if own is None else own.expressions(take.weights)
+        with atomic_file(out) as file:
+            np.savez(file, expression=values.astype(np.float32), angles=take.angles, fps=take.fps)
+        return len(values), take.fps
+    if (source.suffix.lower(), out.suffix.lower()) != (".npz", ".csv"):
+        raise UserError(f"{source} -> {out}: a take (.csv) becomes columns (.npz), or columns a take")
+    with NpzFile(source) as arrays:
+        values, angles = arrays.numbers("expression"), arrays.numbers("angles")
+        fps = float(arrays.numbers("fps"))
+    if values.ndim != 2 or angles.shape != (len(values), len(ANGLES)) or not np.isfinite(values).all():
+        raise UserError(
+            f"{source}: expression {list(values.shape)} and angles {list(angles.shape)} must be finite, "
+            f"[T, K] and [T, {len(ANGLES)}]"
+        )
+    if own is None and values.shape[1] != FACE_DIMS:
+        raise UserError(f"{source}: {values.shape[1]} expression values, not {FACE_DIMS}, need --arkit-bases")
+    weights = synthetic_arkit(values) if own is None else own.weights(values)
+    write_face(out, FaceTake(weights, angles, fps))
+    return len(values), fps

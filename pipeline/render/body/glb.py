@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.body.arkit import ARKIT
 from motionloom.datasets.motion.body.rigid import RigidMotion, on_one_skeleton
+from motionloom.datasets.motion.kinematics import forward_kinematics
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.face import EXPRESSIONS
 from motionloom.pipeline.render.body.mesh import FIRST_OF_HEAD, Body, body_for, colours
@@ -30,6 +32,8 @@ _NEAREST, _CLAMP = 9728, 33071
 _STRIP = 16
 """Columns of the colours' picture: one a swatch."""
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+_LARGEST = 2**28
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
 
 Faces = Literal["expressions", "arkit"]
@@ -275,3 +279,56 @@ def _check(path: Path, clip: GlbClip, shapes: int) -> None:
         raise UserError(
             f"{path}: '{clip.name}' has expression weights {list(clip.expression.shape)}, expected {wanted}"
         )
+
+
+def read_glb(path: Path) -> tuple[NDArray[np.float64], float, str]:
+    """Joints [T, N, 3] in metres, frames a second and the name of a file's first animation.
+
+    `UserError` for a file of other figures than those of `write_glb`, and for a damaged one.
+    """
+    if path.stat().st_size > _LARGEST:
+        raise UserError(f"{path}: {path.stat().st_size:,} bytes; at most {_LARGEST:,} are read")
+    try:
+        from pygltflib import GLTF2
+    except ModuleNotFoundError:
+        raise UserError(f"{path}: GLB files need pygltflib; pip install 'motionloom[glb]'") from None
+    from scipy.spatial.transform import Rotation
+
+    try:
+        gltf = GLTF2().load_binary(str(path))
+        blob = gltf.binary_blob() or b""
+        nodes = [gltf.nodes[node] for node in gltf.skins[0].joints]
+        animation = gltf.animations[0]
+        fps = float(animation.extras["fps"])
+
+        def values(number: int) -> NDArray[np.float64]:
+            accessor = gltf.accessors[number]
+            if accessor.componentType != _FLOAT:
+                raise ValueError("an animation of whole numbers")
+            view = gltf.bufferViews[accessor.bufferView]
+            start, width = (view.byteOffset or 0) + (accessor.byteOffset or 0), _WIDTHS[accessor.type]
+            flat = np.frombuffer(blob, "<f4", accessor.count * width, start)
+            return flat.reshape(-1, width).astype(np.float64)
+
+        tracks = {
+            (channel.target.node, channel.target.path): values(animation.samplers[channel.sampler].output)
+            for channel in animation.channels
+            if channel.target.path != "weights"
+        }
+        names = tuple(node.name for node in nodes)
+        skeleton = next(one for one in map(Skeleton.named, ("smplx52", "smpl22")) if one.joints == names)
+        offsets = np.array([node.translation for node in nodes], dtype=np.float64)
+        frames = max(len(track) for track in tracks.values())
+        turns = np.empty((frames, len(names), 4))
+        for joint in range(len(names)):
+            turns[:, joint] = tracks[joint, "rotation"]
+        rotations = Rotation.from_quat(turns.reshape(-1, 4)).as_matrix().reshape(frames, len(names), 3, 3)
+        root = np.broadcast_to(tracks[0, "translation"], (frames, 3))
+    except Exception as error:  # a file from anywhere breaks this in many ways
+        if isinstance(error, MemoryError):
+            raise
+        raise UserError(
+            f"{path}: not a GLB file that motionloom wrote ({type(error).__name__}); give its BVH or npz"
+        ) from None
+    joints, _ = forward_kinematics(rotations, root, offsets, skeleton.parents)
+    return joints, fps, str(animation.name or "")

@@ -20,7 +20,7 @@ from motionloom.datasets.schema import UserError
 
 Floats = NDArray[np.float64]
 Detail = Literal["near", "far", "shadow"]
-"""How fine the mesh is: for files and figures that are watched, for many or small ones, for shadows."""
+"""Fineness of the mesh: for files and large figures, for many or small ones, for shadows."""
 
 FIRST_OF_HEAD = 3
 """Swatches: right, trunk, left, and from here on those of the head: skin, hair and the face."""
@@ -40,7 +40,7 @@ class Body:
     joints: NDArray[np.int64]
     """Joints that each vertex follows [V, 4], most important first."""
     shares: Floats
-    """How much it follows them [V, 4]; rows sum to 1."""
+    """Skinning weights of these joints [V, 4]; rows sum to 1."""
     swatch: NDArray[np.int64]
     """Row of `colours` [V]."""
     shapes: dict[str, Floats]
@@ -141,7 +141,7 @@ def _on(body: Body, skeleton: Skeleton) -> Body:
 
 
 def stretches(known: Skeleton, skeleton: Skeleton) -> Floats:
-    """What fits the surroundings of each joint of `known` to `skeleton` [N, 3, 3].
+    """Matrices [N, 3, 3] that fit the mesh around each joint of `known` to `skeleton`.
 
     Bones are stretched along themselves; across them counts the figure's size, for fingers their hand's.
     """

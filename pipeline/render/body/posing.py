@@ -1,4 +1,4 @@
-"""How the body stands in each frame: where its joints are, and how each turns and stretches what hangs on it.
+"""The pose of the body in each frame: joint positions, and the rotation and stretch of each bone.
 
 A rigid figure brings its rotations, so page, film and pictures show the same body as its GLB file. Bare
 joints get rotations by the rule that starts a figure's fit (the smallest turn that points each bone the right

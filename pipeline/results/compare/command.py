@@ -16,8 +16,7 @@ from rich.table import Table
 from motionloom.datasets.base.progress import duration
 from motionloom.pipeline.evaluation.figures import heading
 from motionloom.pipeline.launch.console import make_console
-from motionloom.pipeline.render.charts import log_lines
-from motionloom.pipeline.render.labels import curve_label
+from motionloom.pipeline.render.charts import curve_label, log_lines
 from motionloom.pipeline.render.page import Cell, Page, Value
 from motionloom.pipeline.results.compare.runs import (
     ABSENT,
@@ -127,7 +126,7 @@ def comparison_page(
 
 
 def missing_lines(run: ComparedRun) -> list[str]:
-    """What a run does not have yet, a line for each stage."""
+    """Lines on the stages that a run has not finished."""
     return [f"{s.name}: {s.say()}" for s in run.state.unfinished if s.kind not in NO_PAGES]
 
 

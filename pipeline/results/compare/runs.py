@@ -19,7 +19,7 @@ MOST = 8
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """One of them."""
+    """One of the runs that are compared."""
 
     label: str
     colour: int
@@ -91,7 +91,7 @@ ABSENT = "(absent)"
 
 @dataclass(frozen=True)
 class StageDifferences:
-    """What differs of one stage; "" is the recipe itself."""
+    """Settings of one stage that differ between runs; the stage "" is the recipe itself."""
 
     stage: str
     missing: tuple[str, ...]
@@ -106,7 +106,7 @@ def stage_names(runs: Sequence[ComparedRun]) -> list[str]:
 
 
 def setting_differences(runs: Sequence[ComparedRun]) -> list[StageDifferences]:
-    """What differs: of the recipes, then of each stage; stages that are equal in all runs are left out.
+    """Differences of the recipes, then of each stage; stages that are equal in all runs are left out.
 
     A finished stage has the settings that made it, which its recipe may have changed since.
     """

@@ -16,7 +16,7 @@ from motionloom.pipeline.evaluation.figures import (
 from motionloom.pipeline.results.compare.runs import ComparedRun
 
 Row = Mapping[str, Figure]
-"""Figures by name."""
+"""The figures of a row by name."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class RunRow:
 
 @dataclass(frozen=True)
 class ReferenceRow:
-    """What the runs' figures are compared with; never ranked."""
+    """A reference baseline beside the runs; never ranked."""
 
     title: str
     figures: Row
@@ -43,7 +43,7 @@ class ReferenceRow:
 
 @dataclass(frozen=True)
 class ComparedTable:
-    """One table."""
+    """A group of figures of all runs."""
 
     title: str
     stage: str
@@ -52,7 +52,7 @@ class ComparedTable:
     rows: tuple[RunRow, ...]
     references: tuple[ReferenceRow, ...]
     difference: str
-    """How protocols differ, in one sentence; empty where all were measured alike."""
+    """A sentence on how protocols differ; empty where all were measured alike."""
     missing: tuple[str, ...]
     """Runs without these figures."""
 
@@ -102,7 +102,7 @@ def _table(
 
 
 def _best(rows: Mapping[str, Row], protocols: Mapping[str, int]) -> dict[str, dict[str, bool]]:
-    """Of each run the columns in which it is the best of those measured alike, and whether that is sure."""
+    """Run -> columns in which it is the best of those measured alike -> whether that is significant."""
     out: dict[str, dict[str, bool]] = {label: {} for label in rows}
     for name in dict.fromkeys(name for row in rows.values() for name in row):
         for protocol in set(protocols.values()):

@@ -1,4 +1,4 @@
-"""What a run has measured: its finished evaluations, their figures, and which stages each is about."""
+"""The finished evaluations of a run: their figures, and the stages that each is about."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _fix(run: Path, wanted: Iterable[Measure]) -> str:
 
 
 def _staged(run: Path, stage: StageRecord) -> Evaluation:
-    """What an evaluating stage wrote."""
+    """The evaluation that a stage wrote."""
     require_consistent(run, [stage.name])
     file = FigureFile.read(stage.folder / FILE_NAME)
     about = {role: stage.inputs[role] for role in ("tokenizer", "face_tokenizer") if role in stage.inputs}
@@ -68,7 +68,7 @@ def _staged(run: Path, stage: StageRecord) -> Evaluation:
 
 
 def _retrieval(path: Path, run: Path, stages: Mapping[str, StageRecord]) -> Evaluation:
-    """What the command `retrieval` wrote: figures by protocol, `A.t2m/R@1`."""
+    """The evaluation that the command `retrieval` wrote: figures by protocol, `A.t2m/R@1`."""
     file = FigureFile.read(path)
     stage = stages.get(str(file.about.get("stage")))
     if stage is None:

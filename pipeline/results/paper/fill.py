@@ -71,7 +71,7 @@ class _Filling:
         return FilledTable(self.name, self.table, marked, tuple(found), notes)
 
     def _unlike(self) -> list[str]:
-        """How our figures of a column were measured differently from each other."""
+        """Sentences on figures of one column that were measured differently from each other."""
         columns: dict[str, dict[str, Protocol]] = {}
         for (run, name), found in self.shown.items():
             for column, figure in found:
@@ -80,7 +80,7 @@ class _Filling:
         return [sentence.removesuffix(".") for sentence in said if sentence]
 
     def _decimals(self, at: int) -> int:
-        """Of our figures: as many as the paper prints in that column."""
+        """Decimals of our figures: as many as the paper prints in that column."""
         column = self.table.columns[at]
         if not column.printed:
             return 1 if column.unit == "mm" else 3

@@ -21,18 +21,18 @@ _WHO = {"paper": "paper", "ours": "ours", "missing": "ours", "reference": "no mo
 _PAPERS = {"humantomato": "HumanTOMATO", "ude": "UDE"}
 _ARROWS = {"lower": " ↓", "higher": " ↑", None: ""}
 _LONG = 40
-"""What the paper's measuring is called in more letters is not repeated with every difference."""
+"""A longer description of the paper's protocol is not repeated with every difference."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A number."""
+    """A number of the paper or of ours as it is printed."""
 
     text: str
     mean: float
     spread: float | None = None
     alike: str = ""
-    """Of a figure of ours: those whose words here are equal were measured alike."""
+    """Key of the protocol of a figure of ours: figures with equal keys were measured alike."""
     best: bool = False
 
 
@@ -44,11 +44,11 @@ class FilledRow:
     method: str
     """The paper's row that it belongs to; empty of an answer that belongs to all."""
     label: str
-    """What the row is: the paper's method, a run's stage, an answer."""
+    """The paper's method, the stage of a run, or a reference baseline."""
     cells: tuple[Cell | None, ...]
     run: str = ""
     stages: tuple[str, ...] = ()
-    """Of a model: its stage, or one for each setting."""
+    """Stages of a model: one, or one for each setting."""
     evaluations: tuple[str, ...] = ()
 
     def marked(self, best: set[int]) -> FilledRow:

@@ -1,4 +1,4 @@
-"""What is printed below a table: what was measured otherwise than in the paper, what is missing and why."""
+"""Notes below a table: differences from the paper's protocol, and rows that are missing and why."""
 
 from __future__ import annotations
 
@@ -114,9 +114,7 @@ _LENGTHS = {"free": "as the generator ends them", "recorded": "the recorded ones
 def differences(
     evaluation: Evaluation, run: str, table: PaperTable, used: Sequence[tuple[Column, Figure]]
 ) -> list[Difference]:
-    """What was measured otherwise than in the paper, or is not said there: from the protocols of the figures
-    that the table shows.
-    """
+    """Differences of the shown figures from the paper's protocol, and facts that it does not state."""
     paper = table.measured
     out: dict[tuple[str, str], Difference] = {}
 
@@ -152,7 +150,7 @@ def _judge(evaluation: Evaluation, figure: Figure) -> str | None:
 
 
 def _repeats(figure: Figure) -> str | None:
-    """How often motions were drawn, as the papers say it."""
+    """Number of draws of motion, as the papers state it."""
     repeats, decodings = figure.protocol.get("repeats"), decodings_of(figure.protocol)
     if repeats is None or decodings == 1:
         return None if repeats is None else str(repeats)
@@ -160,7 +158,7 @@ def _repeats(figure: Figure) -> str | None:
 
 
 def _sampling(figure: Figure) -> str | None:
-    """How motions were drawn, in one line."""
+    """Settings of sampling, in one line."""
     facts = {
         key.removeprefix("sampling."): v for key, v in figure.protocol.items() if key.startswith("sampling.")
     }

@@ -47,11 +47,11 @@ class Bounds(Config):
 
 
 Condition = Bounds | list[Scalar] | Scalar
-"""Of one value: bounds, any of several values, or the value itself."""
+"""Condition on one value: bounds, any of several values, or the value itself."""
 
 
 class StageMatch(Config):
-    """What a stage must be."""
+    """Conditions that a stage must meet."""
 
     kind: str | list[str]
     """Its kind, or any of several."""
@@ -110,7 +110,7 @@ def _same(one: Scalar, value: object) -> bool:
 
 
 Measure = Literal["evaluate", "evaluate_dances", "retrieval"]
-"""What took a figure: a stage of one of the first two kinds, or the command `retrieval`."""
+"""Source of a figure: a stage of one of the first two kinds, or the command `retrieval`."""
 
 ROLES: dict[str, tuple[Measure, ...]] = {
     "tokenizer": ("evaluate",),
@@ -119,7 +119,7 @@ ROLES: dict[str, tuple[Measure, ...]] = {
     "face_generator": ("evaluate",),
     "alignment": ("retrieval",),
 }
-"""What an evaluation measures, and which kinds of evaluation do."""
+"""Role of a measured model -> kinds of evaluation that measure it."""
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)"
 _PRINTED = re.compile(rf"({_NUMBER})(?: ± ({_NUMBER}))?")
@@ -150,7 +150,7 @@ class Printed(Config):
 
 
 class Column(Config):
-    """One column."""
+    """A column of a paper's table."""
 
     name: str = Field(min_length=1)
     group: str = ""
@@ -165,13 +165,13 @@ class Column(Config):
     scale: float = 1.0
     """The paper's number is our figure times this: 100 where it prints percent."""
     differs: str = ""
-    """How our figure differs in kind from the paper's."""
+    """Difference in definition between our figure and the paper's."""
     candidates: int | None = Field(None, ge=2)
-    """Of how many answers the paper's retrieval chooses; ours is the evaluation's own."""
+    """Candidates of the paper's retrieval; ours are those of the evaluation."""
     data: str = ""
     """The data set, where columns of one table differ in it."""
     where: dict[str, Condition] = Field(default_factory=dict)
-    """What the config of a row's model must be besides, where the columns are settings of it."""
+    """Further conditions on the config of a row's model, where the columns are its settings."""
     setting: dict[str, Scalar] = Field(default_factory=dict)
     """The paper's settings of this column's model; another one of ours is named below the table."""
     printed: bool = True
@@ -237,7 +237,7 @@ class Row(Config):
     why: str = ""
     """Why no model of ours is this row."""
     values: dict[str, str] = Field(default_factory=dict)
-    """What `{...}` in a column's figure stands for in this row."""
+    """Values of this row for `{...}` in a column's figure."""
     note: str = ""
 
     def printed(self) -> tuple[Printed | None, ...]:
@@ -251,18 +251,18 @@ class Row(Config):
 
 
 class Measured(Config):
-    """How the paper's numbers were measured; None where it does not say."""
+    """Protocol of the paper's numbers; None where it does not state one."""
 
     data: str
     split: str | None = "test"
     clips: int | None = None
     evaluator: str | None = None
-    """What embeds motions and captions, in our figures' place."""
+    """The network that embeds motions and captions in the paper."""
     repeats: str | None = None
     sampling: str | None = None
-    """How its motions were drawn."""
+    """The paper's settings of sampling."""
     spread: str | None = None
-    """What its ± is."""
+    """Meaning of the paper's ±."""
     note: str = ""
 
 
@@ -279,7 +279,7 @@ class PaperTable(Config):
     """A table of a paper."""
 
     title: str
-    """What it compares."""
+    """Subject of the comparison."""
     section: str
     """Where the paper speaks of it."""
     measured: Measured

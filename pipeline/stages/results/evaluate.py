@@ -15,7 +15,6 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import FACE_ALIGNMENT, GENERATOR, Every, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, as_rows
-from motionloom.pipeline.evaluation.answers import LOOKUPS, mean_poses
 from motionloom.pipeline.evaluation.cases import Case, extreme_cases, write_cases
 from motionloom.pipeline.evaluation.clip_metrics import (
     CAPTION_METRICS,
@@ -42,6 +41,7 @@ from motionloom.pipeline.evaluation.latent_metrics import (
 )
 from motionloom.pipeline.evaluation.movement import Features, all_features, movement_figures
 from motionloom.pipeline.evaluation.reconstruction import clip_error_figures, face_figures
+from motionloom.pipeline.evaluation.reference_baselines import LOOKUPS, mean_poses
 from motionloom.pipeline.evaluation.truth import Truth, digest_of, reconstruct_truth, spread_any, truth_of
 from motionloom.pipeline.stages.results.evaluate_units import (
     CAPTIONS,

@@ -14,7 +14,6 @@ from motionloom.pipeline.contract.generation import NotedGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, even_slices
-from motionloom.pipeline.evaluation.answers import mean_poses, nearest_dances, random_dances
 from motionloom.pipeline.evaluation.clip_metrics import (
     BEAT_ALIGN,
     DANCE_METRICS,
@@ -53,6 +52,7 @@ from motionloom.pipeline.evaluation.figures import (
     group_figures,
 )
 from motionloom.pipeline.evaluation.movement import all_features, movement_figures
+from motionloom.pipeline.evaluation.reference_baselines import mean_poses, nearest_dances, random_dances
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.stages.results.evaluation import Evaluation, EvaluationStage, bundle_driven_by
 

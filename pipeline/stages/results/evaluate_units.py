@@ -16,11 +16,11 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
-from motionloom.pipeline.evaluation.answers import NearestClip
 from motionloom.pipeline.evaluation.clip_metrics import CAPTION_METRICS, Performance, measure_clip
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.movement import features_of
 from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors, read_basis
+from motionloom.pipeline.evaluation.reference_baselines import NearestClip
 from motionloom.pipeline.evaluation.truth import (
     Truth,
     drawn,

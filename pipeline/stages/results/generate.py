@@ -21,7 +21,7 @@ from motionloom.pipeline.evaluation.truth import has_caption, recorded_seconds, 
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions
 from motionloom.pipeline.inference.writers import Format, default_formats
-from motionloom.pipeline.render.score import Score
+from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
 
 

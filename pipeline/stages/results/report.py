@@ -45,7 +45,7 @@ from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import shown
 from motionloom.pipeline.render.body.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page
-from motionloom.pipeline.render.score import Score
+from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
 from motionloom.pipeline.stages.results.report_parts import (

@@ -13,8 +13,7 @@ from motionloom.datasets.base.progress import duration
 from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import Finished, StageContext, stage_kind
 from motionloom.pipeline.evaluation.cases import Clips
-from motionloom.pipeline.render.charts import log_lines
-from motionloom.pipeline.render.labels import curve_label
+from motionloom.pipeline.render.charts import curve_label, log_lines
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.run_state import RunState

@@ -14,7 +14,7 @@ from motionloom.models.tokenizer.build import build_tokenizer
 from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.stage_module import OptimConfig
-from motionloom.pipeline.evaluation.answers import local_joints
+from motionloom.pipeline.evaluation.reference_baselines import local_joints
 
 LAYOUT = MotionLayout.named("wholebody363")
 RNG = np.random.default_rng(0)

@@ -8,8 +8,8 @@ import pytest
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.evaluation.answers import by_labels, by_words
 from motionloom.pipeline.evaluation.clip_metrics import CAPTION_METRICS, Performance, measure_clip
+from motionloom.pipeline.evaluation.reference_baselines import by_nearest_caption, by_nearest_labels
 from motionloom.pipeline.evaluation.truth import has_caption, truth_of
 
 
@@ -29,7 +29,7 @@ def test_a_lookup_finds_training_motion_of_the_action(splits: tuple[ShardDataset
     truths = [truth_of(test, index) for index in range(len(test))]
     held_out = [t.truth["side"] == "left" and t.truth["action"] == "kick" for t in truths if t.truth]
     assert any(held_out) and not all(held_out)
-    for lookup in (by_words, by_labels):
+    for lookup in (by_nearest_caption, by_nearest_labels):
         found = lookup(train, truths)
         assert len(found) == len(truths) and {one.id for one in found} <= set(train.ids)
         for one, t in zip(found, truths, strict=True):
@@ -48,12 +48,12 @@ def test_what_was_trained_on_is_found_itself(splits: tuple[ShardDataset, ShardDa
     train, _ = splits
     truths = [truth_of(train, index) for index in range(len(train))]
     assert has_caption(train).all()
-    for one, t in zip(by_words(train, truths), truths, strict=True):
+    for one, t in zip(by_nearest_caption(train, truths), truths, strict=True):
         assert t.caption in [caption.text for caption in train.texts(train.ids.index(one.id))]
-    for one, t in zip(by_labels(train, truths), truths, strict=True):
+    for one, t in zip(by_nearest_labels(train, truths), truths, strict=True):
         assert one.truth == t.truth
 
 
 def test_data_without_truth_have_no_labels(splits: tuple[ShardDataset, ShardDataset]) -> None:
     train, test = splits
-    assert by_labels(train, [replace(truth_of(test, 0), truth=None)]) == []
+    assert by_nearest_labels(train, [replace(truth_of(test, 0), truth=None)]) == []

@@ -27,13 +27,13 @@ from motionloom.pipeline.render.body.face import (
     CONTROLS,
     EXPRESSIONS,
     control_weights,
+    convert_face,
     expression_weights,
     own_bases,
     recorded_expression,
     synthetic_arkit,
     synthetic_face_controls,
 )
-from motionloom.pipeline.render.body.face_take import convert_face
 from motionloom.pipeline.render.body.mesh import Body, Detail, asset, body_for, colours, neutral_body
 from motionloom.pipeline.render.body.posing import human_skeleton, posing_of, single_bones
 from motionloom.pipeline.render.scene import Actor

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from motionloom.pipeline.render.charts import Line, histogram, line_chart
-from motionloom.pipeline.render.labels import curve_label
+from motionloom.pipeline.render.charts import Line, curve_label, histogram, line_chart
 from motionloom.pipeline.render.page import Cell, Page
 
 NASTY = '<b onclick="x">&'

@@ -25,8 +25,7 @@ from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import score_of, write_motions
 from motionloom.pipeline.render.film import write_mp4
 from motionloom.pipeline.render.page import Page
-from motionloom.pipeline.render.score import Score, Segment, score_data
-from motionloom.pipeline.render.sound import RATE, embed_sounds, playable
+from motionloom.pipeline.render.sound import RATE, Score, Segment, embed_sounds, playable, score_data
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
 SMPLX = Skeleton.named("smplx52")

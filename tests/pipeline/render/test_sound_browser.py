@@ -11,7 +11,7 @@ import pytest
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.page import Page
-from motionloom.pipeline.render.score import Segment
+from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
 PARENTS = Skeleton.named("smplx52").parents

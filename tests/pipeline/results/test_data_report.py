@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.progress import Progress
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Dropped
@@ -21,7 +20,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
-from motionloom.pipeline.results.data_page import measure, to_watch, write_data_report
+from motionloom.pipeline.results.data_page import to_watch, write_data_report
 
 NASTY = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=1'><b>bold</b> & \"q\""
 CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=5.0)
@@ -67,7 +66,7 @@ def nasty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def page(nasty: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("page") / "deep" / "report.html"
-    write_data_report(nasty, path, check=True)
+    write_data_report(nasty, path)
     return path
 
 
@@ -100,26 +99,14 @@ def test_it_says_what_is_in_the_set(page: Path, nasty: Path) -> None:
         "a note",
         "deep.er",
         "30720",
-        "No errors",
-        "40 warnings",
-        "root yaw velocity",
     ):
         assert word in whole, word
-    assert whole.count("<h1>") == 1 and whole.count("<h2") == 7
+    assert whole.count("<h1>") == 1 and whole.count("<h2") == 5
     assert re.search(r"<dt>captions</dt><dd>180</dd>", whole), "40 clips of 4, and every other one more"
 
 
-def test_statistics_are_of_the_training_split(nasty: Path) -> None:
-    train = ShardDataset.open(nasty, "train")
-    found = measure(train, Progress(disable=True))
-    motion = np.concatenate([train.motion(k) for k in range(len(train))]).astype(np.float64)
-    np.testing.assert_allclose(found.moments.mean, motion.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(found.moments.std, motion.std(axis=0), atol=1e-6)
-    np.testing.assert_array_equal(found.low, motion.min(axis=0))
-
-
 def test_the_same_data_give_the_same_page(page: Path, nasty: Path, tmp_path: Path) -> None:
-    write_data_report(nasty, tmp_path / "again.html", check=True)
+    write_data_report(nasty, tmp_path / "again.html")
     assert (tmp_path / "again.html").read_bytes() == page.read_bytes()
 
 

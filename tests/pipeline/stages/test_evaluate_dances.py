@@ -20,7 +20,6 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.dances import DanceConditions, DanceConfig, beats_of
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, synthesize
 from motionloom.models.metrics.dance import dance_fid
-from motionloom.pipeline.evaluation.answers import mean_poses, nearest_dances, random_dances
 from motionloom.pipeline.evaluation.clip_metrics import DANCE_METRICS, Performance, measure_clip
 from motionloom.pipeline.evaluation.dances import (
     DanceClip,
@@ -42,6 +41,7 @@ from motionloom.pipeline.evaluation.figures import (
     FigureFile,
 )
 from motionloom.pipeline.evaluation.movement import all_features, distances, movement_figures, multimodality
+from motionloom.pipeline.evaluation.reference_baselines import mean_poses, nearest_dances, random_dances
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.ude import UdeGenerator
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe

@@ -1,8 +1,8 @@
-"""Answers that need no model, to stand beside a model's: motions of the training set, and the mean pose.
+"""Reference baselines that need no model: motions retrieved from the training set, and the mean pose.
 
-What a model would answer that only remembers is the training clip that comes nearest to a motion, the
-training dance to the nearest music, or the training motion of the nearest caption. A text-to-motion model has
-learnt more than its training clips only where it does better than these.
+A model that only memorises answers with the training clip nearest to a motion, the training dance to the
+nearest music, or the training motion of the nearest caption. One has learnt more than its training clips only
+where it does better than these.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from motionloom.pipeline.evaluation.truth import Truth, has_caption, truth_in, t
 Joints = NDArray[np.float64]
 
 KEY_FRAMES = 16
-"""Moments of a clip that the search compares."""
+"""Frames of each clip that are compared **[ours]**."""
 
 
 def local_joints(features: NDArray[np.float32], layout: MotionLayout) -> NDArray[np.float64]:
-    """Joints [T, N, 3] relative to the root, turned into its heading: the pose without its path.
+    """Joints [T, N, 3] relative to the root and in its heading: the pose without its path.
 
-    Layouts that hold such positions are read as they are, so that errors of the path play no part.
+    Layouts that store such positions are read as they are, so that errors of the path play no part.
     """
     if not layout.has("positions"):
         return local_joints_of(joints_of(features, layout), layout.fps)
@@ -43,9 +43,10 @@ def local_joints(features: NDArray[np.float32], layout: MotionLayout) -> NDArray
 
 
 class NearestClip:
-    """The training clip whose poses, stretched to the same length, come nearest.
+    """Finds the training clip whose poses, stretched to the same length, are nearest to a motion's.
 
-    Hands are compared where both clips have them. A motion with hands finds none without, if there are any.
+    Hands are compared where both clips have them; for a motion with hands only clips with hands are
+    candidates, where the training set has any.
     """
 
     def __init__(self, train: ClipDataset) -> None:
@@ -68,11 +69,12 @@ class NearestClip:
     def motion(
         self, features: NDArray[np.float32], present: int = PRESENT_ALL
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(pose, joints) of that clip, [T, N, 3] each, stretched to the T frames of `features`.
+        """Return (pose, joints) of that clip, [T, N, 3] each, stretched to the T frames of `features`.
 
         Features are stretched and their velocities scaled with time; where the layout has none, the joints
         are stretched, since angles cannot be averaged. `present` says what `features` hold.
         """
+        # Squared distances up to the constant |key|^2, which the order does not depend on.
         body, hands = (
             norms - 2 * keys @ key
             for norms, keys, key in zip(self.norms, self.keys, self._key(features), strict=True)
@@ -80,15 +82,16 @@ class NearestClip:
         distance = body
         if present & HANDS and self.with_hands.any():
             distance = np.where(self.with_hands, body + hands, np.inf)
-        found = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
+        clip = np.asarray(self.train.motion(int(distance.argmin())))[:, self.columns]
         layout = self.train.layout
         if not layout.has("positions"):
-            joints = joints_of(found, layout)
+            joints = joints_of(clip, layout)
             path = stretch(joints.reshape(len(joints), -1), len(features)).reshape(-1, *joints.shape[1:])
             return local_joints_of(path, layout.fps), path
-        out = stretch(found, len(features))
+        out = stretch(clip, len(features))
+        # A clip that is played faster moves faster: its velocities grow as its time shrinks.
         for field in ("root_yaw_velocity", "root_xz_velocity", "velocities"):
-            out[:, layout.slice(field)] *= len(found) / len(features)
+            out[:, layout.slice(field)] *= len(clip) / len(features)
         near = out.astype(np.float32)
         return local_joints(near, layout), joints_of(near, layout)
 
@@ -104,7 +107,7 @@ def stretch(values: NDArray[np.floating], frames: int) -> NDArray[np.float64]:
 
 
 def mean_poses(pool: Sequence[Joints], fps: float, lengths: Iterable[int]) -> list[Joints]:
-    """The mean pose of training motions [T, N, 3], standing still for so many frames each."""
+    """The mean pose of training motions [T, N, 3], held for each of the `lengths` in frames."""
     poses, heights = [], []
     for joints in pool:
         poses.append(local_joints_of(joints, fps).mean(0))
@@ -117,7 +120,7 @@ def mean_poses(pool: Sequence[Joints], fps: float, lengths: Iterable[int]) -> li
 def random_dances(
     pool: Sequence[DanceClip], clips: Sequence[DanceClip], rng: np.random.Generator
 ) -> list[Joints]:
-    """For each clip a stretch of a training dance drawn at random, as long as the clip where one is."""
+    """For each clip a random stretch of a random training dance, as long as the clip where one is."""
     out = []
     for clip in clips:
         frames = len(clip.joints)
@@ -131,17 +134,17 @@ def random_dances(
 def nearest_dances(
     train: ClipDataset, pool: Sequence[DanceClip], dataset: ClipDataset, clips: Sequence[DanceClip]
 ) -> list[Joints] | None:
-    """For each clip the training dance to the most similar music, cut to its length.
+    """For each clip the training dance to the most similar music, cut to the clip's length.
 
-    Similar: the mean over time of the stored audio features, each in units of its deviation among the
-    training dances **[ours]**. Of equally long dances only where there are some. None where the data store
-    no audio features.
+    Music is compared by the mean over time of the stored audio features, each in units of its standard
+    deviation among the training dances **[ours]**. Dances shorter than the clip are candidates only where
+    there is none as long. None where the data store no audio features.
     """
     known, wanted = _music_means(train, pool), _music_means(dataset, clips)
     if known is None or wanted is None:
         return None
     spread = known.std(0)
-    spread = np.where(spread > 1e-8, spread, np.inf)
+    spread = np.where(spread > 1e-8, spread, np.inf)  # a constant feature tells no two songs apart
     lengths = np.array([len(other.joints) for other in pool])
     out = []
     for clip, music in zip(clips, wanted, strict=True):
@@ -163,14 +166,14 @@ def _music_means(dataset: ClipDataset, clips: Sequence[DanceClip]) -> NDArray[np
     return np.stack(rows)
 
 
-_ENCODER, _AT_ONCE = "minilm", 256
+_ENCODER, _BATCH = "minilm", 256
 _MIN_FRAMES = 16
-"""Of a stretch that a caption is about, as `truth_of` has it."""
+"""Shortest stretch that a caption is about, as in `truth_of`."""
 
 
-def by_words(train: ClipDataset, truths: Sequence[Truth]) -> list[Truth]:
-    """For each clip the training motion of the caption whose sentence embedding (MiniLM) is nearest, by
-    cosine; of equal captions the first. None without captions.
+def by_nearest_caption(train: ClipDataset, truths: Sequence[Truth]) -> list[Truth]:
+    """For each clip the training motion whose caption has the nearest sentence embedding (MiniLM, cosine); of
+    equal captions the first. An empty list where the training clips have no captions.
     """
     spans = [
         (index, span)
@@ -189,34 +192,34 @@ def nearest_texts(known: Sequence[str], wanted: Sequence[str]) -> list[int]:
     """For each wanted text the number of the known one with the nearest sentence embedding, by cosine."""
     words = sorted({*known, *wanted})
     encoder = load_text_encoder(_ENCODER)
-    parts = [encoder.encode(words[at : at + _AT_ONCE]).sentence for at in range(0, len(words), _AT_ONCE)]
+    parts = [encoder.encode(words[at : at + _BATCH]).sentence for at in range(0, len(words), _BATCH)]
     sentence = dict(zip(words, np.concatenate(parts), strict=True))
     rows = np.stack([sentence[text] for text in known])
     return [int((rows @ sentence[text]).argmax()) for text in wanted]
 
 
-def by_labels(train: ClipDataset, truths: Sequence[Truth]) -> list[Truth]:
+def by_nearest_labels(train: ClipDataset, truths: Sequence[Truth]) -> list[Truth]:
     """For each clip the captioned training clip that agrees with its truth in most attributes, the first of
-    several; none unless all clips know what they do.
+    several. An empty list unless every clip carries its truth.
     """
     usable = np.flatnonzero(has_caption(train)).tolist()
     records = [train.meta(index).truth for index in usable]
     if not usable or not all(records) or not all(t.truth for t in truths):
         return []
-    nearest = most_alike([record or {} for record in records], [t.truth or {} for t in truths])
+    nearest = most_similar([record or {} for record in records], [t.truth or {} for t in truths])
     return [truth_of(train, usable[index]) for index in nearest]
 
 
-def most_alike(known: Sequence[Mapping[str, object]], wanted: Sequence[Mapping[str, object]]) -> list[int]:
+def most_similar(known: Sequence[Mapping[str, object]], wanted: Sequence[Mapping[str, object]]) -> list[int]:
     """For each wanted truth the number of the first known one that agrees in most of its attributes."""
     names = sorted({name for one in wanted for name in one})
     columns = {name: np.array([str(record.get(name)) for record in known]) for name in names}
     out = []
     for one in wanted:
-        given = [(name, str(value)) for name, value in one.items() if value is not None]
-        out.append(int(np.sum([columns[name] == value for name, value in given], axis=0).argmax()))
+        attributes = [(name, str(value)) for name, value in one.items() if value is not None]
+        out.append(int(np.sum([columns[name] == value for name, value in attributes], axis=0).argmax()))
     return out
 
 
-LOOKUPS = {NEAREST_WORDS: by_words, NEAREST_LABELS: by_labels}
-"""Row -> how its motions are found; nothing where it cannot."""
+LOOKUPS = {NEAREST_WORDS: by_nearest_caption, NEAREST_LABELS: by_nearest_labels}
+"""Row of a table -> the function that retrieves its motions; an empty list where it cannot."""
