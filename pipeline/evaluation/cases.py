@@ -69,11 +69,11 @@ class Case:
 
 
 def extreme_cases(
-    of: str, truths: Sequence[Truth], errors: Sequence[float], made: Callable[[int], NDArray[Any]]
+    of: str, truths: Sequence[Truth], errors: Sequence[float], motion_of: Callable[[int], NDArray[Any]]
 ) -> list[Case]:
     """The clips with the largest and the smallest errors; `made` gives joints [T, N, 3] by number."""
     return [
-        Case(of, place, truths[k].id, truths[k].caption, errors[k], truths[k].joints, made(k))
+        Case(of, place, truths[k].id, truths[k].caption, errors[k], truths[k].joints, motion_of(k))
         for place, k in extremes(errors)
     ]
 
@@ -81,6 +81,7 @@ def extreme_cases(
 def extremes(errors: Sequence[float]) -> list[tuple[str, int]]:
     """(place, number) of the worst and the best, each number once; the worst first."""
     order = np.argsort(-np.asarray(errors), kind="stable").tolist()
+    # Of few clips half are the worst and half the best.
     each = min(EACH, len(order) // 2 or len(order))
     worst = [(f"worst {k + 1}", number) for k, number in enumerate(order[:each])]
     best = [(f"best {k + 1}", number) for k, number in enumerate(reversed(order[-each:]))]
@@ -97,17 +98,17 @@ def write_cases(folder: Path, cases: Sequence[Case], layout: MotionLayout) -> di
     if not arrays:
         return {}
     save_file(arrays, folder / FILE_NAME)
-    said = [
+    described = [
         {"of": one.of, "place": one.place, "id": one.id, "caption": one.caption, "error": round(one.error, 3)}
         for one in cases
     ]
-    return {"fps": layout.fps, "skeleton": layout.skeleton.name, "cases": said}
+    return {"fps": layout.fps, "skeleton": layout.skeleton.name, "cases": described}
 
 
-def read_cases(folder: Path, found: Sequence[Mapping[str, Any]]) -> list[Case]:
+def read_cases(folder: Path, described: Sequence[Mapping[str, Any]]) -> list[Case]:
     """The cases that an evaluation kept, by `cases` of its `metrics.json`; none where the file is missing."""
     path = folder / FILE_NAME
-    if not found or not path.is_file():
+    if not described or not path.is_file():
         return []
     try:
         arrays = load_file(path)
@@ -121,7 +122,7 @@ def read_cases(folder: Path, found: Sequence[Mapping[str, Any]]) -> list[Case]:
                 recorded=arrays[f"{number}.recorded"],
                 made=arrays[f"{number}.made"],
             )
-            for number, case in enumerate(found)
+            for number, case in enumerate(described)
         ]
     except (SafetensorError, KeyError, OSError) as error:
         raise UserError(f"{path}: does not fit metrics.json beside it ({error}); evaluate again") from None

@@ -67,9 +67,9 @@ def agreement(performance: Performance) -> Row:
     """
     if performance.truth is None or "action" not in performance.truth:
         return {}
-    found = agrees(performance.truth, performance.joints, performance.face, performance.fps)
-    found["everything"] = all(found.values())
-    return {f"agreement.{name}": float(value) for name, value in found.items()}
+    agreeing = agrees(performance.truth, performance.joints, performance.face, performance.fps)
+    agreeing["everything"] = all(agreeing.values())
+    return {f"agreement.{name}": float(value) for name, value in agreeing.items()}
 
 
 def position(performance: Performance) -> Row:
@@ -78,11 +78,11 @@ def position(performance: Performance) -> Row:
     if frames < 2:
         return {}
     pair = (performance.joints, performance.recorded)
-    made, real = (torch.from_numpy(np.ascontiguousarray(x[:frames, :BODY_JOINTS])) for x in pair)
-    found, out = position_errors(made, real), Row()
+    generated, real = (torch.from_numpy(np.ascontiguousarray(x[:frames, :BODY_JOINTS])) for x in pair)
+    errors, out = position_errors(generated, real), Row()
     for kind in KINDS:
-        out |= weighted(f"position.ape_{kind}", found.ape[kind] * frames, frames)
-        out[f"position.ave_{kind}"] = found.ave[kind]
+        out |= weighted(f"position.ape_{kind}", errors.ape[kind] * frames, frames)
+        out[f"position.ave_{kind}"] = errors.ave[kind]
     return out
 
 
@@ -90,8 +90,8 @@ def floor_and_jerk(performance: Performance) -> Row:
     """Skating, floating, penetration and jitter; nothing of a motion too short for them."""
     if len(performance.joints) < SHORTEST:
         return {}
-    found = physics(performance.joints, performance.fps)._asdict()
-    return {f"physics.{name}": value for name, value in found.items()}
+    values = physics(performance.joints, performance.fps)._asdict()
+    return {f"physics.{name}": value for name, value in values.items()}
 
 
 def beat_alignment(performance: Performance) -> Row:
@@ -114,11 +114,11 @@ def recognition(performance: Performance) -> Row:
     truth = performance.truth or {}
     if not truth.get("genre") or performance.frames < MIN_FRAMES:
         return {}
-    found = measure_dance(performance.joints[: performance.frames], performance.fps)
-    off = abs(found.bpm / float(truth["bpm"]) - 1)
+    dance = measure_dance(performance.joints[: performance.frames], performance.fps)
+    off = abs(dance.bpm / float(truth["bpm"]) - 1)
     return {
-        "recognition.genre": float(found.genre == truth["genre"]),
-        "recognition.style": float(found.style == truth["style"]),
+        "recognition.genre": float(dance.genre == truth["genre"]),
+        "recognition.style": float(dance.style == truth["style"]),
         "recognition.tempo": float(off <= 0.05),
         "recognition.tempo_error": off,
     }
@@ -219,9 +219,9 @@ def clip_figures(
     metrics: Sequence[ClipMetric], rows: Mapping[str, Sequence[Sequence[Row]]], protocol: Protocol
 ) -> list[Figure]:
     """Figures of what was measured clip by clip: row -> repeats -> clips (`measure_clip`)."""
-    found: dict[str, dict[str, Estimate]] = {row: row_estimates(repeats) for row, repeats in rows.items()}
+    estimates: dict[str, dict[str, Estimate]] = {row: row_estimates(repeats) for row, repeats in rows.items()}
     return [
         figure
         for metric in metrics
-        for figure in group_figures(metric.group, metric.columns, found, protocol)
+        for figure in group_figures(metric.group, metric.columns, estimates, protocol)
     ]

@@ -130,6 +130,7 @@ def dances_of(
 
     The same data give the same clips.
     """
+    # A permutation of a fixed seed spreads the choice over the data set, whatever its order.
     order = np.random.default_rng(0).permutation(np.flatnonzero(with_music(dataset)))
     seen: set[str] = set()
     first: list[int] = []
@@ -138,8 +139,8 @@ def dances_of(
         song = song_of(dataset, index)
         (rest if song in seen else first).append(index)
         seen.add(song)
-    found = (dance_at(dataset, i, unit=unit, seconds=seconds) for i in sorted((first + rest)[:count]))
-    return [clip for clip in found if clip is not None]
+    clips = (dance_at(dataset, i, unit=unit, seconds=seconds) for i in sorted((first + rest)[:count]))
+    return [clip for clip in clips if clip is not None]
 
 
 def song_of(dataset: ClipDataset, index: int) -> str:
@@ -163,8 +164,8 @@ def dances_for(
     """
     longest, frames = min(seconds or np.inf, bundle.max_seconds), least + seed_frames(bundle)
     cut = None if np.isinf(longest) else float(longest)
-    found = dances_of(dataset, count, unit=unit or bundle.generator.unit_frames, seconds=cut)
-    return [clip for clip in found if len(clip.joints) >= frames]
+    clips = dances_of(dataset, count, unit=unit or bundle.generator.unit_frames, seconds=cut)
+    return [clip for clip in clips if len(clip.joints) >= frames]
 
 
 def seed_frames(bundle: Bundle) -> int:
@@ -198,12 +199,12 @@ def require_dances(dataset: ClipDataset) -> None:
 
 def digest_of_dances(clips: Sequence[DanceClip]) -> str:
     """Tells these dances from others, whatever their data set is called: sha256 of motions and beats."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for clip in clips:
-        found.update(f"{clip.joints.shape} {clip.fps}".encode())
-        found.update(np.ascontiguousarray(clip.joints, "<f4").tobytes())
-        found.update(np.ascontiguousarray(clip.beats, "<f8").tobytes())
-    return found.hexdigest()
+        digest.update(f"{clip.joints.shape} {clip.fps}".encode())
+        digest.update(np.ascontiguousarray(clip.joints, "<f4").tobytes())
+        digest.update(np.ascontiguousarray(clip.beats, "<f8").tobytes())
+    return digest.hexdigest()
 
 
 def commonest(clips: Sequence[DanceClip]) -> dict[str, float]:

@@ -140,20 +140,20 @@ def group_figures(
     return [
         Figure(
             metric.name,
-            found[metric.name].value,
-            found[metric.name].interval,
+            estimates[metric.name].value,
+            estimates[metric.name].interval,
             metric.unit,
             metric.better,
             row,
             protocol,
             group,
             metric.title,
-            found[metric.name].over,
+            estimates[metric.name].over,
             (notes or {}).get(metric.name, ""),
         )
-        for row, found in rows.items()
+        for row, estimates in rows.items()
         for metric in metrics
-        if metric.name in found and math.isfinite(found[metric.name].value)
+        if metric.name in estimates and math.isfinite(estimates[metric.name].value)
     ]
 
 
@@ -210,13 +210,13 @@ class FigureFile:
         try:
             protocols = data["protocol"]
             figures = tuple(Figure(**one, protocol=protocols[one["group"]]) for one in data["figures"])
-            found = cls(str(data["kind"]), figures, dict(data["about"]), dict(data.get("details", {})))
+            file = cls(str(data["kind"]), figures, dict(data["about"]), dict(data.get("details", {})))
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path}: not as an evaluation writes it ({error}); evaluate again") from None
         for one in figures:
             if not _is_number(one.value) or not (one.interval is None or _is_number(one.interval)):
                 raise UserError(f"{path}: figure '{one.name}' is no number; evaluate again")
-        return found
+        return file
 
 
 def _entry(figure: Figure) -> dict[str, object]:
@@ -267,14 +267,17 @@ def columns_of(figures: Iterable[Figure]) -> dict[str, Figure]:
 
 def figure_tables(figures: Iterable[Figure]) -> list[TableRows]:
     """A table for each group of figures; the terminal and the report show the same ones."""
-    return [_table(group, found) for group, found in of_group(figures).items()]
+    return [_table(group, members) for group, members in of_group(figures).items()]
 
 
 def _table(group: str, figures: Sequence[Figure]) -> TableRows:
     columns = columns_of(figures)
     rows = [
-        [row if row != MODEL else "model", *(found[name].text() if name in found else "" for name in columns)]
-        for row, found in rows_of(figures).items()
+        [
+            row if row != MODEL else "model",
+            *(row_figures[name].text() if name in row_figures else "" for name in columns),
+        ]
+        for row, row_figures in rows_of(figures).items()
     ]
     titles = [heading(one) for one in columns.values()]
     return "; ".join([group, *remarks(figures)]), ["", *titles], rows
@@ -319,8 +322,8 @@ def remarks(figures: Sequence[Figure]) -> list[str]:
     out += [f"among {protocol['candidates']}"] if "candidates" in protocol else []
     overs = list(dict.fromkeys(one.over for one in figures if one.over))
     out += [f"± 95 % over {' or '.join(overs)}"] if overs else []
-    doubts: dict[str, dict[str, None]] = {}
+    notes: dict[str, dict[str, None]] = {}
     for one in figures:
         if one.note:
-            doubts.setdefault(one.note, {})[one.title] = None
-    return out + [f"{' and '.join(titles)}: {note}" for note, titles in doubts.items()]
+            notes.setdefault(one.note, {})[one.title] = None
+    return out + [f"{' and '.join(titles)}: {note}" for note, titles in notes.items()]

@@ -31,11 +31,11 @@ class Judge:
         return Judge(tma, lambda truths: tma.embed_captions([t.caption for t in truths], tma.given["text"]))
 
     @staticmethod
-    def evaluator(found: LoadedEvaluator) -> Judge:
+    def evaluator(loaded: LoadedEvaluator) -> Judge:
         """An evaluator reads captions, or their tags, as it was trained to, and refuses others."""
         return Judge(
-            found,
-            lambda truths: found.embed_captions([t.caption for t in truths], [t.tokens for t in truths]),
+            loaded,
+            lambda truths: loaded.embed_captions([t.caption for t in truths], [t.tokens for t in truths]),
         )
 
     @staticmethod
@@ -59,7 +59,7 @@ class Judge:
     def latents(
         self,
         truths: Sequence[Truth],
-        made: Sequence[Tensor],
+        generated: Sequence[Tensor],
         others: Sequence[Truth],
         nearest: Mapping[str, Sequence[Truth]],
     ) -> Latents:
@@ -76,8 +76,8 @@ class Judge:
         return Latents(
             text=self.texts(truths),
             real=self.recorded(truths),
-            made=made,
+            made=generated,
             others=self.recorded(others),
             still=embed_motions(judge, [np.tile(mean, (len(t.features), 1)) for t in truths]),
-            nearest={row: self.recorded(found) for row, found in nearest.items()},
+            nearest={row: self.recorded(clips) for row, clips in nearest.items()},
         )

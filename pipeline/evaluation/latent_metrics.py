@@ -94,8 +94,8 @@ class LatentMetric:
 
 def recalls(row: LatentRow) -> Values:
     """TMA-R-Precision both ways, by cosine (protocols C and D)."""
-    found = recall(row.text, row.motion, batch=row.size, recalls=(1, 2, 3), seed=row.seed * 1000)
-    return {name.replace("/R@", "_r"): value for name, value in found.items() if "/R@" in name}
+    values = recall(row.text, row.motion, batch=row.size, recalls=(1, 2, 3), seed=row.seed * 1000)
+    return {name.replace("/R@", "_r"): value for name, value in values.items() if "/R@" in name}
 
 
 def caption_distance(row: LatentRow) -> Values:
@@ -288,7 +288,7 @@ def reconstructed_figures(
     role: str,
     whose: str,
     real: Tensor,
-    made: Tensor,
+    rebuilt: Tensor,
     others: Tensor,
     text: Tensor | None,
     protocol: Protocol,
@@ -312,11 +312,13 @@ def reconstructed_figures(
         seed: Of the draws.
     """
     prefix, facts = f"reconstruction.{role}", {**protocol, "training_clips": len(others)}
-    base = LatentRow(real if text is None else text, real, made, seed, min(size, len(real)))
-    rows = _measured(prefix, SPREAD_METRICS, base, {MODEL: [made], TRAINING: [others]})
+    base = LatentRow(real if text is None else text, real, rebuilt, seed, min(size, len(real)))
+    rows = _measured(prefix, SPREAD_METRICS, base, {MODEL: [rebuilt], TRAINING: [others]})
     if text is not None:
         facts["candidates"] = base.size
-        motions = {row: [motion] * max(repeats, DRAWS) for row, motion in ((MODEL, made), (RECORDED, real))}
+        motions = {
+            row: [motion] * max(repeats, DRAWS) for row, motion in ((MODEL, rebuilt), (RECORDED, real))
+        }
         for row, estimates in _measured(prefix, EVALUATOR_METRICS, base, motions).items():
             rows[row] = rows.get(row, {}) | estimates
         rows[CHANCE] = _named(prefix, _chance(base.size))
@@ -356,8 +358,8 @@ def _columns(role: str, metrics: Sequence[LatentMetric]) -> list[Metric]:
     ]
 
 
-def _named(role: str, found: dict[str, Estimate]) -> dict[str, Estimate]:
-    return {f"{role}.{name}": value for name, value in found.items()}
+def _named(role: str, estimates: dict[str, Estimate]) -> dict[str, Estimate]:
+    return {f"{role}.{name}": value for name, value in estimates.items()}
 
 
 def caption_distances(text: Tensor, motion: Tensor) -> Tensor:

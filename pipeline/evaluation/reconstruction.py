@@ -145,10 +145,10 @@ def reconstruction_errors(
     return {name: one.value for name, one in row_estimates([rows]).items()}
 
 
-def published_errors(made: Tensor, real: Tensor) -> dict[str, JointErrors]:
+def published_errors(motion: Tensor, real: Tensor) -> dict[str, JointErrors]:
     """Sums over the frames of positions [T, N, 3]: "" of all joints, "_body", and "_hand" if any."""
     length = torch.tensor([len(real)])
-    pair = (made[None], real[None], length)
+    pair = (motion[None], real[None], length)
     out = {"": joint_errors(*pair), "_body": joint_errors(*pair, joints=torch.arange(BODY_JOINTS))}
     if real.shape[1] > BODY_JOINTS:
         left, right = (
@@ -206,10 +206,10 @@ def face_errors(tokenizer: TrainedTokenizer, truth: Truth, basis: NDArray[np.flo
     if real is None:
         return {}
     columns = tokenizer.layout.slice("face")
-    made, mean = reconstruct_all(tokenizer, truth)[:, columns], tokenizer.stats.mean[columns]
+    rebuilt, mean = reconstruct_all(tokenizer, truth)[:, columns], tokenizer.stats.mean[columns]
 
     out, frames = Row(), float(len(real))
-    for suffix, expression in (("", made), ("_mean", mean)):
+    for suffix, expression in (("", rebuilt), ("_mean", mean)):
         error = (expression - real).astype(np.float64)
         out |= weighted(f"expression{suffix}", float(np.linalg.norm(error, axis=-1).sum()), frames)
         if basis is not None:

@@ -140,15 +140,15 @@ def nearest_dances(
     deviation among the training dances **[ours]**. Dances shorter than the clip are candidates only where
     there is none as long. None where the data store no audio features.
     """
-    known, wanted = _music_means(train, pool), _music_means(dataset, clips)
-    if known is None or wanted is None:
+    pool_music, wanted = _music_means(train, pool), _music_means(dataset, clips)
+    if pool_music is None or wanted is None:
         return None
-    spread = known.std(0)
+    spread = pool_music.std(0)
     spread = np.where(spread > 1e-8, spread, np.inf)  # a constant feature tells no two songs apart
     lengths = np.array([len(other.joints) for other in pool])
     out = []
     for clip, music in zip(clips, wanted, strict=True):
-        away = (((known - music) / spread) ** 2).sum(1)
+        away = (((pool_music - music) / spread) ** 2).sum(1)
         if (lengths >= len(clip.joints)).any():
             away[lengths < len(clip.joints)] = np.inf
         out.append(pool[int(away.argmin())].joints[: len(clip.joints)])

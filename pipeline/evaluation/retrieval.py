@@ -49,11 +49,11 @@ def retrieve(
     evaluator's latents are compared by Euclidean distance, as its training and its figures have it; those
     of TMA and TEMOS by cosine.
     """
-    found = alignment_stage(run, stage)
+    source = alignment_stage(run, stage)
     stage_cache = StageCache(choose_device(device))
-    model, inputs = stage_cache.get(found), _sources(run, found)
+    model, inputs = stage_cache.get(source), _sources(run, source)
     data = stage_cache.get(inputs["data"])
-    judge, distance = _judge(model, found, data)
+    judge, distance = _judge(model, source, data)
     dataset = data.split(split) if split else data.held_out(prefer="test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
     truths = [t for t in truths if t.caption and len(t.features) >= 4]
@@ -73,10 +73,10 @@ def retrieve(
         found_in = recall(text, motion, batch=size, seed=seed, distance=distance)
         found_by[name] = f"batches of {size}", found_in
     facts = {
-        "stage": found.name,
-        "kind": found.kind.name,
-        "fingerprint": fingerprint_now(found.folder),
-        "sha256": sha256_of(found.folder / MODEL_FILES[0]),
+        "stage": source.name,
+        "kind": source.kind.name,
+        "fingerprint": fingerprint_now(source.folder),
+        "sha256": sha256_of(source.folder / MODEL_FILES[0]),
         "distance": distance,
         "split": dataset.split,
         "clips": len(truths),
@@ -90,11 +90,11 @@ def retrieve(
     return FigureFile("retrieval", tuple(figures), facts)
 
 
-def _judge(model: Any, found: Finished, data: Any) -> tuple[Judge, Distance]:
+def _judge(model: Any, stage: Finished, data: Any) -> tuple[Judge, Distance]:
     """A loaded stage as a judge, and how its latents are compared."""
     if not isinstance(model, LoadedEvaluator):
         return Judge.tma(model), "cosine"
-    model.require_layout(data.layout, found.name)
+    model.require_layout(data.layout, stage.name)
     return Judge.evaluator(model), "euclidean"
 
 
@@ -102,30 +102,30 @@ def alignment_stage(run: Path, name: str | None = None) -> Finished:
     """A finished stage that aligns text with motion, or an evaluator: by name, else `tma`, else the recipe's
     first, evaluators last.
     """
-    known = _judges(run)
-    name = name or (known or ["tma"])[0]
-    if name not in known:
-        have = f"this run has {', '.join(known)}" if known else "this run has none"
+    names = _judges(run)
+    name = name or (names or ["tma"])[0]
+    if name not in names:
+        have = f"this run has {', '.join(names)}" if names else "this run has none"
         raise UserError(f"{run}: no stage '{name}' that aligns text with body and hands; {have}")
-    found = finished_stages(run).get(name)
-    if found is None:
+    stage = finished_stages(run).get(name)
+    if stage is None:
         raise UserError(f"{run}: no finished '{name}' stage; run the recipe up to it first")
-    needed = [role.name for role in found.kind.roles() if isinstance(role, Role) and not role.optional]
-    missing = [role for role in needed if role not in found.inputs]
+    needed = [role.name for role in stage.kind.roles() if isinstance(role, Role) and not role.optional]
+    missing = [role for role in needed if role not in stage.inputs]
     if missing:
-        said = f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first"
-        raise UserError(found.gone.get(missing[0], said))
+        message = f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first"
+        raise UserError(stage.gone.get(missing[0], message))
     require_consistent(run, [name])
-    return found
+    return stage
 
 
 def _judges(run: Path) -> list[str]:
     """Names of the stages of a run's recipe that can judge, the one that does by default first."""
-    known = [*stages_giving(run, ALIGNMENT), *stages_giving(run, "evaluator")]
-    return sorted(known, key=lambda name: name != "tma")
+    names = [*stages_giving(run, ALIGNMENT), *stages_giving(run, "evaluator")]
+    return sorted(names, key=lambda name: name != "tma")
 
 
-def _sources(run: Path, found: Finished) -> dict[str, Finished]:
+def _sources(run: Path, judge: Finished) -> dict[str, Finished]:
     """The stages of the clips and of the captions' meaning: a judge's own, else the run's first of each.
 
     The published evaluator was made from no stage of the run.
@@ -133,8 +133,8 @@ def _sources(run: Path, found: Finished) -> dict[str, Finished]:
     out, finished = {}, finished_stages(run)
     for what in ("data", "text"):
         own = [stage for stage in finished.values() if stage.kind.name == what or stage.gives(what)]
-        if what in found.inputs or own:
-            out[what] = found.inputs.get(what) or own[0]
+        if what in judge.inputs or own:
+            out[what] = judge.inputs.get(what) or own[0]
     if "data" not in out:
         raise UserError(f"{run}: no finished 'data' stage; run the recipe up to it first")
     return out
@@ -153,8 +153,8 @@ def _figures(name: str, meaning: str, values: dict[str, float], facts: dict[str,
         shares = [Metric(f"{name}.{way}/R@{k}", f"R@{k}", "higher", "share") for k in RECALLS]
         guess = {one.name: min(1.0, k / size) for one, k in zip(shares, RECALLS, strict=True)}
         metrics = [*shares, Metric(f"{name}.{way}/MedR", "median rank", "lower")]
-        found = {one.name: values[one.name.removeprefix(f"{name}.")] for one in metrics}
-        rows = {MODEL: plain(found), CHANCE: plain(guess)}
+        measured = {one.name: values[one.name.removeprefix(f"{name}.")] for one in metrics}
+        rows = {MODEL: plain(measured), CHANCE: plain(guess)}
         out += group_figures(f"Protocol {name}, {words}: {meaning}", metrics, rows, protocol)
     return out
 
@@ -172,10 +172,10 @@ def retrieval_command(
     RUN/retrieval-STAGE.json.
     """
     require_own(run)
-    found = retrieve(run, stage, split=split, seed=seed, device=device)
-    print_tables(found.figures, console)
-    stage = found.about["stage"]
+    file = retrieve(run, stage, split=split, seed=seed, device=device)
+    print_tables(file.figures, console)
+    stage = file.about["stage"]
     path = run / ("retrieval.json" if stage == _judges(run)[0] else f"retrieval-{stage}.json")
-    found.write(path)
+    file.write(path)
     console.print(str(path), markup=False, soft_wrap=True)
     return path

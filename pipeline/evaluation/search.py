@@ -90,14 +90,14 @@ def alignment_model(name: Path | str, device: str = "auto") -> tuple[LoadedTma, 
         stages = sorted(finished_stages(folder).values(), key=lambda stage: stage.name != "tma")
     else:
         raise UserError(no_such_model(name))
-    found = next((stage for stage in stages if stage.gives(ALIGNMENT)), None)
-    if found is None:
+    stage = next((stage for stage in stages if stage.gives(ALIGNMENT)), None)
+    if stage is None:
         raise UserError(
             f"{folder}: has no TMA, which embeds words and motions alike; choose another --model, such as "
             f"synthetic"
         )
-    tma: LoadedTma = StageCache(choose_device(device)).get(found)
-    return tma, sha256_of(found.folder / MODEL_FILES[0])
+    tma: LoadedTma = StageCache(choose_device(device)).get(stage)
+    return tma, sha256_of(stage.folder / MODEL_FILES[0])
 
 
 @dataclass(frozen=True)

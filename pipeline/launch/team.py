@@ -48,7 +48,7 @@ class Team:
         from lightning.fabric import Fabric
         from lightning.fabric.strategies.ddp import DDPStrategy
 
-        _require_match(hardware)
+        _require_match(hardware)  # a launcher that disagrees would have processes wait for ever
         if hardware.world() == 1:
             return Team()
         launcher = environment()
@@ -81,12 +81,12 @@ class Team:
         """Return in every process the values of all, in the order of their ranks."""
         if self.waiting is None:
             return [mine]
-        found = [mine] * self.world
+        values = [mine] * self.world
         try:
-            dist.all_gather_object(found, mine, self.waiting)
+            dist.all_gather_object(values, mine, self.waiting)
         except RuntimeError as error:
             raise TeamError(str(error)) from None
-        return found
+        return values
 
 
 def lead_finds(find: Callable[[], Found]) -> Found:
@@ -98,13 +98,13 @@ def lead_finds(find: Callable[[], Found]) -> Found:
     if not dist.is_initialized() or dist.get_world_size() == 1:
         return find()
     try:
-        found = [find() if dist.get_rank() == 0 else None]
-        dist.broadcast_object_list(found, src=0, group=_patient_group())
+        result = [find() if dist.get_rank() == 0 else None]
+        dist.broadcast_object_list(result, src=0, group=_patient_group())
     except RuntimeError as error:
         if "by peer" in str(error):
             raise TeamError(str(error)) from None
         raise
-    return cast(Found, found[0])
+    return cast(Found, result[0])
 
 
 @cache
@@ -148,9 +148,9 @@ def _require_match(hardware: Hardware) -> None:
                 f"srun --nodes {nodes} --ntasks-per-node {devices}"
             )
         return
-    each, found = env.get("SLURM_NTASKS_PER_NODE"), env.get("SLURM_NNODES")
-    if tasks != world or (each or str(devices)) != str(devices) or (found or str(nodes)) != str(nodes):
-        where = f" on {found} node{'s' if found != '1' else ''}" if found else ""
+    each, stated_nodes = env.get("SLURM_NTASKS_PER_NODE"), env.get("SLURM_NNODES")
+    if tasks != world or (each or str(devices)) != str(devices) or (stated_nodes or str(nodes)) != str(nodes):
+        where = f" on {stated_nodes} node{'s' if stated_nodes != '1' else ''}" if stated_nodes else ""
         raise UserError(
             f"srun started {tasks} processes{where} and the recipe asks for {devices} on "
             f"{nodes} node{'s' if nodes > 1 else ''}: set hardware.devices (processes on a node) and "

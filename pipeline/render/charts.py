@@ -253,8 +253,8 @@ def label(key: str) -> str:
 
 def curve_label(key: str) -> str:
     """A figure of a training log: "accuracy: body" for `accuracy_body`, "cross-entropy" for `ce`."""
-    found = _OF_STREAM.fullmatch(key)
-    figure, stream = found.groups() if found else (key, "")
+    match = _OF_STREAM.fullmatch(key)
+    figure, stream = match.groups() if match else (key, "")
     words = " ".join(_SHORT.get(piece, piece) for piece in figure.split("_"))
     if stream in ("", _ONLY):
         return words

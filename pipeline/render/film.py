@@ -82,6 +82,7 @@ def write_mp4(
             raise UserError(_unfinished(path, str(error))) from None  # ffmpeg has ended before us
         finally:
             wav.unlink(missing_ok=True)
+        # ffmpeg's exit code does not reach us, so the file itself must say that it is complete.
         if not _is_whole(temporary):
             raise UserError(_unfinished(path, "its file is cut short"))
 
@@ -131,12 +132,15 @@ def _frames(
     """One RGB picture [height, width, 3] of each frame, by a camera that follows the figure."""
     joints = actor.posing.joints
     floor = floor_of(joints)
+    # The camera follows a smoothed path: following every step would shake the ground.
     target = smooth_path(joints[:, 0], fps)
     spread = np.linalg.norm(joints[..., [0, 2]] - target[:, None][..., [0, 2]], axis=-1).max(axis=1)
+    # Percentiles, so that one stray frame does not make the figure small in all others.
     height = float(np.clip(np.percentile(joints[..., 1].max(axis=1), 98) - floor + 0.2, 0.3, 5))
     radius = float(np.clip(np.percentile(spread, 90) + 0.06, 0.2, 4))
     target[:, 1] = floor + 0.455 * height
     camera = Camera(*VIEWS["3/4"], fit_distance(height, radius, *size), *size)
+    # The camera never turns, so what its pixels see of the ground is computed once.
     ground = Ground(camera, floor + 0.455 * height, floor - SOLE)
     detail = detail_for(camera)
     for frame, middle in enumerate(target):

@@ -98,6 +98,7 @@ def lit(body: Body, vertices: Array, normals: Array, eye: Floats) -> Array:
     key = np.maximum((normals @ lamp + 0.2) / 1.2, 0)
     sky = 0.5 + 0.5 * normals[:, 1]
     light = 0.48 + 0.16 * sky + 0.46 * key + 0.12 * facing
+    # Painted parts of the face keep half of their own colour, or they would vanish in the shade.
     light = np.where(painted, 0.5 + 0.5 * light, light)
     half = toward + lamp
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -106,6 +107,7 @@ def lit(body: Body, vertices: Array, normals: Array, eye: Floats) -> Array:
     warm = np.clip(key + 0.25, 0, 1)[:, None]
     base = colours()[body.swatch].astype(np.float32) / 255
     out = base * (_COOL + warm * (_WARM - _COOL)) * light[:, None]
+    # The rim is darker, so that the figure stands out from a bright ground.
     rim = 0.6 * (1 - facing[:, None]) ** 3
     out += rim * (_RIM * sky[:, None] - 0.28 * out) + gloss[:, None]
     return np.asarray(255 * np.clip(out, 0, 1), dtype=np.float32)
@@ -131,12 +133,12 @@ def draw_figure(
     if wide <= 0 or tall <= 0:
         return
     body = actor.body(detail)
-    near = NEAR / seen[:, 2]
-    found = cover(2 * (seen[:, :2] - low), near, body.triangles, (2 * wide, 2 * tall))
+    near = NEAR / seen[:, 2]  # 1 / depth is linear on the screen, depth is not
+    covered = cover(2 * (seen[:, :2] - low), near, body.triangles, (2 * wide, 2 * tall))
     eye = np.asarray(target, np.float64) + camera.distance * camera.axes[2]
     fine = np.zeros((2 * tall, 2 * wide, 4), np.uint8)
-    fine.reshape(-1, 4)[found.pixels, :3] = found.mixed(body.triangles, lit(body, vertices, normals, eye))
-    fine.reshape(-1, 4)[found.pixels, 3] = 255
+    fine.reshape(-1, 4)[covered.pixels, :3] = covered.mixed(body.triangles, lit(body, vertices, normals, eye))
+    fine.reshape(-1, 4)[covered.pixels, 3] = 255
     small = np.asarray(Image.fromarray(fine, "RGBa").reduce(2))
     rows, columns = np.nonzero(small[..., 3])
     rows, columns, small = rows + low[1], columns + low[0], small[rows, columns].astype(np.float32)
@@ -244,10 +246,10 @@ def _darkness(flat: Floats, height: Floats, triangles: NDArray[np.int64], low: F
 
     nearness = np.clip(1 - height / 0.5, 0, 1).astype(np.float32)
     places = (flat - low) / (high - low) * _TILE
-    found = cover(places, nearness, triangles, (_TILE, _TILE), both_sides=True)
+    covered = cover(places, nearness, triangles, (_TILE, _TILE), both_sides=True)
     wide, close = np.zeros((2, _TILE * _TILE), np.float32)
-    wide[found.pixels] = 1.0
-    close[found.pixels] = found.mixed(triangles, nearness[:, None])[:, 0]
+    wide[covered.pixels] = 1.0
+    close[covered.pixels] = covered.mixed(triangles, nearness[:, None])[:, 0]
     sigma = 0.5 * _SPREAD * _TILE / (high - low)[::-1]
     shape = (_TILE, _TILE)
     out = 0.2 * gaussian_filter(wide.reshape(shape), sigma)
@@ -289,6 +291,7 @@ def cover(
     on the screen (1 / depth is). Triangles that are clockwise from outside are left out, unless `both_sides`.
     """
     width, height = size
+    # Triangles that face the camera and meet the picture.
     corners = np.ascontiguousarray(triangles.T)
     x, y = (points[:, k].astype(np.float32)[corners] for k in (0, 1))
     area = (x[1] - x[0]) * (y[2] - y[0]) - (y[1] - y[0]) * (x[2] - x[0])
@@ -327,6 +330,7 @@ def cover(
     column = number - np.repeat(np.cumsum(counts) - counts, counts)
     pixels = column + np.repeat(line * width + first, counts)
     depths = np.repeat(depth, counts) + np.repeat(depth_x, counts) * column.astype(np.float32)
+    # Depth in the high bits and the pixel's number in the low ones: one maximum finds both.
     front = np.full(width * height, -1, np.int64)
     np.maximum.at(front, pixels, depths.view(np.int32).astype(np.int64) << 32 | number)
     seen = np.flatnonzero(front >= 0)

@@ -63,20 +63,20 @@ def embed_sounds(
     `uses` are motions: the name in errors, what it plays, and its seconds.
     """
     order: dict[tuple[float, bytes], int] = {}
-    found: list[tuple[NDArray[np.float32], float]] = []
+    distinct: list[tuple[NDArray[np.float32], float]] = []
     chosen: list[int | None] = []
     for where, sound, seconds in uses:
         if sound is None:
             chosen.append(None)
             continue
         content = hashlib.sha256(np.ascontiguousarray(sound.samples).tobytes()).digest()
-        number = order.setdefault((sound.rate, content), len(found))
-        if number == len(found):
-            found.append((playable(sound, f"{where}: sound"), seconds))
-        samples, longest = found[number]
-        found[number] = (samples, max(longest, seconds))
+        number = order.setdefault((sound.rate, content), len(distinct))
+        if number == len(distinct):
+            distinct.append((playable(sound, f"{where}: sound"), seconds))
+        samples, longest = distinct[number]
+        distinct[number] = (samples, max(longest, seconds))
         chosen.append(number)
-    return [_encode(samples[: round(seconds * RATE)]) for samples, seconds in found], chosen
+    return [_encode(samples[: round(seconds * RATE)]) for samples, seconds in distinct], chosen
 
 
 def _encode(samples: NDArray[np.float32]) -> EncodedSound:

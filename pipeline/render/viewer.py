@@ -47,6 +47,7 @@ SCRIPTS = [
 ]
 """The files of `web/viewer`, in the order that they need each other."""
 FACE_STEP = 1e-3
+"""Step of the integers that carry face controls."""
 
 
 class SkeletonData(TypedDict):
@@ -150,7 +151,7 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
     for number, motion in enumerate(motions):
         joints = _checked(motion, number)
         skeleton = _skeleton(motion.parents, joints)
-        if skeleton not in skeletons:
+        if skeleton not in skeletons:  # motions of one skeleton share it
             skeletons.append(skeleton)
         positions, low, step = quantise(joints)
         face = None
@@ -237,6 +238,7 @@ def quantise(
     """Joints [T, N, 3] to 16-bit integers with joints = low + step * integers, per axis."""
     exact = np.asarray(joints, np.float64)
     low = exact.min(axis=(0, 1))
+    # An axis without extent must not divide by zero.
     step = np.maximum((exact.max(axis=(0, 1)) - low) / 65535.0, 1e-9)
     return np.round((exact - low) / step).astype("<u2"), low, step
 

@@ -28,13 +28,13 @@ def suspects_of(root: Path, model: str | None = None, *, progress: bool = False)
     those whose captions its TMA finds far from their motion.
     """
     kept = Decisions.of(root).kept
-    found = find_suspects(open_splits(root), kept, progress=progress)
+    suspects = find_suspects(open_splits(root), kept, progress=progress)
     if model is None:
-        return found
+        return suspects
     from motionloom.pipeline.evaluation.search import Search
 
     search = Search.open(root, model, progress=progress)
-    by_id = {suspect.id: suspect for suspect in found.values()}
+    by_id = {suspect.id: suspect for suspect in suspects.values()}
     for place, fault in search.misfits():
         clip = search.splits[place.split].ids[place.clip]
         if clip not in kept and clip not in search.excluded:

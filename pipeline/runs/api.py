@@ -92,15 +92,15 @@ def run_recipe(
         return run
     chosen = selected(loaded, select or Selection())
     if todo:
-        said = (
+        message = (
             f"{loaded.name} in {run}: {len(todo)} of {len(plan)} stages to run "
             f"on {loaded.hardware.describe()}"
         )
     elif len(chosen) < len(plan):
-        said = f"{run}: the selected stages are finished ({len(chosen)} of {len(plan)}), nothing to do"
+        message = f"{run}: the selected stages are finished ({len(chosen)} of {len(plan)}), nothing to do"
     else:
-        said = f"{run}: all {len(plan)} stages are finished, nothing to do"
-    console.print(said, markup=False)
+        message = f"{run}: all {len(plan)} stages are finished, nothing to do"
+    console.print(message, markup=False)
     if todo:
         execute(loaded, run, plan, console)
     for row in plan:
@@ -136,11 +136,11 @@ def _stages_again(
     if not stages:
         raise UserError(f"{folder}: its recipe has no {target} stage; add one and run it again")
     stages.sort(key=lambda s: s.kind.name != target)
-    given = {name: value for name, value in changes.items() if value is not None}
+    wanted = {name: value for name, value in changes.items() if value is not None}
     for number, stage in enumerate(stages):
         out = folder / target / stage.name if number else folder / target
-        taken = {name: value for name, value in given.items() if name in stage.kind.config.model_fields}
-        config = stage.kind.config.parse({**stage.config.dump(), **taken}, target)
+        applied = {name: value for name, value in wanted.items() if name in stage.kind.config.model_fields}
+        config = stage.kind.config.parse({**stage.config.dump(), **applied}, target)
         inputs = _inputs_again(folder, recipe, stage, state)
         if team.leads:
             out.mkdir(exist_ok=True)
@@ -154,10 +154,10 @@ def _stages_again(
 
 def _inputs_again(folder: Path, recipe: Recipe, stage: Stage, state: RunState | None) -> dict[str, Finished]:
     """The inputs of a stage; with `state` those that are finished, with all that they were made from."""
-    made = {**recipe.outside, **finished_stages(folder)}
-    inputs = {role: made[name] for role, name in stage.inputs.items() if name in made}
+    stages = {**recipe.outside, **finished_stages(folder)}
+    inputs = {role: stages[name] for role, name in stage.inputs.items() if name in stages}
     if state is None:
-        gone = [said for (name, _), said in recipe.gone.items() if name == stage.name]
+        gone = [message for (name, _), message in recipe.gone.items() if name == stage.name]
         unfinished = [
             f"{folder}: stage '{name}' (role {role}) is not finished; run the recipe first"
             for role, name in stage.inputs.items()

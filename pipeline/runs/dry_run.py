@@ -87,15 +87,15 @@ def training_times(
     for row in (row for row in rows if row.stage.kind.trains):
         stage, card = row.stage, cards.get(row.stage.name)
         flights = read_flight(stage_folder(run, stage.name)).get(0, ())
-        found = [one["step_seconds"] for one in flights if "step_seconds" in one]
+        measured = [one["step_seconds"] for one in flights if "step_seconds" in one]
         done = max((int(one["step"]) for one in flights), default=0) if row.action == "resume" else 0
-        seconds = median(found) if found else None
+        seconds = median(measured) if measured else None
         small = card and card.memory_bytes < _TRIED_BYTES and card.parameters < _TRIED_PARAMETERS
         if seconds is None and small:
             seconds = stage.kind.step_seconds(stage.config, previews(stage, stages), recipe.hardware)
         if seconds is not None:
             left = max(0, stage.config.train.steps - done)
-            out[stage.name] = TrainingTime(seconds * left, bool(found))
+            out[stage.name] = TrainingTime(seconds * left, bool(measured))
     return out
 
 
@@ -143,9 +143,9 @@ def say_estimate(
     times = {} if run is None or todo is None else training_times(recipe, run, todo, cards)
     console.print(estimate_table(cards, times))
     total = sum(one.seconds for one in times.values())
-    known = [size for stage in named if (size := stage.kind.disk(stage.config)) is not None]
+    sizes = [size for stage in named if (size := stage.kind.disk(stage.config)) is not None]
     lines = [f"disk: {_size(sum(card.checkpoint_bytes for card in cards.values()))} for checkpoints"]
-    lines += [f"about {_size(sum(known))} for data"] if known else []
+    lines += [f"about {_size(sum(sizes))} for data"] if sizes else []
     lines += [f"trainings: about {duration(total)} on {recipe.hardware.describe()}"] if times else []
     console.print("; ".join(lines), markup=False)
 
@@ -248,8 +248,8 @@ def explain_replacements(run: Path, recipe: str, stages: Sequence[Replaced]) -> 
         return None
     lines = [f"{run}: holds a run of recipe '{other}', not '{recipe}'"] if other is not None else [f"{run}:"]
     if stages:
-        known = [stage.seconds for stage in stages if stage.seconds is not None]
-        total = f", {duration(sum(known))} of work" if known else ""
+        seconds = [stage.seconds for stage in stages if stage.seconds is not None]
+        total = f", {duration(sum(seconds))} of work" if seconds else ""
         joint = "; to go on here would" if other is not None else " this would"
         lines[0] += f"{joint} replace {len(stages)} finished stage{'s' * (len(stages) > 1)}{total}:"
         lines += [stage.say() for stage in stages]
@@ -264,11 +264,11 @@ def _recipe_in(run: Path, name: str) -> str | None:
     """The recipe that a run folder holds, where it is another one."""
     path = run / "recipe.yaml"
     try:
-        found = read_yaml(path) if path.is_file() else None
+        recipe = read_yaml(path) if path.is_file() else None
     except UserError:
         return None  # it is about to be written again
-    there = found.get("name", name) if isinstance(found, dict) else name
-    return None if there == name else str(there)
+    held = recipe.get("name", name) if isinstance(recipe, dict) else name
+    return None if held == name else str(held)
 
 
 def _free(run: Path) -> Path:

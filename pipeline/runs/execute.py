@@ -37,8 +37,9 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
         recipe.hardware.require_devices()
     leads = process_rank() == 0
     if not leads:
-        todo = joint
+        todo = joint  # all other stages run in the lead alone
     with _lock(run) if leads else nullcontext():
+        # All processes start before anything is written, so that they make the same plan.
         team = Team.start(recipe.hardware) if joint else Team()
         if leads:
             remove_temporaries(run)
@@ -63,6 +64,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 seconds = time.perf_counter() - begin
                 took = {"seconds": round(seconds, 2), "hardware": recipe.hardware.describe()}
                 write_json(folder / "timing.json", took)
+                # Last of all: a stage is finished when its artifact is there.
                 _artifact(recipe, run, row, plan).finish(folder)
                 console.print(f"    finished in {seconds:.1f} s")
         if leads:
@@ -114,16 +116,16 @@ def context_of(
 
 def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]:
     """The stages that feed one of a recipe, by role."""
-    made: dict[str, Finished] = dict(recipe.outside)
+    stages: dict[str, Finished] = dict(recipe.outside)
 
     def finished(name: str) -> Finished:
-        if name not in made:
+        if name not in stages:
             source = recipe.stage(name)
             inputs = {role: finished(above) for role, above in source.inputs.items()}
-            gone = {role: said for (needing, role), said in recipe.gone.items() if needing == name}
+            gone = {role: message for (needing, role), message in recipe.gone.items() if needing == name}
             folder = stage_folder(run, name)
-            made[name] = Finished(name, source.kind, source.config, folder, inputs, gone=gone)
-        return made[name]
+            stages[name] = Finished(name, source.kind, source.config, folder, inputs, gone=gone)
+        return stages[name]
 
     return {role: finished(name) for role, name in stage.inputs.items()}
 

@@ -36,49 +36,49 @@ class Sources:
     gone: dict[tuple[str, str], str] = field(default_factory=dict)
     """Stage and role -> what to say where an input from outside is not there any more."""
 
-    def resolve(self, stage: Stage, given: object) -> dict[str, str]:
+    def resolve(self, stage: Stage, written: object) -> dict[str, str]:
         """Role -> stage; a role that is filled by several stages has one entry for each (`Every.key`)."""
         roles, at = stage.kind.roles(), f"{self.where}: stages.{stage.name}.inputs"
-        if not isinstance(given, dict):
+        if not isinstance(written, dict):
             raise UserError(f"{at} must map roles to stages, like {{data: other_data}}")
-        for name in given:
+        for name in written:
             if name not in [role.name for role in roles]:
                 hint = nearest(name, [role.name for role in roles])
                 raise UserError(f"{at}: unknown role '{name}'{hint}")
         inputs: dict[str, str] = {}
         for role in roles:
             if isinstance(role, Every):
-                for key, source in self._every(stage, role, given.get(role.name)):
+                for key, source in self._every(stage, role, written.get(role.name)):
                     if key in inputs:
                         raise UserError(
                             f"{at}.{role.name}: two are called '{key.partition('.')[2]}'; name each once, or "
                             f"rename the folder of one run"
                         )
                     inputs[key] = source
-            elif (one := self._one(stage, role, given)) is not None:
+            elif (one := self._one(stage, role, written)) is not None:
                 inputs[role.name] = one
         return inputs
 
-    def _one(self, stage: Stage, role: Role, given: Mapping[str, object]) -> str | None:
+    def _one(self, stage: Stage, role: Role, written: Mapping[str, object]) -> str | None:
         """The stage in a role; None for an optional one that nothing fills."""
-        source = given.get(role.name, role.name)
+        source = written.get(role.name, role.name)  # by default the stage called as the role
         if source is None and role.optional:
             return None
         if isinstance(source, str) and is_place(source):
-            found = self._find(stage, role.name, source)
-            if found is not None:
-                self._require_fit(stage, role, Stage(source, found.kind, found.config, {}))
-            return None if found is None else source
-        there = next((other for other in self.own if other.name == source), None)
-        if there is not None:
-            self._require_fit(stage, role, there)
-            return there.name
-        if role.name not in given and role.optional:
+            outside = self._find(stage, role.name, source)
+            if outside is not None:
+                self._require_fit(stage, role, Stage(source, outside.kind, outside.config, {}))
+            return None if outside is None else source
+        own = next((other for other in self.own if other.name == source), None)
+        if own is not None:
+            self._require_fit(stage, role, own)
+            return own.name
+        if role.name not in written and role.optional:
             return None
-        known = [other.name for other in self.own if other.name != stage.name]
+        names = [other.name for other in self.own if other.name != stage.name]
         raise UserError(
             f"{self.where}: stage '{stage.name}' needs a stage '{source}' (role '{role.name}')"
-            f"{self._why_not(source) or nearest(str(source), known)}"
+            f"{self._why_not(source) or nearest(str(source), names)}"
         )
 
     def _why_not(self, name: object) -> str:
@@ -122,11 +122,11 @@ class Sources:
             raise UserError(f"{at} must list stages, like [gpt]")
         for name in listed:
             if isinstance(name, str) and is_place(name):
-                found = self._find(stage, role.name, name)
-                if found is None:
+                outside = self._find(stage, role.name, name)
+                if outside is None:
                     continue
-                if found.gives(role.gives):
-                    yield role.key(label_of(found.folder)), name
+                if outside.gives(role.gives):
+                    yield role.key(label_of(outside.folder)), name
                     continue
             elif name in giving:
                 yield role.key(name), name
@@ -146,20 +146,20 @@ def find_outside(name: str, where: str) -> Finished:
     if (folder / "recipe.yaml").is_file() or (folder / "bundle.json").is_file():
         what = "a whole run" if (folder / "recipe.yaml").is_file() else "a whole export"
         raise UserError(f"{where}: {name}: {what}; name one of its stages{_hint(_first(folder))}")
-    found = outside_stage(folder)
-    if found is None:
-        known = (folder / "started.json").is_file()
-        fix = "; finish its run first" if known else f"; {_LIKE}"
+    stage = outside_stage(folder)
+    if stage is None:
+        started = (folder / "started.json").is_file()
+        fix = "; finish its run first" if started else f"; {_LIKE}"
         raise UserError(f"{where}: {name}: no finished stage (no artifact.json){fix}")
     if not in_export(folder):
-        _require_usable(found, name, where)
-    return found
+        _require_usable(stage, name, where)
+    return stage
 
 
-def _require_usable(found: Finished, name: str, where: str) -> None:
-    run = owner_of(found.folder)
+def _require_usable(outside: Finished, name: str, where: str) -> None:
+    run = owner_of(outside.folder)
     again = f"make it again: motionloom run {run / 'recipe.yaml'} -o {run}"
-    for stage in _needed(found):
+    for stage in _needed(outside):
         artifact = None if in_export(stage.folder) else Artifact.find(stage.folder)
         if artifact is None:  # an export is checked as it is opened
             continue
@@ -171,7 +171,7 @@ def _require_usable(found: Finished, name: str, where: str) -> None:
         if gone := artifact.missing(stage.folder):
             raise UserError(f"{where}: {name}: {stage.folder / gone} is gone or has another size; {again}")
     try:
-        require_consistent(run, [found.folder.name])
+        require_consistent(run, [outside.folder.name])
     except UserError as error:
         raise UserError(f"{where}: {name}: {error}") from None
 
@@ -192,15 +192,15 @@ def _first(folder: Path) -> Path:
 def _hint(folder: Path) -> str:
     """The stages next to a folder that is not one."""
     parent = folder.parent if not folder.is_dir() else folder
-    there = [one.name for one in sorted(parent.iterdir()) if one.is_dir()] if parent.is_dir() else []
-    names = [name for name in there if not name.startswith(".")]
+    folders = [one.name for one in sorted(parent.iterdir()) if one.is_dir()] if parent.is_dir() else []
+    names = [name for name in folders if not name.startswith(".")]
     return nearest(folder.name, names) if names else f"; {_LIKE}"
 
 
-def as_stages(found: Mapping[str, Finished]) -> dict[str, Stage]:
+def as_stages(outside: Mapping[str, Finished]) -> dict[str, Stage]:
     """Outside stages and all above them, as the checks of a recipe see stages."""
     out: dict[str, Stage] = {}
-    for name, stage in found.items():
+    for name, stage in outside.items():
         _add(name, stage, out)
     return out
 
@@ -214,13 +214,13 @@ def _add(name: str, stage: Finished, out: dict[str, Stage]) -> None:
         _add(place, source, out)
 
 
-def require_elsewhere(run: Path, stage: Stage, found: Mapping[str, Finished]) -> None:
+def require_elsewhere(run: Path, stage: Stage, outside: Mapping[str, Finished]) -> None:
     """Refuse, as an input from outside, a stage of the run itself, or one made from what it shall feed."""
     target = stage_folder(run, stage.name).resolve()
     for name in stage.inputs.values():
-        if name not in found:
+        if name not in outside:
             continue
-        source = found[name]
+        source = outside[name]
         if owner_of(source.folder).resolve() == run.resolve():
             raise UserError(
                 f"stage '{stage.name}': {name} is a stage of this very run; name it '{source.folder.name}'"

@@ -138,7 +138,7 @@ class LaunchPlan:
     name: str
     """Name of the jobs: lower-case letters, digits and dashes, a letter first."""
     recipe: Recipe
-    given: str | None
+    shipped: str | None
     """A shipped recipe's name; None for a recipe of the user's own, which travels in its resolved form."""
     overrides: tuple[str, ...]
     out: str
@@ -150,9 +150,18 @@ class LaunchPlan:
 
     def command(self, group: Group, recipe: str, program: Sequence[str]) -> list[str]:
         """The words that run a group: `program` is `motionloom`, `recipe` the file of an own recipe."""
-        overrides = self.overrides if self.given else ()  # a resolved recipe has them
+        overrides = self.overrides if self.shipped else ()  # a resolved recipe has them
         sets = [word for setting in (*overrides, *group.settings) for word in ("--set", setting)]
-        return [*program, "run", self.given or recipe, "-o", self.out, "--until", ",".join(group.last), *sets]
+        return [
+            *program,
+            "run",
+            self.shipped or recipe,
+            "-o",
+            self.out,
+            "--until",
+            ",".join(group.last),
+            *sets,
+        ]
 
     def table(self) -> Table:
         table = Table(title=f"{self.recipe.name}: {len(self.groups)} groups", title_justify="left")
@@ -169,7 +178,7 @@ def make_launch_plan(
     recipe: Recipe,
     options: SlurmOptions,
     *,
-    given: str | None,
+    shipped: str | None,
     overrides: Sequence[str],
     out: Path,
     nodes: int,
@@ -200,7 +209,7 @@ def make_launch_plan(
     _require_fit(recipe, groups)
     word = options.name or _word(recipe.name, 30)
     name = word if word[:1].isalpha() else f"run-{word}"
-    return LaunchPlan(name, recipe, given, tuple(overrides), str(out), tuple(groups))
+    return LaunchPlan(name, recipe, shipped, tuple(overrides), str(out), tuple(groups))
 
 
 def _machines(options: SlurmOptions, need: Need, nodes: int, gpus: int) -> Machines:
@@ -233,6 +242,7 @@ def _cut(recipe: Recipe, gpus: int) -> list[tuple[Need, list[Stage]]]:
     out: list[tuple[Need, list[Stage]]] = []
     while waiting:
         ready = [stage for stage in waiting if done.issuperset(stage.inputs.values())]
+        # A stage that needs the same machines goes on in the same job, whatever its place in the recipe.
         same = [stage for stage in ready if out and needs[stage.name] == out[-1][0]]
         if not same:
             out.append((needs[ready[0].name], []))

@@ -109,6 +109,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
         forced |= wanted
     request, done = _request(run, select, forced) if forced else (None, set())
     rows: dict[str, PlannedStage] = {}
+    # In the recipe's order, since a fingerprint needs those of the inputs.
     for stage in recipe.stages:
         require_elsewhere(run, stage, recipe.outside)
         facts, folder = _facts(recipe, stage, rows), stage_folder(run, stage.name)
@@ -119,16 +120,19 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
             request=None if again is None else again.id,
         )
         lengthened: tuple[int, ...] = ()
+        # A request overrules the fingerprints, until this stage is done for it.
         if again is not None and stage.name not in done:
             action, reason = _decide_again(started, before, select)
         else:
             action, reason = _decide(recipe, stage, started, before, folder, rows, forced)
         if before is not None and action == "resume":
             lengthened = before.lengthened
+        # More steps of the same training are no other training: its checkpoints are a beginning of it.
         elif before is not None and action == "run" and again is None:
             longer = _extension(stage, started, before, folder)
             if longer is not None:
                 action, (reason, lengthened) = "resume", longer
+        # A stage outside the selection is left as it is, outdated or not.
         if stage.name not in wanted and action != "skip":
             action, reason = "leave", "not selected"
         started = started.model_copy(update={"lengthened": lengthened})
@@ -203,14 +207,14 @@ def _fingerprint(recipe: Recipe, name: str, rows: Mapping[str, PlannedStage]) ->
 
 def _request(run: Path, select: Selection, forced: set[str]) -> tuple[Request, set[str]]:
     """The request of this command, begun before or now, and the stages that are done for it."""
-    path, asked = run / REQUEST_FILE, asdict(select)
+    path, selection = run / REQUEST_FILE, asdict(select)
     if path.is_file():
-        found = Request.load_json(path)
-        if found.select == asked:
-            done = {name for name in forced if _done(stage_folder(run, name), found)}
+        request = Request.load_json(path)
+        if request.select == selection:
+            done = {name for name in forced if _done(stage_folder(run, name), request)}
             if done != forced:
-                return found, done
-    return Request(id=secrets.token_hex(8), select=asked), set()
+                return request, done
+    return Request(id=secrets.token_hex(8), select=selection), set()
 
 
 def _done(folder: Path, request: Request) -> bool:
@@ -308,16 +312,16 @@ def _extension(
 
     None where more than its steps has changed, or they became fewer, or nothing is there to go on from.
     """
-    wanted, there = started.extendable, before.extendable
-    if wanted is None or there is None or there["others"] != wanted["others"]:
+    wanted, trained = started.extendable, before.extendable
+    if wanted is None or trained is None or trained["others"] != wanted["others"]:
         return None
-    old, new = int(there["steps"]), int(wanted["steps"])
+    old, new = int(trained["steps"]), int(wanted["steps"])
     if old >= new or not any((folder / "checkpoints").glob("*.ckpt")):
         return None
-    said = f"train.steps {old} -> {new}: goes on from its last checkpoint"
+    reason = f"train.steps {old} -> {new}: goes on from its last checkpoint"
     assert isinstance(stage.config, TrainedStageConfig)
     schedule = stage.config.schedule_of_length()
     if schedule is None:
-        return said, before.lengthened
-    said += f"; {schedule} is lengthened, which is not the same as {new} steps at once"
-    return said, (*before.lengthened, old)
+        return reason, before.lengthened
+    reason += f"; {schedule} is lengthened, which is not the same as {new} steps at once"
+    return reason, (*before.lengthened, old)

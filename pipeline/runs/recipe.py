@@ -104,7 +104,9 @@ class Recipe:
 
     def _untrained(self, stage: Stage) -> bool:
         outside = [self.outside[name] for name in stage.inputs.values() if name in self.outside]
-        trained = any(one.kind.trains for found in outside for one in (found, *found.upstream()))
+        trained = any(
+            one.kind.trains for stage_outside in outside for one in (stage_outside, *stage_outside.upstream())
+        )
         return not stage.kind.trains and not trained and all(map(self._untrained, self.above(stage)))
 
     def to_yaml(self, run: Path | None = None) -> str:
@@ -157,7 +159,7 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, stri
     file = RecipeFile.parse(resolved.data, where)
     parsed = _parse(file.stages, where)
     sources = Sources([stage for stage, _ in parsed], where, resolved.removed, strict)
-    stages = [replace(stage, inputs=sources.resolve(stage, given)) for stage, given in parsed]
+    stages = [replace(stage, inputs=sources.resolve(stage, written)) for stage, written in parsed]
     if not sources.gone:
         _check(stages, sources, where)
     return Recipe(

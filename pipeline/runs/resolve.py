@@ -72,9 +72,9 @@ def shipped_recipes() -> dict[str, Path]:
     the top `NAME`.
     """
     folder = Path(str(resources.files("motionloom.configs")))
-    found = {f"{path.parent.name}-{path.stem}": path for path in folder.glob("*/*.yaml")}
-    found |= {path.stem: path for path in folder.glob("*.yaml")}
-    return dict(sorted(found.items()))
+    recipes = {f"{path.parent.name}-{path.stem}": path for path in folder.glob("*/*.yaml")}
+    recipes |= {path.stem: path for path in folder.glob("*.yaml")}
+    return dict(sorted(recipes.items()))
 
 
 def find_recipe(name_or_path: str) -> Path:
@@ -104,7 +104,7 @@ def resolve(path: Path, overrides: Sequence[str] = ()) -> Resolved:
     _read(path, out)
     # Defaults of what is extended may concern stages that this recipe has replaced; its own may not.
     _require_used(read_file(path).get("defaults"), out.data.get("stages"), str(path))
-    known = set(out.data.get("defaults") or ())
+    inherited = set(out.data.get("defaults") or ())
     for text in overrides:
         _override(out, text)
     data = out.data
@@ -115,6 +115,7 @@ def resolve(path: Path, overrides: Sequence[str] = ()) -> Resolved:
         _require_default(key, fields, where)
     if not isinstance(stages, dict):
         return out
+    # Layers are merged now; each stage's entry is completed by what is more general than it.
     model = None if name is None else StartingModel.open(name, where)
     missing = {} if model is None else {r: one for r, one in model.stages.items() if r not in stages}
     for key, entry in stages.items():
@@ -130,7 +131,7 @@ def resolve(path: Path, overrides: Sequence[str] = ()) -> Resolved:
         for concerning in _defaults_of(entry):
             shared = merge(shared, defaults.get(concerning, {}))
         stages[key] = merge(shared, entry)
-    _require_used(defaults.keys() - known, stages, where)
+    _require_used(defaults.keys() - inherited, stages, where)
     return out
 
 
@@ -158,6 +159,7 @@ def _read(path: Path, out: Resolved, depth: int = 0) -> None:
         return
     if depth > _DEEPEST:
         raise UserError(f"{path}: 'extends' goes in a circle or more than four files deep")
+    # A file next to this one goes before a shipped recipe of the same name.
     beside = path.parent / (str(base) if str(base).endswith((".yaml", ".yml")) else f"{base}.yaml")
     _read(beside if beside.is_file() else find_recipe(str(base)), out, depth + 1)
     old, new = out.data.get("stages"), data.get("stages")
@@ -175,6 +177,7 @@ def _read(path: Path, out: Resolved, depth: int = 0) -> None:
             continue
         out.removed.pop(name, None)
         if isinstance(before, dict) and isinstance(entry, dict):
+            # Settings of one kind mean nothing to another.
             same = entry.get("kind", before.get("kind")) == before.get("kind")
             stages[name] = merge(before, entry) if same else entry
         else:
@@ -240,6 +243,7 @@ def _placed(entry: Any, folder: Path | None) -> Any:
         if not isinstance(value, str) or not is_place(value):
             return value
         written = Path(value).expanduser()
+        # A path is seen from the recipe where it leads to something there, else from the current folder.
         if folder is not None and ((folder / written).exists() or value.startswith("../")):
             return place_name(folder / written)
         return place_name(written)
@@ -308,10 +312,10 @@ class StartingModel:
         """The model in a folder, or of the package; `where` is what names it, for messages."""
         if not isinstance(name, str):
             raise UserError(f"{where}: {START} must be the name or the folder of a trained model")
-        made = _generators(name, f"{where}: {START} = '{name}'")
-        gpts = [stage for stage in made if stage.kind.name == "gpt" and not stage.config.face]
+        generators = _generators(name, f"{where}: {START} = '{name}'")
+        gpts = [stage for stage in generators if stage.kind.name == "gpt" and not stage.config.face]
         if not gpts:
-            kinds = ", ".join(dict.fromkeys(stage.kind.name for stage in made)) or "nothing"
+            kinds = ", ".join(dict.fromkeys(stage.kind.name for stage in generators)) or "nothing"
             raise UserError(
                 f"{where}: {START} = '{name}': trainings start from a model whose body is made by a stage of "
                 f"kind gpt; this one has {kinds}"
@@ -320,7 +324,7 @@ class StartingModel:
         stages = {"gpt": gpt, "tokenizer": tokenizer, "stats": tokenizer.inputs["stats"]}
         if "tma" in gpt.inputs:
             stages["tma"] = gpt.inputs["tma"]
-        faces = tuple(stage for stage in made if stage not in gpts and _of_face(stage))
+        faces = tuple(stage for stage in generators if stage not in gpts and _of_face(stage))
         return StartingModel(name, stages, faces, load_facts(tokenizer.folder).layout.layout())
 
     def entry(self, key: str, entry: Tree, missing: Mapping[str, Finished], where: str) -> Tree:
@@ -329,10 +333,10 @@ class StartingModel:
         if "kind" not in entry:
             stage = self.stages.get(key)
             if stage is None or not stage.kind.trains:
-                known = [role for role, found in self.stages.items() if found.kind.trains]
+                trained = [role for role, stage_of_model in self.stages.items() if stage_of_model.kind.trains]
                 raise UserError(
                     f"{where}: stages.{key} has no kind, and {START} '{self.name}' has no '{key}' to go on "
-                    f"from{nearest(key, known)}"
+                    f"from{nearest(key, trained)}"
                 )
             settings = {name: value for name, value in stage.config.dump().items() if name not in _OWN}
             entry = merge({"kind": stage.kind.name, **settings}, entry)

@@ -128,7 +128,7 @@ def launch_recipe(
 
     `options` are `KEY=VALUE` words of `SlurmOptions`.
     """
-    loaded, asked = load_recipe(recipe, overrides), SlurmOptions.from_words(options)
+    loaded, slurm = load_recipe(recipe, overrides), SlurmOptions.from_words(options)
     run = Path(os.path.abspath(out or Path("runs") / loaded.name))  # noqa: PTH100 - links stay as they are
     require_folder(run)
     for what, place in (("--out", run), ("the current folder", Path.cwd())):
@@ -140,8 +140,8 @@ def launch_recipe(
             raise UserError(refusal)
     plan = make_launch_plan(
         loaded,
-        asked,
-        given=None if Path(recipe).suffix in {".yaml", ".yml"} else str(recipe),
+        slurm,
+        shipped=None if Path(recipe).suffix in {".yaml", ".yml"} else str(recipe),
         overrides=overrides,
         out=run,
         nodes=nodes,
@@ -155,12 +155,12 @@ def launch_recipe(
             raise
         planned = []  # the data may be on another machine
         console.print(f"time and disk not estimated: {error}", soft_wrap=True, markup=False)
-    _require_time(plan, asked, training_times(loaded, run, planned, {}))
+    _require_time(plan, slurm, training_times(loaded, run, planned, {}))
     if dry_run:
         say_estimate(loaded, console, run, planned)
-        _show_scripts(plan, asked, console)
+        _show_scripts(plan, slurm, console)
     else:
-        submit_run(plan, asked, console)
+        submit_run(plan, slurm, console)
     return plan
 
 
@@ -177,7 +177,7 @@ def _require_time(plan: LaunchPlan, options: SlurmOptions, times: Mapping[str, T
 
 def _show_scripts(plan: LaunchPlan, options: SlurmOptions, console: Console) -> None:
     folder = Path(plan.out) / LOG_FOLDER / "DATE-TIME"
-    if plan.given is None:
+    if plan.shipped is None:
         line = f"would write {folder / RECIPE_FILE}: the resolved recipe"
         console.print(line, soft_wrap=True, markup=False)
     before: str | None = None
@@ -201,19 +201,19 @@ def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> lis
         raise UserError("no sbatch here: start this where jobs are submitted, or look with --dry-run")
     require_own(Path(plan.out))
     folder = _new_folder(Path(plan.out) / LOG_FOLDER)
-    if plan.given is None:
+    if plan.shipped is None:
         write_text(folder / RECIPE_FILE, plan.recipe.to_yaml())
     scripts = slurm_scripts(plan, options, folder, Path.cwd())
     for script in scripts:
         write_text(script.path, script.text)
     ids: list[str] = []
     for script in scripts:
-        asked = subprocess.run(script.submit(ids[-1] if ids else None), capture_output=True, text=True)
-        if asked.returncode != 0:
+        submitted = subprocess.run(script.submit(ids[-1] if ids else None), capture_output=True, text=True)
+        if submitted.returncode != 0:
             if ids:
                 subprocess.run(["scancel", *ids], capture_output=True)
-            raise UserError(f"sbatch refused {script.path}: {asked.stderr.strip()}")
-        ids.append(asked.stdout.strip().partition(";")[0])
+            raise UserError(f"sbatch refused {script.path}: {submitted.stderr.strip()}")
+        ids.append(submitted.stdout.strip().partition(";")[0])
         after = f", after job {ids[-2]}" if len(ids) > 1 else ""
         console.print(f"{script.group.name}: job {ids[-1]}{after}")
     console.print(
@@ -251,7 +251,7 @@ def _options(
     machines = group.machines
     partition = options.partition if machines.gpus else options.light_partition or options.partition
     log = f"{str(folder / group.name).replace('%', '%%')}-%j.log"
-    asked: list[tuple[str, str | None]] = [
+    options_of_job: list[tuple[str, str | None]] = [
         ("job-name", plan.job(group)),
         ("partition", partition),
         ("account", options.account),
@@ -269,7 +269,7 @@ def _options(
         ("kill-on-invalid-dep", "yes"),
         *options.extra.items(),
     ]
-    return [("requeue", None), *((name, value) for name, value in asked if value is not None)]
+    return [("requeue", None), *((name, value) for name, value in options_of_job if value is not None)]
 
 
 def _directive(name: str, value: str | None) -> str:
@@ -285,9 +285,9 @@ def _command(plan: LaunchPlan, group: Group, folder: Path) -> Sequence[str]:
     command, machines = plan.command(group, str(folder / RECIPE_FILE), PROGRAM), group.machines
     if machines.nodes * machines.processes == 1:
         return command
-    asked = [f"--nodes={machines.nodes}", f"--ntasks-per-node={machines.processes}"]
-    asked += [f"--cpus-per-task={machines.cpus // machines.processes}"]
+    task_options = [f"--nodes={machines.nodes}", f"--ntasks-per-node={machines.processes}"]
+    task_options += [f"--cpus-per-task={machines.cpus // machines.processes}"]
     if machines.gpus:
         # All GPUs of a node for each of its processes, which choose theirs.
-        asked.append(f"--gpus-per-node={machines.gpus}")
-    return ["srun", *asked, "--kill-on-bad-exit=1", *command]
+        task_options.append(f"--gpus-per-node={machines.gpus}")
+    return ["srun", *task_options, "--kill-on-bad-exit=1", *command]

@@ -69,6 +69,7 @@ def compare_shards(
     known = Compared.parse(seen_by[0][1], str(record))
     todo: list[LocalShard] = []
     missing = 0
+    # Processes that see the same states see the same files, and share them; another state is another copy.
     for seen in {str(seen): seen for seen, _ in seen_by}.values():
         alike = [rank for rank, (theirs, _) in enumerate(seen_by) if theirs == seen]
         pending = [
@@ -81,8 +82,9 @@ def compare_shards(
         return 0
     size = sum(shard.info.bytes for shard in todo)
     with Meter("comparing shards", len(todo), console=console) as meter:
-        found = problems(todo, min(_THREADS, usable_cores()), meter.advance)
-    wrong = [said for own in team.gather(found) for said in own]
+        mistakes = problems(todo, min(_THREADS, usable_cores()), meter.advance)
+    # Gathered, so that every process refuses, and none waits for one that has.
+    wrong = [message for own in team.gather(mistakes) for message in own]
     if wrong:
         more = f" ({len(wrong)} such shards; motionloom data check lists them)" if len(wrong) > 1 else ""
         raise JointError(f"{wrong[0]}{more}")

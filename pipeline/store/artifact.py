@@ -114,21 +114,21 @@ Changed = tuple[Path, InputStage]
 """The folder of a stage, and one of its inputs that is another now than the stage was made from."""
 
 
-def changed_above(folder: Path, found: dict[Path, Changed | None]) -> Changed | None:
+def changed_above(folder: Path, visited: dict[Path, Changed | None]) -> Changed | None:
     """The first change above a stage, or of its own inputs; `found` keeps what was looked at.
 
     Goes up to the first stage of all, into other runs too; an export is whole in itself. What is gone without
     a trace cannot be compared and is let through.
     """
     key = folder.resolve()
-    if key not in found:
-        found[key] = None  # a damaged folder may name itself
+    if key not in visited:
+        visited[key] = None  # a damaged folder may name itself
         artifact = None if in_export(folder) else Artifact.find(folder)
         sources = [] if artifact is None else list(artifact.inputs.values())
         own_ones = ((folder, one) for one in sources if one.now(folder) not in (None, one.fingerprint))
-        above = (changed_above(source.place(folder), found) for source in sources)
-        found[key] = next(own_ones, None) or next(filter(None, above), None)
-    return found[key]
+        above = (changed_above(source.place(folder), visited) for source in sources)
+        visited[key] = next(own_ones, None) or next(filter(None, above), None)
+    return visited[key]
 
 
 def require_consistent(run: Path, stages: Iterable[str]) -> None:

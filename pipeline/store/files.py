@@ -18,9 +18,9 @@ from motionloom.datasets.schema import UserError
 
 def require_folder(folder: Path) -> None:
     """Refuse an output folder that is a file, or is below one; creates nothing."""
-    there = next((place for place in (folder, *folder.parents) if place.exists()), folder)
-    if there.exists() and not there.is_dir():
-        raise UserError(f"{there}: is a file, and a folder is needed here; choose another name")
+    existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
+    if existing.exists() and not existing.is_dir():
+        raise UserError(f"{existing}: is a file, and a folder is needed here; choose another name")
 
 
 def require_file_place(path: Path) -> None:

@@ -72,7 +72,7 @@ class RunReader:
 
     def find(self, folder: Path) -> StageRecord | None:
         """The stage in a folder; None where it has not finished."""
-        key = folder.resolve()
+        key = folder.resolve()  # one record for each stage, however it is reached
         if key not in self._found:
             self._found[key] = None  # a damaged folder may name itself
             self._found[key] = self._read(folder)
@@ -117,8 +117,8 @@ class RunReader:
 def finished_records(run: Path) -> dict[str, StageRecord]:
     """The finished stages of a run by name, in the recipe's order."""
     reader = RunReader(run)
-    found = {name: reader.find(stage_folder(run, name)) for name in stages_of(run)}
-    return {name: stage for name, stage in found.items() if stage is not None}
+    records = {name: reader.find(stage_folder(run, name)) for name in stages_of(run)}
+    return {name: stage for name, stage in records.items() if stage is not None}
 
 
 @dataclass(frozen=True)
@@ -227,15 +227,15 @@ def _stage(
     )
 
 
-def _why_outdated(run: Path, name: str, found: dict[Path, Changed | None]) -> str:
+def _why_outdated(run: Path, name: str, visited: dict[Path, Changed | None]) -> str:
     """The first stage above a finished one that is another now than it was made from."""
-    changed = changed_above(stage_folder(run, name), found)
+    changed = changed_above(stage_folder(run, name), visited)
     if changed is None:
         return ""
     folder, source = changed
     own = folder.parent.parent
-    there = f" of {own}" if source.folder is None and own.resolve() != run.resolve() else ""
-    return f"{source.say(folder)}{there} has been made anew since"
+    where = f" of {own}" if source.folder is None and own.resolve() != run.resolve() else ""
+    return f"{source.say(folder)}{where} has been made anew since"
 
 
 def _mapping(value: object) -> Mapping[str, object]:

@@ -204,6 +204,7 @@ class TokenBatches(Dataset[dict[str, Any]]):
         """A caption of a clip, and first group and length of the stretch it is about, or of a random part of
         one that is longer than the block.
         """
+        # Seeded by clip and turn, so that no order of batches and no number of ranks changes a draw.
         rng = np.random.default_rng([self.seed, turn, item])
         choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
         caption = self.captions[item][choice]
@@ -246,6 +247,7 @@ def gpt_clips(
     `store` holds the tokens of all clips. Captions about fewer than `min_frames` frames give way to longer
     ones of the same clip.
     """
+    # Clips of which no stream says what was recorded cannot be learned from.
     table = present_table(tokenizer, dataset.layout)
     usable = table.usable[dataset.present]
     if not usable.any():
@@ -262,12 +264,13 @@ def gpt_clips(
             f"{dataset.where}: no clip of split '{dataset.split}' has a {kind} to train a GPT on; "
             f"convert data with {kind}s"
         )
+    # Equal captions share one row of the text embeddings.
     own = store.of(chosen)
     rows: dict[str, int] = {}
     captions = []
     for number, index in enumerate(in_order(dataset, member, clips=clips.tolist())):
-        found, frames = captions_of(dataset, index, face=face), int(dataset.frames[index])
-        spans = caption_spans(found, dataset.layout.fps, frames, min_frames)
+        clip_captions, frames = captions_of(dataset, index, face=face), int(dataset.frames[index])
+        spans = caption_spans(clip_captions, dataset.layout.fps, frames, min_frames)
         groups = int(own.groups[number])
         captions.append([_caption(span, groups, tokenizer.group_frames, rows) for span in spans])
     bits = torch.from_numpy(dataset.present[clips].astype(np.int64))
@@ -305,10 +308,10 @@ class PresentTable:
 def present_table(tokenizer: Tokenizer, layout: MotionLayout) -> PresentTable:
     """The table of a tokenizer and the layout of the full frames."""
     columns = torch.from_numpy(layout.present_columns[:, tokenizer.columns.cpu().numpy()])
-    found = tokenizer.missing(columns.to(tokenizer.columns.device))
-    missing = {name: value.cpu() for name, value in found.items()}
+    missing_masks = tokenizer.missing(columns.to(tokenizer.columns.device))
+    missing = {name: value.cpu() for name, value in missing_masks.items()}
     # A tokenizer that gives a part a stream of its own keeps that part out of the other streams.
     others = torch.ones(len(columns), dtype=torch.bool) if missing else columns.all(1)
-    known = [~missing[name] if name in missing else others for name in stream_names(tokenizer.pattern)]
-    streams = torch.stack(known, dim=1)
+    recorded = [~missing[name] if name in missing else others for name in stream_names(tokenizer.pattern)]
+    streams = torch.stack(recorded, dim=1)
     return PresentTable(columns, streams, streams.any(1).numpy())

@@ -53,9 +53,9 @@ def read_rows(path: Path) -> list[dict[str, float]]:
 
 def read_flight(folder: Path) -> dict[int, list[dict[str, float]]]:
     """The flight logs in a stage's folder, by rank."""
-    found = {}
+    ranks = {}
     for path in sorted((folder / FLIGHT).glob("rank_*.jsonl")):
         rank = path.stem.removeprefix("rank_")
         if rank.isdecimal() and (rows := read_rows(path)):
-            found[int(rank)] = rows
-    return found
+            ranks[int(rank)] = rows
+    return ranks

@@ -158,8 +158,8 @@ def name_of(step: int) -> str:
 
 def step_of(path: Path) -> int | None:
     """Step of a checkpoint's file name; None of any other file."""
-    found = _NAME.fullmatch(path.name)
-    return int(found[1]) if found else None
+    match = _NAME.fullmatch(path.name)
+    return int(match[1]) if match else None
 
 
 class BackgroundWriter:
@@ -304,12 +304,12 @@ def _check_seal(path: Path) -> None:
         if seal is None:
             raise DamagedError("its end with the checksum is cut off or damaged")
         file.seek(0)
-        found, block = hashlib.sha256(), memoryview(bytearray(_BLOCK))
+        digest, block = hashlib.sha256(), memoryview(bytearray(_BLOCK))
         while size > 0:
             count = file.readinto(block[: min(size, _BLOCK)])
             if not count:
                 raise DamagedError("became shorter while it was read")
-            found.update(block[:count])
+            digest.update(block[:count])
             size -= count
-    if found.hexdigest().encode() != seal[1]:
+    if digest.hexdigest().encode() != seal[1]:
         raise DamagedError("the bytes are not those that were written: their sha256 is another")

@@ -127,7 +127,7 @@ def _schedule_of_length(config: BaseModel, prefix: str = "") -> str | None:
         value = getattr(config, name)
         if isinstance(value, OptimConfig) and value.schedule != "constant":
             return f"{prefix}{name}.schedule {value.schedule}"
-        found = _schedule_of_length(value, f"{prefix}{name}.") if isinstance(value, BaseModel) else None
-        if found:
-            return found
+        schedule = _schedule_of_length(value, f"{prefix}{name}.") if isinstance(value, BaseModel) else None
+        if schedule:
+            return schedule
     return None

@@ -68,22 +68,22 @@ def first_failure(module: StageModule, *, scaled: bool) -> Failure | None:
     figures, norms = module.figures[:], [] if scaled else module.norms[:]
     module.figures.clear()
     module.norms.clear()
-    found: list[Failure] = []
+    failures: list[Failure] = []
     if figures:
         values = torch.cat([part.values for part in figures]).tolist()
         for part in figures:
             own, values = dict(zip(part.names, values, strict=False)), values[len(part.names) :]
             terms = {name: value for name, value in own.items() if not math.isfinite(value)}
             if any(_is_loss(name) for name in terms):
-                found.append(
+                failures.append(
                     Failure(part.step, dict(sorted(terms.items(), key=lambda item: _is_loss(item[0]))))
                 )
     if norms:
         values = torch.stack([norm.float() for _, norm in norms]).tolist()
-        found += [
+        failures += [
             Failure(step) for (step, _), value in zip(norms, values, strict=True) if not math.isfinite(value)
         ]
-    return min(found, key=lambda failure: failure.order, default=None)
+    return min(failures, key=lambda failure: failure.order, default=None)
 
 
 def _is_loss(name: str) -> bool:
@@ -107,6 +107,7 @@ class FailureGuard:
             NotFiniteError: In the lead, if any rank has failed.
             TeamError: In the other ranks.
         """
+        # The rank that failed first is the cause: the others got its gradient.
         failure = first_failure(self.module, scaled=scaled)
         orders = all_ranks([math.inf if failure is None else failure.order], self.module.device)[
             :, 0

@@ -32,6 +32,7 @@ class Loggers:
 
     def open(self, rows: Sequence[dict[str, float]]) -> None:
         """Begin, or go on from a checkpoint that holds `rows`."""
+        # Rows up to `sent` are on the servers, which cannot take any back.
         path = self.folder / _SENT
         sent = int(str(read_record(path)["step"])) if path.is_file() else -1
         for name in self.names:

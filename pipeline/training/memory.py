@@ -39,6 +39,7 @@ def model_card(
     """Sizes of a training: `make` gives its module, a batch of `batch` rows, and a note about its tokens."""
     with FakeTensorMode(allow_non_fake_inputs=True):
         module, example, note = make()
+        # A fused kernel keeps no attention weights, which dropout would have the plain one keep.
         for layer in module.modules():
             if isinstance(layer, SelfAttention):
                 layer.attention_dropout = 0.0
@@ -50,6 +51,7 @@ def model_card(
         kept = _saved_bytes(module, example, _HALF.get(train.precision))
     copies = train.keep_checkpoints + (train.steps // train.keep_every if train.keep_every else 0)
     numbers = parameters + (3 if train.ema else 2) * trained
+    # FSDP cuts weights, gradients and moments; activations it does not.
     holders = hardware.world() if train.strategy == "fsdp" else 1
     return ModelCard(
         parameters=parameters,

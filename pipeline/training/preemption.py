@@ -105,14 +105,14 @@ class Agreement:
             return self.signals.number
         # One all-reduce carries both the signal and the pace; MAX lets any rank's signal win.
         seconds = time.monotonic() - self._time
-        asked = torch.tensor([float(self.signals.number), seconds], dtype=torch.float64)
-        dist.all_reduce(asked, dist.ReduceOp.MAX, self.group)
-        taken, seconds = self._count - self._last, float(asked[1])
-        if taken > 0:  # the slowest rank's clock decides for all
-            fitting = int(taken * _BETWEEN / max(seconds, 1e-6))
+        agreed = torch.tensor([float(self.signals.number), seconds], dtype=torch.float64)
+        dist.all_reduce(agreed, dist.ReduceOp.MAX, self.group)
+        steps, seconds = self._count - self._last, float(agreed[1])
+        if steps > 0:  # the slowest rank's clock decides for all
+            fitting = int(steps * _BETWEEN / max(seconds, 1e-6))
             self._every = max(1, min(fitting, _GROWTH * self._every))
         self._last, self._next, self._time = self._count, self._count + self._every, time.monotonic()
-        return int(asked[0])
+        return int(agreed[0])
 
     def restart_pace(self) -> None:
         """From here on borders come at another pace: batches of a validation, or steps again."""

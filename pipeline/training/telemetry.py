@@ -94,6 +94,7 @@ class Telemetry:
 
     def end_row(self) -> dict[str, float]:
         """Write a row; all ranks call this after the same step. What loggers get of it."""
+        # The step times of all ranks, so that each knows how long it has waited for the slowest.
         late = all_ranks(([0.0] * LOG_EVERY + self._own)[-LOG_EVERY:], self.module.device)
         self.waits["ranks"] += waited_in_steps(late, rank())
         now = time.perf_counter()
@@ -145,9 +146,9 @@ def all_ranks(values: Sequence[float], device: torch.device) -> Tensor:
     if world_size() == 1:
         return own[None]
     own = own.to(device)
-    found = [torch.empty_like(own) for _ in range(world_size())]
-    dist.all_gather(found, own)
-    return torch.stack(found).cpu()
+    gathered = [torch.empty_like(own) for _ in range(world_size())]
+    dist.all_gather(gathered, own)
+    return torch.stack(gathered).cpu()
 
 
 def waited_in_steps(seconds: Tensor, rank: int) -> float:

@@ -344,14 +344,14 @@ def _find_resume_point(context: StageContext, config: TrainConfig) -> ResumePoin
     folder = context.folder / "checkpoints"
     if folder.is_dir():
         remove_temporaries(folder)
-    found = resume_point(
+    point = resume_point(
         folder, config, partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
     )
-    newest = found.checkpoint
+    newest = point.checkpoint
     for path in folder.glob("*.ckpt"):
         if newest is not None and (step_of(path) or 0) > (step_of(newest) or 0):
             path.unlink()  # damaged: the training writes this step again
-    return found
+    return point
 
 
 def resume_point(

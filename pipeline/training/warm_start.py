@@ -21,11 +21,11 @@ def starts_from(name: str, first: str, others: Mapping[str, Stage]) -> bool:
     """Whether a stage is `first`, or was trained on from it, directly or over others; "" is none."""
     if not first:
         return not name
-    seen: set[str] = set()
-    while name not in seen:
+    visited: set[str] = set()
+    while name not in visited:
         if name == first:
             return True
-        seen.add(name)
+        visited.add(name)
         name = others[name].inputs.get(START, "") if name in others else ""
     return False
 

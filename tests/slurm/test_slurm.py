@@ -54,7 +54,7 @@ def plan(nodes: int = 2) -> LaunchPlan:
     return make_launch_plan(
         load_recipe("humantomato-tiny"),
         OPTIONS,
-        given="humantomato-tiny",
+        shipped="humantomato-tiny",
         overrides=(),
         out=Path("run").absolute(),
         nodes=nodes,

@@ -53,6 +53,7 @@ def _detail(name: str) -> dict[str, object]:
     moves = arrays[f"{name}_moves"][:, chosen] * arrays[f"{name}_move_step"].astype(float)
     size = max(float(np.abs(moves).max(initial=0.0)), 1e-3) / 127
     moves = np.round(moves / size)
+    # Most vertices never move; only the others have a row.
     moving = np.flatnonzero(moves.any(axis=(1, 2)))
     out: dict[str, object] = {
         key: packed(arrays[f"{name}_{key}"])
@@ -90,6 +91,7 @@ def pack_turns(turns: NDArray[np.floating]) -> NDArray[np.uint32]:
     quaternions = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_quat()
     largest = np.abs(quaternions).argmax(axis=1)
     rows = np.arange(len(quaternions))
+    # q and -q are one rotation: with the largest component positive, the reader can compute it.
     quaternions *= np.sign(quaternions[rows, largest])[:, None]
     others = np.stack([quaternions[rows, (largest + k) % 4] for k in (1, 2, 3)], axis=1)
     # The middle step is exactly 0, so that a figure at rest is.

@@ -130,10 +130,10 @@ def recorded_expression(weights: Values) -> Floats:
     """
     bases = _with_detail()
     source, arkit = (basis.reshape(len(basis), -1) for basis in (bases.source, bases.arkit))
-    known, detail = source[: len(EXPRESSIONS)], source[len(EXPRESSIONS) :]
+    expressions, detail = source[: len(EXPRESSIONS)], source[len(EXPRESSIONS) :]
     moved = np.asarray(weights, np.float64) @ arkit
-    mixed = bounded_least_squares(known @ known.T, moved @ known.T)
-    left = (moved - mixed @ known) @ detail.T / DETAIL_METRES**2
+    mixed = bounded_least_squares(expressions @ expressions.T, moved @ expressions.T)
+    left = (moved - mixed @ expressions) @ detail.T / DETAIL_METRES**2
     emotions, blink, talk = mixed[:, :4], mixed[:, 4], mixed[:, 5:]
     opened = np.maximum(1 + emotions @ (_EYE_OPEN - 1), 1e-6)
     along = np.concatenate(

@@ -106,6 +106,7 @@ class _Scene:
             )
         ]
         self._material()
+        # Two meshes, since morph targets hold a displacement for every vertex of theirs.
         head = body.swatch >= FIRST_OF_HEAD
         self._mesh("body", body, ~head, expressions=False)
         self._mesh("head", body, head, expressions=True)
@@ -154,6 +155,7 @@ class _Scene:
         mesh = Mesh(name=name, primitives=[primitive])
         if expressions:
             moves = body.shapes
+            # Shapes that move nothing share one accessor of zeros.
             at_rest = [not move.any() for move in moves.values()]
             still = self._zeros(int(chosen.sum())) if any(at_rest) else 0
             primitive.targets = [
@@ -175,6 +177,7 @@ class _Scene:
         first = self._add(np.zeros((1, 1)), bounds=True)
 
         def channel(node: int, path: str, values: Values) -> None:
+            # One key is enough for what does not move, such as the fingers of a body without hands.
             still = len(values) == frames and not (values != values[:1]).any()
             kept = values[:1] if still else values
             if path == "weights":

@@ -156,6 +156,7 @@ def stretches(known: Skeleton, skeleton: Skeleton) -> Floats:
             stretch[joint] = girth * np.eye(3)
             continue
         before, after = old[ends], new[ends]
+        # Least squares for the bones that begin here; the regulariser gives girth across them.
         firm = 0.02 * np.square(before).sum() / len(ends)
         stretch[joint] = np.linalg.solve(
             before.T @ before + firm * np.eye(3), before.T @ after + firm * girth * np.eye(3)

@@ -26,7 +26,7 @@ from motionloom.pipeline.results.compare.runs import (
     setting_differences,
     stage_names,
 )
-from motionloom.pipeline.results.compare.tables import ComparedTable, compared_tables
+from motionloom.pipeline.results.compare.tables import ComparedTable, RunRow, compared_tables
 from motionloom.pipeline.store.files import require_file_place
 from motionloom.pipeline.store.yaml import setting_text
 
@@ -77,9 +77,9 @@ def print_comparison(
     """One row a run with the leading figures, then what is missing and what was measured otherwise."""
     leading = []
     for name, title in HEADLINES:
-        found = next((t for t in tables if any(column.name == name for column in t.columns)), None)
-        if found is not None:
-            leading.append((name, title, found))
+        table = next((t for t in tables if any(column.name == name for column in t.columns)), None)
+        if table is not None:
+            leading.append((name, title, table))
     console.print(_table(runs, leading))
     for run in runs:
         if lines := missing_lines(run):
@@ -98,18 +98,21 @@ def _table(runs: Sequence[ComparedRun], leading: Sequence[tuple[str, str, Compar
     for run in runs:
         done = sum(stage.usable for stage in run.state.stages)
         cells = [escape(run.label), f"{done} of {len(run.state.stages)}"]
-        for name, _, found in leading:
-            row = next((row for row in found.rows if row.run is run), None)
-            figure = None if row is None else row.figures.get(name)
-            if row is None or figure is None:
-                cells.append("–")
-            else:
-                mark = {True: " *", False: " (*)", None: ""}[row.best.get(name)]
-                cells.append(f"{figure.text()}{mark}")
+        for name, _, compared in leading:
+            row = next((row for row in compared.rows if row.run is run), None)
+            cell = None if row is None else _figure_cell(row, name)
+            mark = "" if cell is None else " (*)" if cell.maybe else " *" if cell.best else ""
+            cells.append("–" if cell is None else f"{cell}{mark}")
         table.add_row(*cells)
-    if any(row.best.get(name) is False for name, _, found in leading for row in found.rows):
+    if any(row.best.get(name) is False for name, _, compared in leading for row in compared.rows):
         table.caption, table.caption_justify = "(*) its interval overlaps another's", "left"
     return table
+
+
+def _figure_cell(row: RunRow, name: str) -> Cell | None:
+    """A figure of a run, marked where it is the best; None where it was not measured."""
+    figure, sure = row.figures.get(name), row.best.get(name)
+    return None if figure is None else Cell(figure.text(), best=sure is not None, maybe=sure is False)
 
 
 def comparison_page(
@@ -135,7 +138,7 @@ def _who(page: Page, runs: Sequence[ComparedRun]) -> None:
     rows: list[list[Value]] = []
     for run in runs:
         state = run.state
-        known = [stage.seconds for stage in state.stages if stage.seconds is not None]
+        seconds = [stage.seconds for stage in state.stages if stage.seconds is not None]
         places = dict.fromkeys(stage.hardware for stage in state.stages if stage.hardware)
         done = sum(stage.usable for stage in state.stages)
         rows.append(
@@ -144,7 +147,7 @@ def _who(page: Page, runs: Sequence[ComparedRun]) -> None:
                 state.recipe,
                 "–" if state.seed is None else str(state.seed),
                 f"{done} of {len(state.stages)}",
-                duration(sum(known)) if known else None,
+                duration(sum(seconds)) if seconds else None,
                 "; ".join(places) or None,
             ]
         )
@@ -203,16 +206,11 @@ def _figure_table(page: Page, table: ComparedTable, several: bool, silent: Seque
         cells: list[Value] = [_chip(row.run)]
         if lettered:
             cells.append(f"as {LETTERS[row.protocol]}")
-        for column in table.columns:
-            figure = row.figures.get(column.name)
-            sure = row.best.get(column.name)
-            text = None if figure is None else figure.text()
-            cells.append(text if text is None or sure is None else Cell(text, best=sure, maybe=not sure))
-        rows.append(cells)
+        rows.append([*cells, *(_figure_cell(row, column.name) for column in table.columns)])
     for reference in table.references:
         name = f"{reference.title} ({', '.join(reference.runs)})" if reference.runs else reference.title
-        found = [reference.figures.get(column.name) for column in table.columns]
-        soft = [None if f is None else Cell(f.text(), soft=True) for f in found]
+        figures = [reference.figures.get(column.name) for column in table.columns]
+        soft = [None if f is None else Cell(f.text(), soft=True) for f in figures]
         rows.append([Cell(name, soft=True), *([None] if lettered else []), *soft])
     title = f"{table.title} – stage {table.stage}" if several else table.title
     page.add_table(columns, rows, title, pinned=True)

@@ -52,8 +52,10 @@ class ComparedRun:
 
     def _newest(self) -> int:
         """When the last stage was finished that figures may depend on; pages do not change them."""
-        made = [s.folder / "artifact.json" for s in self.state.stages if s.kind not in ("report", "generate")]
-        return max((path.stat().st_mtime_ns for path in made if path.is_file()), default=0)
+        artifacts = [
+            s.folder / "artifact.json" for s in self.state.stages if s.kind not in ("report", "generate")
+        ]
+        return max((path.stat().st_mtime_ns for path in artifacts if path.is_file()), default=0)
 
 
 def open_runs(folders: Sequence[Path]) -> list[ComparedRun]:
@@ -123,8 +125,8 @@ def setting_differences(runs: Sequence[ComparedRun]) -> list[StageDifferences]:
     for name in stage_names(runs):
         stages = [run.state.stage(name) for run in runs]
         missing = tuple(run.label for run, stage in zip(runs, stages, strict=True) if stage is None)
-        there = [_settings(stage) for stage in stages]
-        out.append(StageDifferences(name, missing, _differences(there)))
+        settings = [_settings(stage) for stage in stages]
+        out.append(StageDifferences(name, missing, _differences(settings)))
     return [stage for stage in out if stage.missing or stage.differences]
 
 
@@ -136,11 +138,13 @@ def _settings(stage: StageState | None) -> Mapping[str, object] | None:
 
 def _differences(each: Sequence[Mapping[str, object] | None]) -> dict[str, tuple[object, ...]]:
     """Keys whose values are not equal in all of `each` that are there."""
-    there = [settings for settings in each if settings is not None]
+    present = [settings for settings in each if settings is not None]
     out = {}
-    for key in dict.fromkeys(key for settings in there for key in settings):
-        found = [settings.get(key, ABSENT) for settings in there]
+    for key in dict.fromkeys(key for settings in present for key in settings):
+        values = [settings.get(key, ABSENT) for settings in present]
         # Python takes 1 and true for equal.
-        if any(value != found[0] or isinstance(value, bool) != isinstance(found[0], bool) for value in found):
+        if any(
+            value != values[0] or isinstance(value, bool) != isinstance(values[0], bool) for value in values
+        ):
             out[key] = tuple(ABSENT if settings is None else settings.get(key, ABSENT) for settings in each)
     return out

@@ -61,11 +61,11 @@ def compared_tables(runs: Sequence[ComparedRun]) -> list[ComparedTable]:
     """All tables that a run has figures for."""
     out = []
     for stage in dict.fromkeys(name for run in runs for name in run.evaluations):
-        found = {
+        groups_of = {
             run.label: of_group(run.evaluations[stage].figures) for run in runs if stage in run.evaluations
         }
-        for group in dict.fromkeys(group for groups in found.values() for group in groups):
-            figures = {label: groups[group] for label, groups in found.items() if group in groups}
+        for group in dict.fromkeys(group for groups in groups_of.values() for group in groups):
+            figures = {label: groups[group] for label, groups in groups_of.items() if group in groups}
             table = _table(group, stage, runs, figures)
             if table is not None:
                 out.append(table)
@@ -73,28 +73,29 @@ def compared_tables(runs: Sequence[ComparedRun]) -> list[ComparedTable]:
 
 
 def _table(
-    group: str, stage: str, runs: Sequence[ComparedRun], found: Mapping[str, Sequence[Figure]]
+    group: str, stage: str, runs: Sequence[ComparedRun], by_label: Mapping[str, Sequence[Figure]]
 ) -> ComparedTable | None:
-    columns = columns_of(figure for figures in found.values() for figure in figures)
+    columns = columns_of(figure for figures in by_label.values() for figure in figures)
     # What is not ranked, such as bits a second, makes no table beside figures that are.
     telling = [name for name, column in columns.items() if column.better] or list(columns)
-    rows = {label: rows_of(figures) for label, figures in found.items()}
+    rows = {label: rows_of(figures) for label, figures in by_label.items()}
     rows = {label: own for label, own in rows.items() if any(name in own.get(MODEL, {}) for name in telling)}
     if not rows:
         return None
     # All figures of a group have one protocol.
-    protocols = {label: found[label][0].protocol for label in rows}
-    keys = {label: found[label][0].protocol_key for label in rows}
+    protocols = {label: by_label[label][0].protocol for label in rows}
+    keys = {label: by_label[label][0].protocol_key for label in rows}
+    # Protocols are numbered as they come; runs of one number are ranked with each other.
     order = list(dict.fromkeys(keys.values()))
     numbers = {label: order.index(key) for label, key in keys.items()}
     subjects = {label: own[MODEL] for label, own in rows.items()}
     best = _best(subjects, numbers)
-    there = [run for run in runs if run.label in rows]
+    measured = [run for run in runs if run.label in rows]
     return ComparedTable(
         title=group,
         stage=stage,
         columns=tuple(columns.values()),
-        rows=tuple(RunRow(run, subjects[run.label], best[run.label], numbers[run.label]) for run in there),
+        rows=tuple(RunRow(run, subjects[run.label], best[run.label], numbers[run.label]) for run in measured),
         references=tuple(_references(rows)),
         difference=say_difference(protocols),
         missing=tuple(run.label for run in runs if run.label not in rows),
@@ -127,6 +128,7 @@ def _winner(figures: Mapping[str, Figure]) -> tuple[str, bool] | None:
     (label, first), (_, second) = order[:2]
     if first.value == second.value:
         return None
+    # Two 95 % intervals that do not overlap: stricter than a test of the difference **[ours]**.
     sure = all(
         sign * (other.value - first.value) > (other.interval or 0.0) + (first.interval or 0.0)
         for _, other in order[1:]

@@ -40,14 +40,14 @@ def compare_with_paper(
             raise UserError(f"{out}: a table is written as Markdown; name a file that ends in .md")
         require_file_place(out)
     names = [name for name in shipped_tables() if name.startswith(f"{table}/")] or [table]
-    found = [fill(name, paper_table(name), runs) for name in names]
+    tables = [fill(name, paper_table(name), runs) for name in names]
     if out is None:
-        for filled in found:
+        for filled in tables:
             filled.print(console)
     else:
-        write_text(out, "\n".join(filled.markdown() for filled in found))
+        write_text(out, "\n".join(filled.markdown() for filled in tables))
         console.print(str(out), soft_wrap=True)
-    return found
+    return tables
 
 
 def list_tables(console: Console | None = None) -> None:
@@ -64,8 +64,8 @@ def list_tables(console: Console | None = None) -> None:
 def shipped_tables() -> dict[str, Path]:
     """The tables that come with the package: `PAPER/NUMBER` -> its file, in the papers' order."""
     folder = Path(str(resources.files("motionloom.configs"))) / "tables"
-    found = [(path.relative_to(folder).parts[0], int(path.stem), path) for path in folder.rglob("*.yaml")]
-    return {f"{paper}/{number}": path for paper, number, path in sorted(found)}
+    files = [(path.relative_to(folder).parts[0], int(path.stem), path) for path in folder.rglob("*.yaml")]
+    return {f"{paper}/{number}": path for paper, number, path in sorted(files)}
 
 
 def paper_table(name: str) -> PaperTable:

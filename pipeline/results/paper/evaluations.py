@@ -36,18 +36,18 @@ class Evaluation:
 def evaluations_of(run: Path, measures: Iterable[Measure]) -> list[Evaluation]:
     """All that a run has of `measures`, in the recipe's order; a `UserError` where it has none."""
     stages, wanted = finished_records(run), tuple(measures)
-    found = [
+    evaluations = [
         _staged(run, stage)
         for stage in stages.values()
         if stage.kind in wanted and (stage.folder / FILE_NAME).is_file()
     ]
     if "retrieval" in wanted:
-        found += [_retrieval(path, run, stages) for path in sorted(run.glob("retrieval*.json"))]
-    if not found:
+        evaluations += [_retrieval(path, run, stages) for path in sorted(run.glob("retrieval*.json"))]
+    if not evaluations:
         raise UserError(
             f"{run}: no finished evaluation that this table takes figures of; {_fix(run, wanted)}"
         )
-    return found
+    return evaluations
 
 
 def _fix(run: Path, wanted: Iterable[Measure]) -> str:

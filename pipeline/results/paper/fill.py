@@ -47,6 +47,7 @@ class _Filling:
 
     def filled(self) -> FilledTable:
         """The paper's rows, ours below each, and the answers that need no model."""
+        # Models first: baselines are shown of those evaluations whose models stand in the table.
         models = [self._models(row) for row in self.table.rows]
         self.compared = set(self.used)
         rows: list[FilledRow] = []
@@ -58,7 +59,7 @@ class _Filling:
                 rows += self._references(row.values, _ANSWERS)
         if not any(row.values for row in self.table.rows):
             rows += self._references({}, _ANSWERS)
-        found = [
+        unlike = [
             difference
             for (run, name), evaluation in self.used.items()
             for difference in differences(
@@ -66,18 +67,18 @@ class _Filling:
             )
         ]
         marked = mark_best(rows, self.table.columns)
-        doubts = [*self._unlike(), *(f"{', '.join(of)}: {note}" for note, of in self.doubts.items())]
-        notes = notes_of(self.table, marked, list(self.settings), doubts, with_runs=bool(self.evaluations))
-        return FilledTable(self.name, self.table, marked, tuple(found), notes)
+        remarks = [*self._unlike(), *(f"{', '.join(of)}: {note}" for note, of in self.doubts.items())]
+        notes = notes_of(self.table, marked, list(self.settings), remarks, with_runs=bool(self.evaluations))
+        return FilledTable(self.name, self.table, marked, tuple(unlike), notes)
 
     def _unlike(self) -> list[str]:
         """Sentences on figures of one column that were measured differently from each other."""
         columns: dict[str, dict[str, Protocol]] = {}
-        for (run, name), found in self.shown.items():
-            for column, figure in found:
+        for (run, name), figures in self.shown.items():
+            for column, figure in figures:
                 columns.setdefault(column.title, {})[f"{self.labels[run]} {name}"] = figure.protocol
-        said = dict.fromkeys(say_difference(protocols) for protocols in columns.values())
-        return [sentence.removesuffix(".") for sentence in said if sentence]
+        sentences = dict.fromkeys(say_difference(protocols) for protocols in columns.values())
+        return [sentence.removesuffix(".") for sentence in sentences if sentence]
 
     def _decimals(self, at: int) -> int:
         """Decimals of our figures: as many as the paper prints in that column."""
@@ -98,17 +99,17 @@ class _Filling:
         """Our rows of one of the paper's; one that says so where there are none."""
         if row.recorded or not self.evaluations:
             return []
-        found = [
+        ours = [
             one
             for run in self.evaluations
             for one in named_apart(without_repetitions(self._of_run(run, row)))
         ]
-        for one in found:
+        for one in ours:
             for evaluation in self.evaluations[self.folders[one.run]]:
                 if evaluation.name in one.evaluations:
                     self.used[evaluation.run, evaluation.name] = evaluation
         label = _NO_MODEL if row.ours is None else _MISSING
-        return found or [FilledRow("missing", row.method, label, (None,) * len(self.table.columns))]
+        return ours or [FilledRow("missing", row.method, label, (None,) * len(self.table.columns))]
 
     def _of_run(self, run: Path, row: Row) -> list[FilledRow]:
         """One row for each model of a run, or for each set of models where the columns are settings."""
@@ -121,6 +122,7 @@ class _Filling:
             if role in evaluation.about
             and all(may_fill(match, evaluation.about.get(name)) for name, match in conditions.items())
         ]
+        # Columns that are settings of a model make one row of several models.
         by_setting = any(column.where for column in self.table.columns)
         names = [""] if by_setting else list(dict.fromkeys(model.name for _, model in fitting))
         out = []
@@ -137,8 +139,9 @@ class _Filling:
                 ]
                 for column in self.table.columns
             ]
+            # A model that was evaluated several times has a row for each, until equal ones are dropped.
             for turn in range(max(map(len, lists), default=0)):
-                chosen = [found[turn] if turn < len(found) else None for found in lists]
+                chosen = [choices[turn] if turn < len(choices) else None for choices in lists]
                 out.append(self._ours(run, row, chosen))
             if (
                 not any(lists) and fitting and not by_setting
@@ -156,12 +159,12 @@ class _Filling:
         assert row.ours is not None
         cells: list[Cell | None] = []
         models, evaluations = dict.fromkeys([name] if name else []), dict[str, None]()
-        for at, found in enumerate(chosen):
+        for at, pair in enumerate(chosen):
             column = self.table.columns[at]
-            if found is None or column.figure is None:
+            if pair is None or column.figure is None:
                 cells.append(None)
                 continue
-            evaluation, model = found
+            evaluation, model = pair
             models[model.name] = None
             evaluations[evaluation.name] = None
             figure = evaluation.figure(column.figure.format(**row.values))

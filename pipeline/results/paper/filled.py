@@ -92,15 +92,15 @@ class FilledTable:
         yield from self.notes
         if alone := [_heading(column, arrow=False) for column in self.table.columns if not column.printed]:
             yield f"{', '.join(alone)}: not in the paper, a figure of ours alone."
-        known = self.table.measured.dump().values()
-        found: dict[tuple[str, str], list[str]] = {}
+        protocol = self.table.measured.dump().values()
+        lines: dict[tuple[str, str], list[str]] = {}
         for one in self.differences:
             theirs = "the paper does not say" if one.paper is None else f"paper: {one.paper}"
-            if one.paper is not None and len(one.paper) > _LONG and one.paper in known:
+            if one.paper is not None and len(one.paper) > _LONG and one.paper in protocol:
                 theirs = "paper: see above"
-            found.setdefault((one.run, one.evaluation), []).append(f"{one.what} {one.ours} ({theirs})")
-        for (run, evaluation), said in found.items():
-            yield f"{run} {evaluation}: {'; '.join(said)}"
+            lines.setdefault((one.run, one.evaluation), []).append(f"{one.what} {one.ours} ({theirs})")
+        for (run, evaluation), parts in lines.items():
+            yield f"{run} {evaluation}: {'; '.join(parts)}"
 
     def markdown(self) -> str:
         """A pipe table, the best figures bold, and what is to be known as a list below."""

@@ -21,18 +21,18 @@ def notes_of(
     table: PaperTable,
     rows: Sequence[FilledRow],
     settings: Sequence[str],
-    doubts: Sequence[str],
+    remarks: Sequence[str],
     *,
     with_runs: bool,
 ) -> tuple[str, ...]:
     """Sentences, most important first."""
     measured, out = table.measured, []
-    said = [f"data {measured.data}"]
-    said += [f"split {measured.split}"] if measured.split else []
-    said += [f"judged by {measured.evaluator}"] if measured.evaluator else []
-    said += [f"repeats {measured.repeats}"] if measured.repeats else []
-    said += [f"± is {measured.spread}"] if measured.spread else []
-    out.append(f"The paper's numbers: {'; '.join(said)}." + (f" {measured.note}" if measured.note else ""))
+    facts = [f"data {measured.data}"]
+    facts += [f"split {measured.split}"] if measured.split else []
+    facts += [f"judged by {measured.evaluator}"] if measured.evaluator else []
+    facts += [f"repeats {measured.repeats}"] if measured.repeats else []
+    facts += [f"± is {measured.spread}"] if measured.spread else []
+    out.append(f"The paper's numbers: {'; '.join(facts)}." + (f" {measured.note}" if measured.note else ""))
     out += [f"{row.method}: {row.note}." for row in table.rows if row.note]
     if not with_runs:
         return tuple(out)
@@ -44,28 +44,28 @@ def notes_of(
             "± of ours is half of the 95 % interval: over clips, of figures of whole sets over repeats."
         )
     columns = table.columns
-    for differs, found in _shared(columns, lambda column: column.differs):
-        out.append(f"{_titles(found)}: {differs}.")
-    for why, found in _shared(columns, lambda column: column.why):
-        out.append(f"No figure of ours for {_titles(found)}: {why}.")
+    for differs, sharing in _shared(columns, lambda column: column.differs):
+        out.append(f"{_titles(sharing)}: {differs}.")
+    for why, sharing in _shared(columns, lambda column: column.why):
+        out.append(f"No figure of ours for {_titles(sharing)}: {why}.")
     for why, methods in _shared(table.rows, lambda row: row.why):
         out.append(f"No model of ours for {', '.join(row.method for row in methods)}: {why}.")
     missing = [row.method for row in rows if row.source == "missing"]
     absent = [row.method for row in table.rows if row.ours is not None and row.method in missing]
     if absent:
         out.append(f"Not in these runs: {', '.join(dict.fromkeys(absent))}.")
-    out += [f"{text}." for text in doubts]
+    out += [f"{text}." for text in remarks]
     out += [f"Another setting than the paper's: {text}." for text in settings]
     return tuple(out)
 
 
 def _shared(things: Iterable[T], text: Callable[[T], str]) -> list[tuple[str, list[T]]]:
     """(text, the things that share it), in order; empty texts left out."""
-    found: dict[str, list[T]] = defaultdict(list)
+    groups: dict[str, list[T]] = defaultdict(list)
     for thing in things:
         if text(thing):
-            found[text(thing)].append(thing)
-    return list(found.items())
+            groups[text(thing)].append(thing)
+    return list(groups.items())
 
 
 def _titles(columns: Iterable[Column]) -> str:
@@ -120,8 +120,8 @@ def differences(
 
     def add(what: str, ours: object, theirs: object) -> None:
         if ours is not None and ours != theirs:
-            said = None if theirs is None else str(theirs)
-            out.setdefault((what, str(ours)), Difference(run, evaluation.name, what, str(ours), said))
+            stated = None if theirs is None else str(theirs)
+            out.setdefault((what, str(ours)), Difference(run, evaluation.name, what, str(ours), stated))
 
     data = data_of(evaluation.data)
     if not any(is_named(name.split(" for ")[0], data) for name in paper.data.split(", ")):

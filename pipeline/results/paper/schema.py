@@ -302,9 +302,9 @@ class PaperTable(Config):
         for row in self.rows:
             if len(row.printed()) != wanted:
                 raise ValueError(f"row '{row.method}' has {len(row.printed())} numbers for {wanted} columns")
-        known = {data.name for data in self.data}
+        data_sets = {data.name for data in self.data}
         for column in self.columns:
-            if column.data and column.data not in known:
+            if column.data and column.data not in data_sets:
                 raise ValueError(f"column '{column.title}': no data set '{column.data}' under data")
         return self
 

@@ -16,7 +16,7 @@ from motionloom.pipeline.runs.resolve import shipped_recipes
 
 def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1) -> LaunchPlan:
     return make_launch_plan(
-        load_recipe(name, overrides), SlurmOptions(), given=str(name), overrides=overrides,
+        load_recipe(name, overrides), SlurmOptions(), shipped=str(name), overrides=overrides,
         out=Path("/runs/x"), nodes=nodes, gpus_per_node=gpus,
     )  # fmt: skip
 
@@ -81,10 +81,10 @@ def test_names_suit_slurm(tmp_path: Path) -> None:
 def test_a_resolved_recipe_takes_no_overrides_twice() -> None:
     overrides = ("tma.train.steps=5",)
     recipe = load_recipe("humantomato-tiny", overrides)
-    given = plan_of("humantomato-tiny", *overrides)
-    own = LaunchPlan(given.name, recipe, None, overrides, given.out, given.groups)
-    group = given.groups[0]
-    assert "tma.train.steps=5" in given.command(group, "r.yaml", ["motionloom"])
+    shipped = plan_of("humantomato-tiny", *overrides)
+    own = LaunchPlan(shipped.name, recipe, None, overrides, shipped.out, shipped.groups)
+    group = shipped.groups[0]
+    assert "tma.train.steps=5" in shipped.command(group, "r.yaml", ["motionloom"])
     words = own.command(group, "r.yaml", ["motionloom"])
     assert words[2] == "r.yaml" and "tma.train.steps=5" not in words
 

@@ -27,7 +27,7 @@ NASTY = """data.path=it's a "$(HOME)" `x`; touch y"""
 def scripts(folder: Path, recipe: str, *words: str, nodes: int = 1, gpus: int = 0) -> list[slurm.Script]:
     options, overrides = SlurmOptions.from_words(words), (NASTY,) if "paper" in recipe else ()
     plan = make_launch_plan(
-        load_recipe(recipe, overrides), options, given=recipe, overrides=overrides,
+        load_recipe(recipe, overrides), options, shipped=recipe, overrides=overrides,
         out=folder / "run", nodes=nodes, gpus_per_node=gpus,
     )  # fmt: skip
     return slurm.slurm_scripts(plan, options, folder, folder)

@@ -300,15 +300,15 @@ function mountViewer(root, data, options) {
   const handle = {
     get frame() { return frame(); }, get time() { return state.time; }, get playing() { return state.playing; },
     get draws() { return state.draws; }, get frames() { return last + 1; }, get camera() { return { ...camera }; },
-    get follow() { return state.follow; }, get loop() { return state.loop; },
-    remove, play, setFrame, paint: () => paintAll(cells.filter((cell) => cell.visible)), setView, zoom, turn, toggle: (name) => toggle(name, name),
+    get follow() { return state.follow; },
+    remove, play, setFrame, paint: () => paintAll(cells.filter((cell) => cell.visible)), setView, turn, toggle: (name) => toggle(name, name),
     get sound() { return player.on; }, get audio() { return player.audio; },
     get segment() { return lead && segmentAt(lead.score, localTime(lead)); },
-    get view() { return stage && stage.ready ? "webgl" : "2d"; }, stage, pace,
+    get view() { return stage && stage.ready ? "webgl" : "2d"; }, stage,
     bones: (k) => [...bonesAt(clips[k], localFrame(clips[k]))], // what moves the mesh now, for checks from outside
     lens: (k) => lensOfCell(cells[k]), canvas: (k) => cells[k].canvas, floor: (k) => clips[k].floor,
     joints: (k, at = localFrame(clips[k])) => jointsAt(clips[k], at),
-    look: (from) => { Object.assign(camera, from); refresh(); }, project, rayThrough, refresh, setSpeed, setSound, listen: (k) => follow(clips[k]),
+    look: (from) => { Object.assign(camera, from); refresh(); }, project, rayThrough, refresh, setSpeed, setSound,
   };
   window.__viewers = window.__viewers || [];
   window.__viewers.push(handle);

@@ -156,5 +156,5 @@ function watchPace(stage) {
       count = -FIRST;
     }
   };
-  return { begin, note, get spent() { return spent; }, get gap() { return gap; } };
+  return { begin, note };
 }
