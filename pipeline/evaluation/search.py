@@ -142,7 +142,7 @@ class Search:
         """The embedding [Z] of a clip of the set, by its id."""
         if clip_id not in self.ids:
             raise UserError(f"no clip '{clip_id}' in this data set; its ids are in the answers of a search")
-        return self.vectors[self.ids.index(clip_id)].astype(np.float32)
+        return np.asarray(self.vectors[self.ids.index(clip_id)], np.float32)
 
     def motion(self, joints: NDArray[np.floating], fps: float) -> Vectors:
         """The embedding [Z] of joints [T, 22 or 52, 3] in metres, Y up."""

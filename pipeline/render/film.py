@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.camera import VIEWS, Camera, fit_distance, floor_of, smooth_path
 from motionloom.pipeline.render.scene import SOLE, Actor, Ground, detail_for, draw_figure
-from motionloom.pipeline.render.sound import RATE, Soundtrack, film_sound
+from motionloom.pipeline.render.sound import RATE, film_sound
 
 Progress = Callable[[int, int], None]
 Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
@@ -31,7 +32,7 @@ def write_mp4(
     caption: str = "",
     *,
     size: tuple[int, int] = (512, 512),
-    sound: Soundtrack | None = None,
+    sound: Sound | None = None,
     figure: RigidMotion | None = None,
     face_controls: NDArray[np.floating] | None = None,
     progress: Progress | None = None,

@@ -13,16 +13,17 @@ takes seven times the room.
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, TypedDict, get_args
+from typing import Literal, NamedTuple, TypedDict, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.sound import resample_sound
+from motionloom.datasets.audio.sound import Sound, resample_sound
 from motionloom.datasets.schema import UserError
 
 RATE = 44_100
@@ -32,81 +33,57 @@ BIT_RATE = 96_000
 _BLOCK = 2**16
 
 
-class Soundtrack(Protocol):
-    """Mono sound: `samples` float [S] in -1..1 at `rate` Hz; sample 0 sounds with frame 0."""
+class SoundData(TypedDict):
+    """A compressed sound as a page carries it: a file in base64."""
 
-    @property
-    def samples(self) -> NDArray[np.float32]:
-        """Samples [S] in -1..1."""
-        ...
-
-    @property
-    def rate(self) -> float:
-        """Sample rate in Hz."""
-        ...
-
-
-@dataclass(frozen=True)
-class EncodedSound:
-    """A compressed sound: the bytes of a file, its media type and its length."""
-
-    data: bytes
     mime: str
     seconds: float
+    data: str
 
 
-def embed_sounds(
-    uses: Iterable[tuple[str, Soundtrack | None, float]],
-) -> tuple[list[EncodedSound], list[int | None]]:
+def embed_sounds(uses: Iterable[tuple[Sound | None, float]]) -> tuple[list[SoundData], list[int | None]]:
     """Each distinct sound once, as long as the longest motion that plays it; and which one each use plays.
 
-    `uses` are motions: the name in errors, what it plays, and its seconds.
+    `uses` are motions: what each plays, and its seconds.
     """
     order: dict[tuple[float, bytes], int] = {}
     distinct: list[tuple[NDArray[np.float32], float]] = []
     chosen: list[int | None] = []
-    for where, sound, seconds in uses:
+    for sound, seconds in uses:
         if sound is None:
             chosen.append(None)
             continue
         content = hashlib.sha256(np.ascontiguousarray(sound.samples).tobytes()).digest()
         number = order.setdefault((sound.rate, content), len(distinct))
         if number == len(distinct):
-            distinct.append((playable(sound, f"{where}: sound"), seconds))
+            distinct.append((playable(sound), seconds))
         samples, longest = distinct[number]
         distinct[number] = (samples, max(longest, seconds))
         chosen.append(number)
     return [_encode(samples[: round(seconds * RATE)]) for samples, seconds in distinct], chosen
 
 
-def _encode(samples: NDArray[np.float32]) -> EncodedSound:
-    data = _mp3(samples)
-    mime = "audio/mpeg"
+def _encode(samples: NDArray[np.float32]) -> SoundData:
+    data, mime = _mp3(samples), "audio/mpeg"
     if data is None:
         data, mime = wav_bytes(samples), "audio/wav"
-    return EncodedSound(data, mime, len(samples) / RATE)
+    return {"mime": mime, "seconds": len(samples) / RATE, "data": base64.b64encode(data).decode("ascii")}
 
 
-def film_sound(sound: Soundtrack, seconds: float) -> bytes:
+def film_sound(sound: Sound, seconds: float) -> bytes:
     """A WAV of exactly `seconds`: cut, or filled up with silence."""
-    samples = playable(sound, "sound of the film")
+    samples = playable(sound)
     wanted = round(seconds * RATE)
     out = np.zeros(wanted, np.float32)
     out[: len(samples)] = samples[:wanted]
     return wav_bytes(out)
 
 
-def playable(sound: Soundtrack, where: str) -> NDArray[np.float32]:
-    """Samples [S] at `RATE` Hz; `UserError`, naming `where`, for what is not mono sound."""
-    samples = np.asarray(sound.samples)
-    if samples.ndim != 1 or not len(samples):
-        raise UserError(f"{where}: samples must be mono, [S] with S > 0, got {list(samples.shape)}")
-    if not np.isfinite(samples).all():
-        raise UserError(f"{where}: samples hold NaN or infinity")
-    rate = float(sound.rate)
-    if not (rate >= 1 and rate.is_integer()):
-        raise UserError(f"{where}: the rate must be a whole number of Hz above 0, got {sound.rate}")
-    return np.clip(resample_sound(samples.astype(np.float32), int(rate), RATE), -1.0, 1.0)
+def playable(sound: Sound) -> NDArray[np.float32]:
+    """Samples [S] of a sound at `RATE` Hz."""
+    if not len(sound.samples):
+        raise UserError("a sound without samples cannot be played; leave it out")
+    return np.clip(resample_sound(sound.samples, sound.rate, RATE), -1.0, 1.0)
 
 
 def wav_bytes(samples: NDArray[np.floating]) -> bytes:
@@ -164,7 +141,7 @@ Segments = Sequence[Segment | tuple[float, float, str]]
 class Score:
     """Sound, beats and segments on the time line of one motion, in seconds from frame 0."""
 
-    sound: Soundtrack | None = None
+    sound: Sound | None = None
     beats: Sequence[float] = ()
     segments: Segments = ()
 

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,13 +21,15 @@ from typing import NotRequired, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.body.rigid import RigidMotion
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.embed import PoseData, mesh_data, packed, pose_data
 from motionloom.pipeline.render.body.face import FACE_CONTROLS, FACE_NEUTRAL
 from motionloom.pipeline.render.body.posing import human_skeleton, posing_of
-from motionloom.pipeline.render.sound import ScoreData, Segments, Soundtrack, embed_sounds, score_data
+from motionloom.pipeline.render.sound import ScoreData, Segments, SoundData, embed_sounds, score_data
 
 SCRIPTS = [
     "space",
@@ -79,14 +80,6 @@ class ClipData(TypedDict):
     score: NotRequired[int]
 
 
-class SoundData(TypedDict):
-    """A sound's file in base64."""
-
-    mime: str
-    seconds: float
-    data: str
-
-
 class ViewerData(TypedDict):
     """Everything that the viewer's script needs."""
 
@@ -118,7 +111,7 @@ class ViewerMotion:
     caption: str = ""
     group: str = ""
     face_controls: NDArray[np.floating] | None = None
-    sound: Soundtrack | None = None
+    sound: Sound | None = None
     beats: Sequence[float] = ()
     segments: Segments = ()
     figure: RigidMotion | None = None
@@ -150,7 +143,8 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
     clips: list[ClipData] = []
     for number, motion in enumerate(motions):
         joints = _checked(motion, number)
-        skeleton = _skeleton(motion.parents, joints)
+        human = human_skeleton(motion.parents)
+        skeleton = _skeleton(motion.parents, human, joints)
         if skeleton not in skeletons:  # motions of one skeleton share it
             skeletons.append(skeleton)
         positions, low, step = quantise(joints)
@@ -171,7 +165,7 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
                 "step": [float(v) for v in step],
                 "positions": packed(positions),
                 "face": face,
-                "pose": _pose(motion, joints),
+                "pose": None if human is None else pose_data(posing_of(joints, human, motion.figure)),
             }
         )
     out: ViewerData = {
@@ -186,9 +180,9 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
     return out
 
 
-def _skeleton(parents: Sequence[int], joints: NDArray[np.float64]) -> SkeletonData:
-    """Sides by the names of a person's joints; by where they are in the first pose for other skeletons."""
-    own, human = [int(parent) for parent in parents], human_skeleton(parents)
+def _skeleton(parents: Sequence[int], human: Skeleton | None, joints: NDArray[np.float64]) -> SkeletonData:
+    """The tree of a motion; sides by the names of a person's joints, else by places in the first pose."""
+    own = [int(parent) for parent in parents]
     if human is not None:
         sides = [{"left": 1, "right": 2}.get(name.split("_")[0], 0) for name in human.joints]
         return {"parents": own, "sides": sides, "head": human.index("head")}
@@ -211,7 +205,7 @@ def _add_tracks(data: ViewerData, motions: Sequence[ViewerMotion]) -> None:
     """Put in distinct `sounds` and `scores`, where there are any; clips get the numbers of their own."""
     names = [_name(motion, number) for number, motion in enumerate(motions)]
     lengths = [len(motion.joints) / motion.fps for motion in motions]
-    sounds, playing = embed_sounds(zip(names, [motion.sound for motion in motions], lengths, strict=True))
+    sounds, playing = embed_sounds(zip([motion.sound for motion in motions], lengths, strict=True))
     scores: list[ScoreData] = []
     for motion, clip, name, length, sound in zip(
         motions, data["motions"], names, lengths, playing, strict=True
@@ -224,10 +218,7 @@ def _add_tracks(data: ViewerData, motions: Sequence[ViewerMotion]) -> None:
                 scores.append(score)
             clip["score"] = scores.index(score)
     if sounds:
-        data["sounds"] = [
-            {"mime": s.mime, "seconds": s.seconds, "data": base64.b64encode(s.data).decode("ascii")}
-            for s in sounds
-        ]
+        data["sounds"] = sounds
     if scores:
         data["scores"] = scores
 
@@ -294,11 +285,6 @@ def _checked(motion: ViewerMotion, number: int) -> NDArray[np.float64]:
                 f"{where}: face_controls must be finite [T={len(joints)}, 5], got {list(face.shape)}"
             )
     return joints
-
-
-def _pose(motion: ViewerMotion, joints: NDArray[np.float64]) -> PoseData | None:
-    skeleton = human_skeleton(motion.parents)
-    return None if skeleton is None else pose_data(posing_of(joints, skeleton, motion.figure))
 
 
 def _name(motion: ViewerMotion, number: int) -> str:

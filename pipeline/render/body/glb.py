@@ -82,7 +82,7 @@ class _Scene:
     """The file while it is put together."""
 
     def __init__(self, body: Body, clips: Sequence[GlbClip], figures: Sequence[RigidMotion]) -> None:
-        from pygltflib import GLTF2, Asset, Node, Scene, Skin
+        from pygltflib import GLTF2, Asset, Buffer, Node, Scene, Skin
 
         self.gltf = GLTF2(asset=Asset(version="2.0", generator="motionloom"), scene=0)
         self.blob = bytearray()
@@ -116,7 +116,8 @@ class _Scene:
         names = _distinct([clip.name for clip in clips])
         for name, clip, figure in zip(names, clips, figures, strict=True):
             self._animation(name, clip, figure, head=count + 1)
-        self._finish()
+        self.gltf.buffers = [Buffer(byteLength=len(self.blob))]
+        self.gltf.set_binary_blob(bytes(self.blob))
 
     def _material(self) -> None:
         from PIL import Image as Picture
@@ -233,12 +234,6 @@ class _Scene:
         self.gltf.bufferViews.append(view)
         self.blob += data + bytes(-len(data) % 4)
         return len(self.gltf.bufferViews) - 1
-
-    def _finish(self) -> None:
-        from pygltflib import Buffer
-
-        self.gltf.buffers = [Buffer(byteLength=len(self.blob))]
-        self.gltf.set_binary_blob(bytes(self.blob))
 
 
 def _merged(joints: NDArray[np.int64], shares: Values) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

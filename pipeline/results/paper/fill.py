@@ -9,8 +9,14 @@ from pathlib import Path
 
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, ROWS, Figure, Protocol, say_difference
 from motionloom.pipeline.results.paper.evaluations import Evaluation, evaluations_of
-from motionloom.pipeline.results.paper.filled import Cell, FilledRow, FilledTable
-from motionloom.pipeline.results.paper.notes import data_set_of, differences, notes_of
+from motionloom.pipeline.results.paper.filled import (
+    Cell,
+    FilledRow,
+    FilledTable,
+    data_set_of,
+    differences,
+    notes_of,
+)
 from motionloom.pipeline.results.paper.schema import Column, PaperTable, Row, config_fits, may_fill, value_at
 from motionloom.pipeline.store.run_state import StageRecord
 

@@ -7,7 +7,6 @@ import io
 import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +15,19 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-
-@dataclass(frozen=True)
-class Song:
-    """Sound as the renderers take it."""
-
-    samples: NDArray[np.float32]
-    rate: int
+from motionloom.datasets.audio.sound import Sound
 
 
 @pytest.fixture(scope="session")
-def song() -> Callable[..., Song]:
+def song() -> Callable[..., Sound]:
     """`song(seconds, rate, beat)`: a soft tone with a sharp click at each multiple of `beat` seconds."""
 
-    def make(seconds: float, rate: int = 30_720, beat: float = 0.5) -> Song:
+    def make(seconds: float, rate: int = 30_720, beat: float = 0.5) -> Sound:
         t = np.arange(round(seconds * rate)) / rate
         since = t % beat
         # The click is band-limited, so that compression and resampling leave its place alone.
         click = 0.7 * np.sin(2 * np.pi * 1500 * since) * np.exp(-since * 400)
-        return Song((0.05 * np.sin(2 * np.pi * 220 * t) + click).astype(np.float32), rate)
+        return Sound((0.05 * np.sin(2 * np.pi * 220 * t) + click).astype(np.float32), rate)
 
     return make
 

@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import multiprocessing
 import os
-import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -273,25 +271,24 @@ def test_a_full_disk_ends_a_training_with_a_sentence(tmp_path: Path, monkeypatch
     assert read_training_log(tmp_path / "hit") == read_training_log(tmp_path / "whole")
 
 
-KILLED = """
-import os, sys, time
-from pathlib import Path
-from motionloom.pipeline.training.checkpointing import BackgroundWriter, name_of
-folder = Path(sys.argv[1])
-writer = BackgroundWriter(keep=2)
-writer.write({"global_step": 1}, folder / name_of(1))
-writer.finish()
-os.fsync = lambda _: (print("writing", flush=True), time.sleep(60))
-writer.write({"global_step": 2}, folder / name_of(2))
-"""
+def write_and_hang(folder: Path, begun: Any) -> None:
+    """Write a checkpoint, and begin another that never ends."""
+    writer = BackgroundWriter(keep=2)
+    writer.write({"global_step": 1}, folder / name_of(1))
+    writer.finish()
+    os.fsync = lambda _: (begun.set(), time.sleep(60))  # type: ignore[assignment,return-value]
+    writer.write({"global_step": 2}, folder / name_of(2))
 
 
 def test_killed_while_it_writes(tmp_path: Path) -> None:
     """The checkpoint before is the newest, and what was being written goes with the next start."""
-    command = [sys.executable, "-P", "-c", KILLED, str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None and process.stdout.readline() == "writing\n"
-        process.send_signal(signal.SIGKILL)
+    context = multiprocessing.get_context("fork")  # torch is imported already
+    begun = context.Event()
+    process = context.Process(target=write_and_hang, args=(tmp_path, begun))
+    process.start()
+    assert begun.wait(30)
+    process.kill()
+    process.join()
     assert len(list(tmp_path.iterdir())) == 2
     assert newest(tmp_path) == tmp_path / name_of(1)
     assert read_checkpoint(tmp_path / name_of(1))["global_step"] == 1
