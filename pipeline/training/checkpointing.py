@@ -39,7 +39,7 @@ from motionloom.datasets.base.files import HashingFile, atomic_file, sync_folder
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Means, StageModule
-from motionloom.pipeline.training.progress import LogState
+from motionloom.pipeline.training.metric_log import LogState
 
 OptimizerState = dict[str, Any]
 """As `Optimizer.state_dict` gives it."""

@@ -1,4 +1,4 @@
-"""Per-rank training telemetry: speed, step times, waits, and a profile of a few steps on request.
+"""Progress and telemetry of a training: the bar, and per rank speed, step times, waits, a profile on request.
 
 A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, which the report draws.
 """
@@ -18,10 +18,12 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 from rich.console import Console
+from rich.progress import Progress
 from torch import Tensor
 from torch.profiler import profile, schedule
 
 from motionloom.datasets.base.files import atomic_path, write_text
+from motionloom.datasets.base.progress import Pace, bar
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
 from motionloom.pipeline.store.files import open_own
@@ -192,3 +194,44 @@ def step_profiler(name: str, folder: Path, steps: int, left: int, console: Conso
     warm = min(1, before)
     phases = schedule(wait=before - warm, warmup=warm, active=steps, repeat=1)
     return profile(schedule=phases, on_trace_ready=write, record_shapes=True)
+
+
+_REDRAW = 0.1
+"""Seconds between two states of the bar, which is drawn no more often."""
+
+
+class StepProgress:
+    """Steps done, loss, speed and time left: a bar on a terminal, a line every 15 s elsewhere; the lead's."""
+
+    def __init__(self, name: str, first: int, steps: int, console: Console) -> None:
+        self.name, self.steps, self.console = name, steps, console
+        self.pace = Pace(steps, first)
+        self._next = 0.0
+        self._bar: Progress | None = None
+        if rank() == 0:
+            self._bar = bar(console)
+            self._bar.start()
+            self._task = self._bar.add_task(name, total=steps, completed=first, note="")
+
+    def show(self, step: int, loss: Tensor) -> None:
+        """Move the bar, or print a line now and then."""
+        if self._bar is None:
+            return
+        terminal = self.console.is_terminal
+        if not terminal and not self.pace.due(step) and step < self.steps:
+            return
+        if terminal and step < self.steps:
+            now = time.monotonic()
+            if now < self._next:  # reading a loss waits for the GPU
+                return
+            self._next = now + _REDRAW
+        note = f"loss {float(loss):.4f}  {self.pace.speed(step):.1f} steps/s"
+        if terminal:
+            self._bar.update(self._task, completed=step, note=note)
+        else:
+            left = self.pace.left(step)
+            self.console.print(f"    {self.name}: step {step}/{self.steps}  {note}{left and f'  {left}'}")
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()

@@ -55,10 +55,9 @@ from motionloom.pipeline.training.execution import (
     set_threads,
 )
 from motionloom.pipeline.training.failures import FailureGuard, StallTimer
-from motionloom.pipeline.training.loggers import Loggers
+from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
-from motionloom.pipeline.training.progress import MetricLog, StepProgress
-from motionloom.pipeline.training.telemetry import Telemetry, step_profiler
+from motionloom.pipeline.training.telemetry import StepProgress, Telemetry, step_profiler
 
 
 def fit(
@@ -130,10 +129,8 @@ class Training:
         self.how = execution(fabric, module, config)
         self.optimizers = module.configure_optimizers()
         self.average = AveragedWeights(module.net, config.ema) if config.ema else None
-        self.log = MetricLog(
-            context.folder,
-            Loggers(hardware.loggers, context.folder, context.recipe, f"{context.recipe}/{name}"),
-        )
+        title = f"{context.recipe}/{name}"
+        self.log = MetricLog(context.folder, hardware.loggers, context.recipe, title)
         self.validation_is_due = False
         if resume.checkpoint is not None:
             self._load(read_checkpoint(resume.checkpoint), longer=resume.longer)

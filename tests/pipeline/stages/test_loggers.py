@@ -15,8 +15,8 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.tma import TmaStageConfig
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.training_log import read_training_log
-from motionloom.pipeline.training import loggers
-from motionloom.pipeline.training.loggers import Loggers
+from motionloom.pipeline.training import metric_log
+from motionloom.pipeline.training.metric_log import MetricLog
 
 FILES = {"loggers": ("tensorboard", "csv")}
 STEPS: dict[str, Any] = {"steps": 30, "checkpoint_every": 12, "validate_every": 12}
@@ -102,7 +102,7 @@ class Noted(Logger):
 def test_a_logger_gets_rows_with_their_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It cannot take one back: what a kill has undone must not have been sent."""
     sent: list[int] = []
-    monkeypatch.setitem(loggers._MAKERS, "wandb", lambda *_: Noted(sent))
+    monkeypatch.setitem(metric_log._MAKERS, "wandb", lambda *_: Noted(sent))
     server = {"loggers": ("wandb",)}
     with pytest.raises(ConnectionResetError):
         train(tmp_path, hardware=server, dies_at=23, **STEPS)
@@ -114,8 +114,8 @@ def test_a_logger_gets_rows_with_their_checkpoint(tmp_path: Path, monkeypatch: p
 
 
 def test_a_server_knows_a_training_that_goes_on(tmp_path: Path) -> None:
-    first, again = (Loggers((), tmp_path, "p", "t").identity("wandb") for _ in range(2))
-    assert first == again != Loggers((), tmp_path / "other", "p", "t").identity("wandb")
+    first, again = (MetricLog(tmp_path, (), "p", "t").identity("wandb") for _ in range(2))
+    assert first == again != MetricLog(tmp_path / "other", (), "p", "t").identity("wandb")
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
