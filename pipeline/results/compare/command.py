@@ -10,8 +10,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from motionloom.datasets.base.progress import duration
 from motionloom.pipeline.evaluation.figures import heading
@@ -30,17 +28,6 @@ from motionloom.pipeline.results.compare.tables import ComparedTable, RunRow, co
 from motionloom.pipeline.store.files import require_file_place
 from motionloom.pipeline.store.yaml import setting_text
 
-HEADLINES = (
-    ("reconstruction.mpjpe", "MPJPE, mm"),
-    ("tma.t2m_r1", "text to motion R@1"),
-    ("tma.fid", "FID"),
-    ("agreement.everything", "does all its caption says"),
-    ("beat_align.bailando", "Beat Align"),
-    ("movement.fid_k", "FID_k"),
-)
-"""Figures that the terminal shows, and their titles there."""
-KEYS = 6
-"""Settings that are named before the rest is counted."""
 NO_PAGES = ("report",)
 """Kinds of stages that nothing compared here comes from."""
 LETTERS = "ABCDEFGH"
@@ -56,57 +43,18 @@ def compare_runs(
     Args:
         runs: Two run folders or more, at most eight.
         out: The page.
-        console: Where the short table goes; standard output by default.
+        console: Where the path goes, and what runs lack; standard output by default.
     """
     console = console or make_console()
     require_file_place(out)
     opened = open_runs(runs)
     differences, tables = setting_differences(opened), compared_tables(opened)
     comparison_page(opened, differences, tables).write(out)
-    print_comparison(console, opened, differences, tables)
-    console.print(str(out.resolve()), soft_wrap=True)
-    return out
-
-
-def print_comparison(
-    console: Console,
-    runs: Sequence[ComparedRun],
-    differences: Sequence[StageDifferences],
-    tables: Sequence[ComparedTable],
-) -> None:
-    """One row a run with the leading figures, then what is missing and what was measured otherwise."""
-    leading = []
-    for name, title in HEADLINES:
-        table = next((t for t in tables if any(column.name == name for column in t.columns)), None)
-        if table is not None:
-            leading.append((name, title, table))
-    console.print(_table(runs, leading))
-    for run in runs:
+    for run in opened:
         if lines := missing_lines(run):
             console.print(f"{run.label}: missing {'; '.join(lines)}", markup=False, soft_wrap=True)
-    for sentence in dict.fromkeys(table.difference for _, _, table in leading if table.difference):
-        console.print(sentence, markup=False, soft_wrap=True)
-    keys = [f"{one.stage}.{key}" if one.stage else key for one in differences for key in one.differences]
-    if keys:
-        more = f" and {len(keys) - KEYS} more" if len(keys) > KEYS else ""
-        console.print(f"settings that differ: {', '.join(keys[:KEYS])}{more}", markup=False, soft_wrap=True)
-
-
-def _table(runs: Sequence[ComparedRun], leading: Sequence[tuple[str, str, ComparedTable]]) -> Table:
-    titles = ["run", "finished", *(title for _, title, _ in leading)]
-    table = Table(*titles, title=f"{len(runs)} runs (* best of those measured alike)", title_justify="left")
-    for run in runs:
-        done = sum(stage.usable for stage in run.state.stages)
-        cells = [escape(run.label), f"{done} of {len(run.state.stages)}"]
-        for name, _, compared in leading:
-            row = next((row for row in compared.rows if row.run is run), None)
-            cell = None if row is None else _figure_cell(row, name)
-            mark = "" if cell is None else " (*)" if cell.maybe else " *" if cell.best else ""
-            cells.append("–" if cell is None else f"{cell}{mark}")
-        table.add_row(*cells)
-    if any(row.best.get(name) is False for name, _, compared in leading for row in compared.rows):
-        table.caption, table.caption_justify = "(*) its interval overlaps another's", "left"
-    return table
+    console.print(str(out.resolve()), soft_wrap=True)
+    return out
 
 
 def _figure_cell(row: RunRow, name: str) -> Cell | None:

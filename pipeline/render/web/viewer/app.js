@@ -2,7 +2,7 @@
 
 const VIEWS = { "3/4": [0.62, 0.2], front: [0, 0.08], side: [Math.PI / 2, 0.08], top: [0.62, 1.35] };
 const SPEEDS = [0.1, 0.25, 0.5, 1, 1.5, 2];
-const KEYS = "Space plays · ←/→ step a frame · Home/End ends · +/− zoom · Shift+arrows turn · 1–4 views · C close-up · F follow · L loop · R reset";
+const KEYS = "Space plays · ←/→ step a frame · Home/End ends · +/− zoom · Shift+arrows turn · 1–4 views · C close-up · F follow · R reset";
 
 function element(tag, properties, ...children) {
   const node = document.createElement(tag);
@@ -42,7 +42,7 @@ function mountViewer(root, data, options) {
   const rate = Math.max(...clips.map((c) => c.fps));
   const last = Math.round(duration * rate);
   const calm = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const state = { time: 0, playing: !calm, speed: 1, follow: true, loop: false, draws: 0, close: false };
+  const state = { time: 0, playing: !calm, speed: 1, follow: true, draws: 0, close: false };
   const camera = { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
   let theme, stale = true, dragging = 0, printing = false;
   const stage = clips.some((clip) => clip.pose) ? openStage() : null, pace = stage && watchPace(stage);
@@ -67,11 +67,7 @@ function mountViewer(root, data, options) {
   const button = (name, act) => bar[name].addEventListener("click", act);
 
   // ---- clock
-  const localTime = (clip) => (state.loop && clip.frames > 1 ? state.time % (clip.duration + 1 / clip.fps) : state.time);
-  const localFrame = (clip) => {
-    if (clip.frames < 2) return 0;
-    return clamp(localTime(clip) * clip.fps, 0, clip.frames - 1);
-  };
+  const localFrame = (clip) => clamp(state.time * clip.fps, 0, clip.frames - 1); // shorter motions hold their last frame
   const frame = () => clamp(Math.round(state.time * rate), 0, last);
   const play = (on) => {
     if (!on) state.time = player.halt(state.time);
@@ -90,11 +86,6 @@ function mountViewer(root, data, options) {
   let lead = null;
   const leads = (clip) => clip.sound === lead.sound && clip.score === lead.score;
   const player = makePlayer(sounds, {
-    laps: (time) => {
-      if (!state.loop || !lead || lead.frames < 2) return [0, 0];
-      const lap = lead.duration + 1 / lead.fps;
-      return [lap, Math.floor(time / lap)];
-    },
     changed: () => {
       bar.sound.setAttribute("aria-pressed", String(player.on));
       bar.sound.disabled = player.failed;
@@ -169,8 +160,8 @@ function mountViewer(root, data, options) {
     const centre = state.follow ? pathAt(clip, local) : clip.frame.middle;
     drawGround(ctx, lens, centre, clip.floor, theme);
     drawTrail(ctx, lens, clip, local, theme);
-    cell.now.show(segmentAt(clip.score, localTime(clip)));
-    const own = Math.round(local), over = !state.loop && state.time > clip.duration + 0.5 / clip.fps;
+    cell.now.show(segmentAt(clip.score, state.time));
+    const own = Math.round(local), over = state.time > clip.duration + 0.5 / clip.fps;
     cell.count.textContent = `${own + 1} / ${clip.frames}${over ? " · ended" : ""}`;
     if (stage && stage.ready && clip.pose) {
       const item = stageItem(stage, clip, lens, local, face, theme, state.playing && !printing ? stage.quality : 0);
@@ -191,8 +182,7 @@ function mountViewer(root, data, options) {
     before = now;
     if (state.playing && !dragging && duration > 0) {
       state.time = player.advance(state.time, passed);
-      // A short rest on the last frame before the next round; none where every motion loops by itself.
-      if (state.time > duration + (state.loop ? 1 / rate : 0.35)) state.time = 0;
+      if (state.time > duration + 0.35) state.time = 0; // a short rest on the last frame before the next round
       stale = true;
     } else player.rest();
     if (stale && !printing) {
@@ -202,9 +192,9 @@ function mountViewer(root, data, options) {
       if (pace && state.playing) pace.note(performance.now() - start, between);
       const shown = Math.min(state.time, duration);
       bar.scrub.value = frame();
-      const segment = lead ? segmentAt(lead.score, localTime(lead)) : null;
+      const segment = lead ? segmentAt(lead.score, state.time) : null;
       bar.scrub.setAttribute("aria-valuetext", `${shown.toFixed(2)} seconds${segment ? `, ${segment[2]}` : ""}`);
-      if (strip) strip.mark(lead ? localTime(lead) : state.time);
+      if (strip) strip.mark(state.time);
       bar.time.textContent = `${shown.toFixed(2)} / ${duration.toFixed(2)} s`;
       state.draws += 1;
     }
@@ -216,7 +206,6 @@ function mountViewer(root, data, options) {
   button("back", () => step(-1));
   button("forth", () => step(1));
   button("follow", () => toggle("follow", "follow"));
-  button("loop", () => toggle("loop", "loop"));
   button("close", () => toggle("close", "close"));
   button("theme", () => { document.documentElement.dataset.theme = isDark() ? "light" : "dark"; });
   const setSpeed = (value) => { state.speed = value; player.setSpeed(value); };
@@ -242,7 +231,7 @@ function mountViewer(root, data, options) {
   const actions = {
     " ": () => play(!state.playing), ArrowLeft: () => step(-1), ArrowRight: () => step(1),
     Home: () => setFrame(0), End: () => { play(false); setFrame(last); }, "+": () => zoom(1.15), "=": () => zoom(1.15),
-    "-": () => zoom(1 / 1.15), f: () => bar.follow.click(), l: () => bar.loop.click(), c: () => bar.close.click(),
+    "-": () => zoom(1 / 1.15), f: () => bar.follow.click(), c: () => bar.close.click(),
     r: () => bar["view 3/4"].click(), t: () => bar.theme.click(), m: () => setSound(!player.on),
   };
   Object.keys(VIEWS).forEach((name, k) => { actions[k + 1] = () => bar[`view ${name}`].click(); });
@@ -303,7 +292,7 @@ function mountViewer(root, data, options) {
     get follow() { return state.follow; },
     remove, play, setFrame, paint: () => paintAll(cells.filter((cell) => cell.visible)), setView, turn, toggle: (name) => toggle(name, name),
     get sound() { return player.on; }, get audio() { return player.audio; },
-    get segment() { return lead && segmentAt(lead.score, localTime(lead)); },
+    get segment() { return lead && segmentAt(lead.score, state.time); },
     get view() { return stage && stage.ready ? "webgl" : "2d"; }, stage,
     bones: (k) => [...bonesAt(clips[k], localFrame(clips[k]))], // what moves the mesh now, for checks from outside
     lens: (k) => lensOfCell(cells[k]), canvas: (k) => cells[k].canvas, floor: (k) => clips[k].floor,

@@ -71,7 +71,6 @@ function buildBar(last, duration, strip, sounding) {
     time: element("output", { className: "mlv-time" }),
     speed: element("select", { title: "Speed" }),
     follow: button("Follow", "Camera follows the root (F)", true),
-    loop: button("Loop each", "Shorter motions start again instead of holding their last frame (L)", false),
     close: button("Close-up", "Close-up of the head (C)", false),
     theme: button("◐", "Dark or light (T)"),
     sound: button("♪ Sound", "Sound on (M)", false),
@@ -97,7 +96,7 @@ function buildBar(last, duration, strip, sounding) {
     element("span", { className: strip ? "mlv-line mlv-tight" : "mlv-line" },
       bar.play, bar.back, bar.forth, ...(strip ? [] : [bar.scrub]), bar.time),
     ...sound,
-    element("span", { className: "mlv-line mlv-wrap" }, bar.speed, views, bar.close, bar.follow, bar.loop, bar.theme, legend));
+    element("span", { className: "mlv-line mlv-wrap" }, bar.speed, views, bar.close, bar.follow, bar.theme, legend));
   bar.help = element("p", { className: "mlv-help", textContent: `Drag to orbit · Shift-drag or right-drag to pan · wheel or pinch to zoom · double-click to reset · ${KEYS}${sounding ? " · M sound" : ""}` });
   return bar;
 }

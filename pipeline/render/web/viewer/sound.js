@@ -2,12 +2,11 @@
 
 const PATIENCE = 1; // seconds that the figures wait for sound to start, before they go on without
 
-/* `laps(time)` -> [length of a lap or 0, laps done]: where "Loop each" is on, sound starts again with its motion.
-   `changed()` after sound went on or off; `stopped()` when someone outside the page pauses it, a headset's key say. */
-function makePlayer(sounds, { laps, changed, stopped }) {
+/* `changed()` after sound went on or off; `stopped()` when someone outside the page pauses it, a headset's key say. */
+function makePlayer(sounds, { changed, stopped }) {
   const player = { on: false, failed: false, audio: null };
   const made = new Map();
-  let length = 0, speed = 1, volume = 1, last = null, lapOf = 0, waited = 0, starting = false;
+  let length = 0, speed = 1, volume = 1, last = null, waited = 0, starting = false;
 
   player.choose = (number) => {
     const next = number === undefined ? null : made.get(number) || openSound(sounds[number]);
@@ -39,10 +38,10 @@ function makePlayer(sounds, { laps, changed, stopped }) {
   };
   /* Silence at once; the viewer's time where the sound stopped, which may have gone on since the last drawing. */
   player.halt = (time) => {
-    const { audio } = player, [lap, done] = laps(time);
+    const { audio } = player;
     const heard = audio && !audio.paused && !audio.seeking && !starting && time === last;
     player.rest();
-    return heard ? lap * done + audio.currentTime : time;
+    return heard ? audio.currentTime : time;
   };
 
   const begin = (place) => {
@@ -57,16 +56,15 @@ function makePlayer(sounds, { laps, changed, stopped }) {
   };
   /* The viewer's time after `passed` seconds of the wall clock, by the sound where there is one to hear. */
   player.advance = (time, passed) => {
-    const { audio } = player, [lap, done] = laps(time), place = time - lap * done;
-    if (!player.on || !audio || place >= length - 0.02) {
+    const { audio } = player;
+    if (!player.on || !audio || time >= length - 0.02) {
       player.rest();
       return time + passed * speed;
     }
     audio.defaultPlaybackRate = audio.playbackRate = speed;
     audio.volume = volume;
-    if (time !== last || done !== lapOf) { // someone went elsewhere, or a lap is over
-      lapOf = done;
-      begin(place);
+    if (time !== last) { // someone went elsewhere
+      begin(time);
       last = time;
       return time;
     }
@@ -84,8 +82,8 @@ function makePlayer(sounds, { laps, changed, stopped }) {
       return last;
     }
     // Some browsers move their audio clock in steps: go on evenly, pulled towards it, and never 15 ms away.
-    const heard = audio.currentTime, even = place + passed * speed;
-    last = lap * done + clamp(even + 0.2 * (heard - even), heard - 0.015, heard + 0.015);
+    const heard = audio.currentTime, even = time + passed * speed;
+    last = clamp(even + 0.2 * (heard - even), heard - 0.015, heard + 0.015);
     return last;
   };
   return player;
