@@ -42,8 +42,6 @@ from motionloom.pipeline.store.weights import MODEL_FILES
 
 INDEX_FILE = "search.npz"
 _VERSION = 2
-_BLOCK = 4096
-"""Rows that are multiplied at a time: their floats stay in the processor's cache."""
 _BATCH = 256
 MISFIT = 0.5
 """Share of other captions that fit a motion better than its own from which its own are suspect: above a half,
@@ -53,7 +51,6 @@ _OTHERS = 500
 _WRISTS = [Skeleton.named("smpl22").index(f"{side}_wrist") for side in ("left", "right")]
 
 Vectors = NDArray[np.float32]
-HalfVectors = NDArray[np.float16]
 
 
 class Hit(NamedTuple):
@@ -65,20 +62,11 @@ class Hit(NamedTuple):
     """Cosine with the query."""
 
 
-def unit_rows(vectors: Vectors) -> HalfVectors:
-    """Vectors [n, Z] scaled to length 1, in half precision."""
-    lengths = np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
-    return np.asarray(vectors / lengths, np.float16)
-
-
-def cosines(rows: HalfVectors, query: Vectors) -> Vectors:
-    """Cosines [n] of rows of length 1 [n, Z] with a query [Z] of any length."""
-    unit = (query / max(float(np.linalg.norm(query)), 1e-12)).astype(np.float32)
-    out = np.empty(len(rows), np.float32)
-    for start in range(0, len(rows), _BLOCK):
-        block = slice(start, start + _BLOCK)
-        out[block] = rows[block].astype(np.float32) @ unit
-    return out
+def unit(vectors: Vectors) -> Vectors:
+    """Vectors [..., Z] scaled to length 1."""
+    return np.asarray(
+        vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12), np.float32
+    )
 
 
 def alignment_model(name: Path | str, device: str = "auto") -> tuple[LoadedTma, str]:
@@ -107,7 +95,7 @@ class Search:
     splits: Splits
     """All clips, also excluded ones, which are never returned."""
     tma: LoadedTma
-    vectors: HalfVectors
+    vectors: Vectors
     """Embeddings [n, Z] of length 1, in the order of `places`."""
     places: tuple[Place, ...]
     excluded: frozenset[str] = field(default_factory=frozenset)
@@ -122,10 +110,12 @@ class Search:
         places = tuple(Place(split, clip) for split, part in splits.items() for clip in range(len(part)))
         vectors = _stored(root / INDEX_FILE, made_from, (len(places), tma.net.config.latent))
         if vectors is None:
-            vectors = unit_rows(np.concatenate(list(_embedded(splits, places, tma, progress))))
+            embedded = np.concatenate(list(_embedded(splits, places, tma, progress)))
+            half = unit(embedded).astype(np.float16)
             with atomic_file(root / INDEX_FILE) as file:
                 key = np.frombuffer(made_from.encode(), np.uint8)
-                np.savez(file, allow_pickle=False, made_from=key, vectors=vectors)
+                np.savez(file, allow_pickle=False, made_from=key, vectors=half)
+            vectors = half.astype(np.float32)  # the same numbers as when the file is read
         return Search(splits, tma, vectors, places, frozenset(manifest.excluded))
 
     @cached_property
@@ -142,7 +132,7 @@ class Search:
         """The embedding [Z] of a clip of the set, by its id."""
         if clip_id not in self.ids:
             raise UserError(f"no clip '{clip_id}' in this data set; its ids are in the answers of a search")
-        return np.asarray(self.vectors[self.ids.index(clip_id)], np.float32)
+        return np.asarray(self.vectors[self.ids.index(clip_id)])
 
     def motion(self, joints: NDArray[np.floating], fps: float) -> Vectors:
         """The embedding [Z] of joints [T, 22 or 52, 3] in metres, Y up."""
@@ -173,7 +163,7 @@ class Search:
 
     def best(self, query: Vectors, count: int = 12, without: str = "") -> list[Hit]:
         """The clips nearest to an embedding [Z], the best first, except the one with the id `without`."""
-        scores, hits = cosines(self.vectors, query), list[Hit]()
+        scores, hits = self.vectors @ unit(query), list[Hit]()
         # Enough candidates that excluded clips, were they the nearest, leave `count` others.
         some = min(len(scores), count + 1 + len(self.excluded))
         near = np.argpartition(-scores, some - 1)[:some] if some else np.zeros(0, int)
@@ -189,14 +179,14 @@ class Search:
         if len(different) < 2:
             return
         row = {text: k for k, text in enumerate(different)}
-        captions = unit_rows(self._texts(different))
+        captions = unit(self._texts(different))
         # A sample of all captions is enough to estimate a share, and keeps large sets fast.
         spread = np.unique(np.linspace(0, len(different) - 1, _OTHERS).round().astype(int))
+        others = captions[spread]
         for at, (place, own) in enumerate(zip(self.places, texts, strict=True)):
             if own:
-                motion = self.vectors[at].astype(np.float32)
-                mine = cosines(captions[[row[text] for text in own]], motion)
-                theirs = cosines(captions[spread], motion)
+                mine = captions[[row[text] for text in own]] @ self.vectors[at]
+                theirs = others @ self.vectors[at]
                 share = float((theirs > mine.max()).mean())
                 if share > MISFIT:
                     nearest, best = own[int(mine.argmax())], different[int(spread[int(theirs.argmax())])]
@@ -245,7 +235,7 @@ def _embedded(splits: Splits, places: Sequence[Place], tma: LoadedTma, progress:
             meter.advance(len(motions))
 
 
-def _stored(path: Path, made_from: str, shape: tuple[int, int]) -> HalfVectors | None:
+def _stored(path: Path, made_from: str, shape: tuple[int, int]) -> Vectors | None:
     """The stored embeddings of these clips and weights; None for others, a damaged file, or no file."""
     try:
         with NpzFile(path) as stored:
@@ -254,4 +244,4 @@ def _stored(path: Path, made_from: str, shape: tuple[int, int]) -> HalfVectors |
             vectors = stored.array("vectors", limit=2 * shape[0] * shape[1] + 4096)
     except UserError:
         return None
-    return vectors if vectors.shape == shape and vectors.dtype == np.float16 else None
+    return vectors.astype(np.float32) if vectors.shape == shape and vectors.dtype == np.float16 else None

@@ -74,9 +74,9 @@ def run_recipe(
         raise
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:
+        require_fit(todo, loaded.hardware)  # before the estimate, which takes seconds
         say_estimate(loaded, console, run, todo)
         console.print(plan_table(loaded, plan))
-        require_fit(todo, loaded.hardware)
     replaced = replaced_stages(run, plan)
     refusal = None if replace else explain_replacements(run, loaded.name, replaced)
     if refusal is not None and not dry_run:

@@ -18,8 +18,7 @@ from motionloom.models.tokenizer.config import VqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.showing import ModelCard
-from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.dry_run import TrainingTime, estimate, plan_record
+from motionloom.pipeline.runs.dry_run import TrainingTime, estimate, estimate_table, plan_record
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.slurm import launch_recipe
 from motionloom.pipeline.training.memory import _saved_bytes
@@ -38,10 +37,6 @@ stages:
 """
 
 
-def cards(path: Path, *overrides: str) -> dict[str, ModelCard]:
-    return estimate(load_recipe(path, overrides))
-
-
 @pytest.fixture
 def paper(tmp_path: Path) -> Path:
     path = tmp_path / "paper.yaml"
@@ -49,8 +44,8 @@ def paper(tmp_path: Path) -> Path:
     return path
 
 
-def test_paper_counts(paper: Path, tmp_path: Path) -> None:
-    rows = cards(paper)
+def test_paper_counts(paper: Path) -> None:
+    rows = estimate(load_recipe(paper))
     assert list(rows) == ["tokenizer", "vanilla", "tma", "gpt"]
     assert rows["gpt"].note == "98 body + 49 hand + 2 End = 149 for 196 frames"
     assert rows["gpt"].parameters == pytest.approx(229e6, rel=0.01)
@@ -59,17 +54,20 @@ def test_paper_counts(paper: Path, tmp_path: Path) -> None:
     assert rows["vanilla"].note == "1 code per 4 frames, 75 bit/s"
     assert {row.local_batch for row in rows.values()} == {64}
     console = Console(record=True, width=200)
-    run_recipe(paper, tmp_path / "run", dry_run=True, console=console)
-    said = console.export_text()
-    assert "GiB" in said and "300,000" in said and not (tmp_path / "run").exists()
+    console.print(estimate_table(rows, {}))
+    text = console.export_text()
+    assert "GiB" in text and "300,000" in text
 
 
 def test_memory_follows_batch_and_checkpointing(paper: Path) -> None:
-    def memory(*overrides: str) -> int:
-        return cards(paper, *overrides)["gpt"].memory_bytes
+    def card(*overrides: str) -> ModelCard:
+        return estimate(load_recipe(paper, overrides), {"gpt"})["gpt"]
 
-    whole = memory()
-    weights = 16 * cards(paper)["gpt"].parameters
+    def memory(*overrides: str) -> int:
+        return card(*overrides).memory_bytes
+
+    first = card()
+    whole, weights = first.memory_bytes, 16 * first.parameters
     half = memory("gpt.train.batch_size=32")
     assert whole - weights == pytest.approx(2 * (half - weights), rel=0.02)
     assert memory("gpt.train.checkpoint_activations=true") - weights < 0.2 * (whole - weights)

@@ -118,7 +118,9 @@ def test_without_a_cluster_in_a_dry_run_or_in_anothers_folder_nothing_is_written
     with pytest.raises(UserError, match="no sbatch here"):
         launch_recipe("humantomato-tiny", gpus_per_node=1, out=tmp_path / "run", console=console())
     to = console()
-    launch_recipe("humantomato-tiny", gpus_per_node=1, dry_run=True, console=to)
+    # Data that are elsewhere, so that nothing is estimated.
+    away = ("stages.data={kind: shards, path: elsewhere}",)
+    launch_recipe("humantomato-tiny", gpus_per_node=1, overrides=away, dry_run=True, console=to)
     assert "2-train" in said(to) and "until evaluate" in " ".join(said(to).replace("- ", "").split())
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "recipe.yaml").write_text("name: other\n")
