@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -251,27 +252,32 @@ class SmallRun:
     output: str
 
 
+def run_once(
+    factory: pytest.TempPathFactory, name: str, content: str, start: Callable[..., Any], *options: object
+) -> SmallRun:
+    """The finished run of a recipe; the first of the test processes that needs it makes it for all."""
+    base = factory.getbasetemp()
+    root = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "runs" / name
+    root.mkdir(parents=True, exist_ok=True)
+    recipe, folder, log = root / f"{name}.yaml", root / "run", root / "log"
+    with (root / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not log.is_file():
+            recipe.write_text(content)
+            process = start("run", recipe, "--out", folder, *options)
+            output, _ = process.communicate(timeout=240)
+            assert process.returncode == 0, output
+            log.write_text(output)
+    return SmallRun(recipe, folder, log.read_text())
+
+
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any]) -> SmallRun:
-    """Every stage of a small recipe, run once for all tests."""
-    root = tmp_path_factory.mktemp("small")
-    recipe = root / "small.yaml"
-    recipe.write_text(SMALL)
-    folder = root / "run"
-    process = start("run", recipe, "--out", folder)
-    output, _ = process.communicate(timeout=240)
-    assert process.returncode == 0, output
-    return SmallRun(recipe, folder, output)
+    """Every stage of a small recipe."""
+    return run_once(tmp_path_factory, "small", SMALL, start)
 
 
 @pytest.fixture(scope="session")
 def ude_run(tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any]) -> SmallRun:
     """A small UDE, text or music to motion, up to the stage that generates."""
-    root = tmp_path_factory.mktemp("ude")
-    recipe = root / "ude-small.yaml"
-    recipe.write_text(UDE)
-    folder = root / "run"
-    process = start("run", recipe, "--out", folder, "--until", "ude")
-    output, _ = process.communicate(timeout=240)
-    assert process.returncode == 0, output
-    return SmallRun(recipe, folder, output)
+    return run_once(tmp_path_factory, "ude-small", UDE, start, "--until", "ude")
