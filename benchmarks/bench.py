@@ -78,7 +78,7 @@ def train(
     path.parent.mkdir(parents=True, exist_ok=True)
     hardware = {"accelerator": "cpu", "threads": torch.get_num_threads()}
     path.write_text(dump_yaml({"name": folder.name, "hardware": hardware, **fields, "stages": dict(stages)}))
-    select = Selection(only=until, force=True) if force else Selection(until=until)
+    select = Selection(first=until, until=until) if force else Selection(until=until)
     return run_recipe(path, folder, select=select, replace=True, console=Console())
 
 

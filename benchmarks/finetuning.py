@@ -1,7 +1,7 @@
 """Does a trained model's help last? Fine-tuning against training from nothing, for equal processor time.
 
     motionloom data convert bvh mocap shards --captions mocap/captions.jsonl --licence CC-BY-NC-4.0 \
-      --layout wholebody363 --set fingers=resting
+      --set layout=wholebody363 --set fingers=resting
     python benchmarks/finetuning.py LABELS WORK --data shards --start synthetic --judge runs/bvh-body
 
 `scratch` trains tokenizer, TMA and GPT from new weights, with the data's own statistics. `whole` and `lora`

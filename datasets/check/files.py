@@ -37,7 +37,7 @@ from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.convert.common.splits import read_ids, read_split_files
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
-from motionloom.datasets.schema import SPLITS, UserError
+from motionloom.datasets.schema import SPLITS, Config, UserError
 from motionloom.datasets.shards.tar import npy_from_bytes, scan_tar
 from motionloom.datasets.text.clean import usable_caption
 
@@ -51,8 +51,7 @@ _SPLIT_NAMES = frozenset((*SPLITS, "train_val", "all"))
 _SPLIT_FOLDERS = frozenset(("splits", "split"))
 
 
-@dataclass(frozen=True)
-class FileRules:
+class FileRules(Config):
     """What single files are expected to hold."""
 
     layout: str | None = None
@@ -60,10 +59,11 @@ class FileRules:
     fps: float | None = None
     """Frame rate, for the ranges of speeds; None = the layout's usual one."""
     texts: str = "auto"
+    """How `.txt` files are read, one of `TEXTS`."""
     seconds: float | None = None
     """Length of the clips that captions belong to; None leaves their ends unchecked."""
 
-    def __post_init__(self) -> None:
+    def model_post_init(self, _: object) -> None:
         if self.texts not in TEXTS:
             raise UserError(f"texts '{self.texts}': choose one of {', '.join(TEXTS)}")
         if self.layout not in (None, *JOINTS, *LAYOUTS):
@@ -199,9 +199,9 @@ def _layout_hint(path: Path, layout: MotionLayout) -> str:
     except UserError:
         return ""
     if len(shape) == 3 and (shape[1:] in JOINTS.values()):
-        return f"; for joints: --layout joints{shape[1]}"
+        return f"; for joints: --set layout=joints{shape[1]}"
     known = [name for name in LAYOUTS if MotionLayout.named(name).dim == shape[-1] != layout.dim]
-    return f"; for this width: --layout {known[0]}" if len(shape) == 2 and known else ""
+    return f"; for this width: --set layout={known[0]}" if len(shape) == 2 and known else ""
 
 
 def _check_npz(path: Path, rules: FileRules) -> Verdict:

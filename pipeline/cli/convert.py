@@ -1,22 +1,23 @@
 """`motionloom data convert SOURCE-KIND …`: one command per converter, made from its config class.
 
-The options of a command are the fields of the converter's config that are used every day (`_EVERYDAY`), and
-their docstrings are the help; `--set KEY=VALUE` sets any other, which the help lists. So the command line, a
-recipe's stage and the Python API can never differ. A converter is imported when asked for.
+Options say how to run. What to make of the source is `--set KEY=VALUE`, with the fields of the converter's
+config for keys, and their docstrings for help: so the command line, a recipe's stage and the Python API can
+never differ. The few fields of `config.everyday` have an option too. A converter is imported when asked for.
 """
 
 from __future__ import annotations
 
+import difflib
 import inspect
+import json
 import shlex
 import time
-import types
 import typing
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from pydantic.fields import FieldInfo
 from rich.console import Console
 from rich.table import Table
 from typer.core import TyperGroup
@@ -24,9 +25,9 @@ from typer.main import get_command
 
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.registry import converter_named, names
-from motionloom.datasets.schema import MANIFEST_FILE, Config, Manifest, UserError
+from motionloom.datasets.schema import MANIFEST_FILE, Manifest, UserError
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
-from motionloom.pipeline.cli.options import AsJson, fields_of, print_json
+from motionloom.pipeline.cli.options import AsJson, Workers, fields_of, print_json, set_option
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.store.files import require_folder
 
@@ -37,34 +38,13 @@ if typing.TYPE_CHECKING:
 _REASONS = 12
 """Reasons for clips that were left out, a line each; the file has every clip."""
 
-_EVERYDAY = (
-    "layout", "fps", "licence", "limit", "use", "subsets", "captions", "splits", "uncaptioned", "joint_map",
-    "unit", "up", "music", "body_model", "humanml_index", "humanml_texts", "where", "sound", "tasks",
-    "variant",
-)  # fmt: skip
-"""Fields with an option of their own, where a converter has them."""
-
 _RUN_OPTIONS: dict[str, tuple[object, object]] = {
     "plan": (
         Annotated[bool, typer.Option("--plan", help="Only list what would be done, with disk and time.")],
         False,
     ),
-    "strict": (
-        Annotated[bool, typer.Option("--strict", help="Stop when a clip is missing or cannot be read.")],
-        False,
-    ),
-    "workers": (
-        Annotated[int, typer.Option(help="Processes; the shards are the same bytes for any number.")],
-        2,
-    ),
-    "clips_per_shard": (Annotated[int, typer.Option(help="Clips in one tar file.")], 256),
-    "sets": (
-        Annotated[
-            list[str] | None,
-            typer.Option("--set", "-s", metavar="KEY=VALUE", help="Any other setting, as below."),
-        ],
-        None,
-    ),
+    "workers": (Workers, 2),
+    "sets": (Annotated[list[str] | None, set_option("A setting below.")], None),
     "as_json": (AsJson, False),
 }
 
@@ -101,38 +81,39 @@ def _convert() -> None:
 
 
 def _command(name: str) -> Any:
+    """The command of a converter: its arguments, its everyday fields, and how to run it."""
     entry = converter_named(name)
     config = entry.config_class
-    fields = {
-        key: field
-        for key, field in config.model_fields.items()
-        if key != "source" and (key in _EVERYDAY or field.is_required())
-    }
 
-    def run(source: Path, out: Path, **values: Any) -> None:
+    def run(source: Path, out: Path, plan: bool, workers: int, sets: list[str] | None, as_json: bool,
+            **everyday: Any) -> None:  # fmt: skip
         started = time.perf_counter()  # the imports are the larger part of a short conversion
-        steering = {key: values.pop(key) for key in _RUN_OPTIONS}
-        given = {key: _plain(fields[key], value) for key, value in values.items()}
-        given |= fields_of(steering.pop("sets"), "--set")
-        if steering["as_json"] and not steering["plan"]:
+        if as_json and not plan:
             raise UserError("--json is for the plan: give --plan too")
-        console = make_console(aside=steering["as_json"])
-        fields_given = {"source": source, **given}
-        convert_command(name, fields_given, out, console=console, started=started, **steering)
+        settings = {key: value for key, value in everyday.items() if value is not None}
+        settings |= fields_of(sets, "--set")
+        _require_known(settings, config, f"data convert {name}")
+        fields = {"source": source, **settings}
+        console = make_console(aside=as_json)
+        convert_command(
+            name, fields, out, plan=plan, workers=workers, console=console, started=started, as_json=as_json
+        )
 
     parameters = [
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),
         _parameter("out", Annotated[Path, typer.Argument(help="Folder for the shards.")]),
-        *(_option(key, field) for key, field in fields.items()),
-        *(_parameter(key, kind, default) for key, (kind, default) in _RUN_OPTIONS.items()),
     ]
+    for key in config.everyday:
+        option = typer.Option(f"--{key}", help=_help(config, key))
+        parameters.append(_parameter(key, Annotated[config.model_fields[key].annotation, option], None))
+    parameters += [_parameter(key, kind, default) for key, (kind, default) in _RUN_OPTIONS.items()]
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    run.__doc__ = f"{entry.summary}\n\nExample: `motionloom data convert {name} {entry.example} --plan`"
-    others = [key for key in config.model_fields if key != "source" and key not in fields]
-    if others:
-        listed = "\n".join(f"- `{key}`: {_help(config, key)}" for key in others)
-        run.__doc__ += f"\n\nBy `--set KEY=VALUE`:\n\n{listed}"
+    listed = "\n".join(f"- `{key}`: {_help(config, key)}" for key in _settings(config))
+    run.__doc__ = (
+        f"{entry.summary}\n\nExample: `motionloom data convert {name} {entry.example} --plan`\n\n"
+        f"Settings for `--set KEY=VALUE`:\n\n{listed}"
+    )
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
     app.command(name)(run)
     return get_command(app)
@@ -142,20 +123,30 @@ def _parameter(name: str, annotation: object, default: object = inspect.Paramete
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _option(key: str, field: FieldInfo) -> inspect.Parameter:
-    """A command line option for one field: its type, default and docstring."""
-    kind, name = _simple(field.annotation), key.replace("_", "-")
+def _settings(config: type[ConvertConfig]) -> list[str]:
+    """Fields without an argument or option of their own."""
+    return [key for key in config.model_fields if key not in ("source", *config.everyday)]
+
+
+def _require_known(keys: Iterable[str], config: type[ConvertConfig], where: str) -> None:
+    """`UserError` with the nearest setting and its help, and all settings, for a key that is none."""
+    for key in keys:
+        if key not in config.model_fields:
+            known = sorted(_settings(config))
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f"did you mean '{near[0]}' ({_help(config, near[0]).rstrip('.')})? " if near else ""
+            raise UserError(f"{where}: unknown key '{key}'; {hint}settings: {', '.join(known)}")
+
+
+def _help(config: type[ConvertConfig], key: str) -> str:
+    """The field's docstring, with the words that it takes and its default."""
+    field = config.model_fields[key]
     text = " ".join((field.description or "").split())
-    choices = _choices(field.annotation)
-    if choices:
-        text = f"{text} One of: {', '.join(choices)}."
-    info = typer.Option(f"--{name}/--no-{name}" if kind is bool else f"--{name}", help=text)
-    if field.is_required():
-        return _parameter(key, Annotated[kind, info])
+    if choices := _choices(field.annotation):
+        text += f" One of: {', '.join(choices)}."
     default = field.get_default(call_default_factory=True)
-    if typing.get_origin(kind) is list:
-        kind, default = kind | None, list(default) or None
-    return _parameter(key, Annotated[kind, info], default)
+    shown = f" Default: {_yaml(default)}." if default not in (None, "", ()) else ""
+    return text if field.is_required() else text + shown
 
 
 def _choices(annotation: object) -> list[str]:
@@ -167,27 +158,16 @@ def _choices(annotation: object) -> list[str]:
     return [word for part in typing.get_args(annotation) for word in _choices(part)]
 
 
-def _simple(annotation: object) -> Any:
-    """The command line's type for a field: constraints are the config's business."""
-    origin = typing.get_origin(annotation)
-    if origin is Literal:
-        return str
-    if origin is tuple:
-        return list[typing.get_args(annotation)[0]]  # type: ignore[misc]
-    if origin in (typing.Union, types.UnionType):
-        kinds = [_simple(kind) for kind in typing.get_args(annotation) if kind is not type(None)]
-        return kinds[0] | None
-    return annotation
+def _yaml(value: object) -> str:
+    """A setting as `--set` reads it."""
+    from motionloom.pipeline.store.yaml import load_yaml
 
-
-def _plain(field: FieldInfo, value: object) -> object:
-    if value is None and typing.get_origin(field.annotation) is tuple:
-        return ()
-    return value
-
-
-def _help(config: type[Config], key: str) -> str:
-    return " ".join((config.model_fields[key].description or "").split())
+    if isinstance(value, tuple):
+        return f"[{','.join(map(_yaml, value))}]"
+    if isinstance(value, bool | int | float):
+        return json.dumps(value)
+    text = str(value)
+    return text if load_yaml(text, "a setting") == text else json.dumps(text)
 
 
 def convert_command(
@@ -196,9 +176,7 @@ def convert_command(
     out: Path,
     *,
     plan: bool,
-    strict: bool,
     workers: int,
-    clips_per_shard: int,
     console: Console,
     started: float | None = None,
     as_json: bool = False,
@@ -229,13 +207,7 @@ def convert_command(
     for note in conversion.plan.notes:
         say(console, f"note: {note}")
     manifest = run_conversion(
-        conversion,
-        out,
-        workers=workers,
-        strict=strict,
-        clips_per_shard=clips_per_shard,
-        progress=shown,
-        say=lambda line: say(console, line),
+        conversion, out, workers=workers, progress=shown, say=lambda line: say(console, line)
     )
     say_manifest(manifest, out, console)
     for note in manifest.notes:
@@ -264,15 +236,7 @@ def proposed(
         value = changes.get(key, getattr(config, key))
         if key == "source" or value is None or value == field.get_default(call_default_factory=True):
             continue
-        option = f"--{key.replace('_', '-')}"
-        if key not in _EVERYDAY and not field.is_required():
-            listed = f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else value
-            words += ["--set", f"{key}={str(listed).lower() if isinstance(value, bool) else listed}"]
-        elif isinstance(value, bool):
-            words.append(option if value else f"--no-{option[2:]}")
-        else:
-            for one in value if isinstance(value, tuple) else (value,):
-                words += [option, str(one)]
+        words += [f"--{key}", str(value)] if key in config.everyday else ["--set", f"{key}={_yaml(value)}"]
     return shlex.join(words)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.console import Console
@@ -15,14 +14,17 @@ from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Dropped, Manifest, UserError
 from motionloom.datasets.shards.left_out import grouped
 from motionloom.pipeline.cli.convert import convert_app, say, say_manifest
-from motionloom.pipeline.cli.options import AsJson, plain, print_json
+from motionloom.pipeline.cli.options import AsJson, Workers, fields_of, plain, print_json, set_option
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.render.charts import label
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
+    from motionloom.datasets.check.files import FileRules
     from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess
 
+_SUSPECTS = 60
+"""Suspects on the page, at most: the worst."""
 _ALIKE = 5
 """Findings that say the same and are still listed one by one."""
 
@@ -32,19 +34,21 @@ data_app = typer.Typer(
 data_app.add_typer(convert_app, name="convert")
 
 Out = Annotated[Path, typer.Argument(help="Folder for the shards.")]
-Workers = Annotated[int, typer.Option(help="Processes; the shards are the same bytes for any number.")]
+Root = Annotated[Path, typer.Argument(help="Folder with manifest.json.")]
 
 
 @data_app.command()
 def synth(
     out: Out,
     clips: Annotated[int, typer.Option(help="Number of clips over all splits.")] = 512,
-    seed: Annotated[int, typer.Option(help="Same seed, same clips.")] = 0,
-    layout: Annotated[
-        str, typer.Option(help="wholebody363 (body, hands, face) or body133.")
-    ] = "wholebody363",
-    music: Annotated[bool, typer.Option("--music", help="Add dances with their audio.")] = False,
     workers: Workers = 2,
+    sets: Annotated[
+        list[str] | None,
+        set_option(
+            "What to make: seed=1; layout=body133 (default wholebody363, with hands and face); "
+            "dances={}, which adds dances with their music; actions=all, ..."
+        ),
+    ] = None,
 ) -> None:
     """Procedural whole-body motion whose captions are true.
 
@@ -52,8 +56,7 @@ def synth(
     """
     from motionloom.datasets.synth.generate import SynthConfig, synthesize
 
-    fields = {"clips": clips, "seed": seed, "layout": layout, "dances": {} if music else None}
-    config = SynthConfig.parse(fields, "data synth")
+    config = SynthConfig.parse({"clips": clips, **fields_of(sets, "--set")}, "data synth")
     require_folder(out)
     say_manifest(synthesize(config, out, workers=workers), out, make_console())
 
@@ -64,23 +67,15 @@ def check(
         list[Path],
         typer.Argument(help="Folders with manifest.json; or source files, or folders of such files."),
     ],
-    layout: Annotated[
-        str | None,
-        typer.Option(
-            help="Files: layout of .npy arrays, or joints22, joints52; default smplx322 (Motion-X)."
+    sets: Annotated[
+        list[str] | None,
+        set_option(
+            "Of files: layout of .npy arrays, or joints22, joints52 (default smplx322, Motion-X's); fps; "
+            "texts, how .txt is read: auto, humanml, plain (a caption a line) or ids; seconds, the length of "
+            "the clips of captions."
         ),
     ] = None,
-    fps: Annotated[
-        float | None, typer.Option(help="Files: frame rate, if not the layout's usual one.")
-    ] = None,
-    texts: Annotated[
-        str, typer.Option(help="Files: how .txt is read: auto, humanml, plain (a caption a line) or ids.")
-    ] = "auto",
-    seconds: Annotated[float | None, typer.Option(help="Files: length of the clips of captions.")] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Warnings count as problems.")] = False,
-    every: Annotated[
-        bool, typer.Option("--all", help="List every finding, also where many say the same.")
-    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Checksums, schema, finite values, ranges, people on a floor, duplicates, leaks. Exit code 1 and a list.
@@ -90,45 +85,39 @@ def check(
 
     Example: `motionloom data check shards`
 
-    Example: `motionloom data check HumanML3D/new_joint_vecs --layout h3d263`
+    Example: `motionloom data check HumanML3D/new_joint_vecs --set layout=h3d263`
     """
-    rules = {"layout": layout, "fps": fps, "texts": texts, "seconds": seconds}
-    console = make_console(aside=as_json)
-    if len(paths) == 1:
-        count, found = _check_one(paths[0], rules, every, strict, console)
-    else:
-        count, each, sets = 0, [], []
-        for path in paths:
-            problems, one = _check_one(path, rules, every, strict, console)
-            count += problems
-            each.append(one)
-            sets += [path] if "files" not in one else []
-        leaks = _leaks(sets, console)
-        count, found = count + len(leaks), {"paths": each, "problems": count + len(leaks), "leaks": leaks}
+    from motionloom.datasets.check.files import FileRules
+
+    rules, console = FileRules.parse(fields_of(sets, "--set"), "data check"), make_console(aside=as_json)
+    records = [_check_one(path, rules, strict, console) for path in paths]
+    record, count = records[0], sum(cast(int, one["problems"]) for one in records)
+    if len(paths) > 1:
+        leaks = _leaks(
+            [path for path, one in zip(paths, records, strict=True) if "files" not in one], console
+        )
+        count += len(leaks)
+        record = {"paths": records, "problems": count, "leaks": leaks}
     if as_json:
-        print_json(found)
+        print_json(record)
     raise typer.Exit(1 if count else 0)
 
 
-def _check_one(
-    path: Path, rules: Mapping[str, Any], every: bool, strict: bool, console: Console
-) -> tuple[int, dict[str, object]]:
+def _check_one(path: Path, rules: FileRules, strict: bool, console: Console) -> dict[str, object]:
+    """The record of a data set, a file or a folder of files: `problems` and what was found."""
     if not path.exists():
         raise UserError(f"{path}: no such folder or file")
     files = path.is_file() or _holds_files(path)
-    of_files = [f"--{name}" for name, value in rules.items() if value not in (None, "auto")]
-    if of_files and not files:
+    if rules.model_fields_set and not files:
         raise UserError(
-            f"{path}: {', '.join(of_files)} is for single files; a data set says this in its manifest.json; "
-            f"leave it out"
+            f"{path}: --set {', '.join(sorted(rules.model_fields_set))} is for single files; a data set says "
+            f"this in its manifest.json; leave it out"
         )
-    count, warned, found = (
-        _check_files(path, rules, console) if files else _check_dataset(path, every, console)
-    )
+    count, warned, found = _check_files(path, rules, console) if files else _check_dataset(path, console)
     if strict:
         count += warned
     console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
-    return count, {"path": path, "problems": count, **found}
+    return {"path": path, "problems": count, **found}
 
 
 def _leaks(folders: list[Path], console: Console) -> list[str]:
@@ -213,11 +202,10 @@ def face(
 
 @data_app.command()
 def report(
-    root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
+    root: Root,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The page; default ROOT/report.html.")
     ] = None,
-    clips: Annotated[int, typer.Option(help="Clips to watch, at most.")] = 12,
 ) -> None:
     """One self-contained page about a data set: counts, captions, rejected clips, clips to watch.
 
@@ -227,24 +215,26 @@ def report(
 
     console, path = make_console(), out or root / "report.html"
     require_file_place(path)
-    write_data_report(root, path, clips=clips, progress=console.is_terminal)
+    write_data_report(root, path, progress=console.is_terminal)
     console.print(str(path), markup=False, soft_wrap=True)
 
 
 @data_app.command()
 def clean(
-    root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
+    root: Root,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The page; default ROOT/clean.html.")
     ] = None,
     model: Annotated[
         str | None, typer.Option(help="Also judge captions by this run's, export's or shipped model's TMA.")
     ] = None,
-    clips: Annotated[int, typer.Option(min=1, help="Suspects on the page, at most: the worst.")] = 60,
     decisions: Annotated[
-        Path | None, typer.Option(help="Leave out and keep what a file that the page saved says.")
+        Path | None,
+        typer.Option(
+            help="Leave out and keep what a file that the page saved says; `none` forgets all decisions, and "
+            "every clip is back."
+        ),
     ] = None,
-    undo: Annotated[bool, typer.Option("--undo", help="Forget all decisions: every clip is back.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Suspect clips on a page to watch and decide about; what is left out is listed, and nothing deleted.
@@ -257,13 +247,11 @@ def clean(
     Example: `motionloom data clean shards --decisions decisions.json`
     """
     console, page = make_console(aside=as_json), out or root / "clean.html"
-    if decisions is not None or undo:
+    if decisions is not None:
         from motionloom.datasets.check import decisions as cleaning
         from motionloom.datasets.schema import Decisions
 
-        if decisions is not None and undo:
-            raise UserError("--undo forgets all decisions: give --decisions afterwards")
-        if decisions is None:
+        if decisions == Path("none"):
             manifest = cleaning.undo(root)
         else:
             manifest = cleaning.decide(root, Decisions.load_json(decisions), str(decisions))
@@ -278,9 +266,9 @@ def clean(
 
     require_file_place(page)
     found = suspects_of(root, model, progress=console.is_terminal)
-    for suspect in list(found.values())[: None if as_json else clips]:
+    for suspect in list(found.values())[: None if as_json else _SUSPECTS]:
         say(console, f"{suspect.id}: {'; '.join(fault.text for fault in suspect.faults)}")
-    write_clean_page(root, page, found, clips)
+    write_clean_page(root, page, found, _SUSPECTS)
     kinds = ", ".join(f"{count} {kind}" for kind, count in kinds_of(found).items())
     say(console, f"{page}: {len(found)} suspects{f' ({kinds})' if kinds else ''}")
     if as_json:
@@ -289,10 +277,7 @@ def clean(
 
 @data_app.command()
 def stats(
-    root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
-    group: Annotated[
-        bool, typer.Option("--group", help="Average the deviation per kind of feature (HumanML3D).")
-    ] = False,
+    root: Root,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Also write a .safetensors file.")] = None,
 ) -> None:
     """Counts, lengths, and mean and deviation per kind of feature (training split).
@@ -313,7 +298,7 @@ def stats(
     lengths = np.asarray(dataset.frames) / dataset.layout.fps
     low, middle, high = np.percentile(lengths, [5, 50, 95])
     console.print(f"clip length: median {middle:.1f} s, 5 % below {low:.1f} s, 5 % above {high:.1f} s")
-    stats = compute(dataset, group=group)
+    stats = compute(dataset)
     table = Table("feature", "dims", "mean |mean|", "mean deviation", "largest deviation")
     for name, size in dataset.layout.fields:
         columns = dataset.layout.slice(name)
@@ -335,15 +320,15 @@ def _holds_files(folder: Path) -> bool:
     return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
 
 
-def _check_dataset(root: Path, every: bool, console: Console) -> tuple[int, int, dict[str, object]]:
+def _check_dataset(root: Path, console: Console) -> tuple[int, int, dict[str, object]]:
     from motionloom.datasets.check.dataset import examine
 
     report = examine(root, progress=console.is_terminal)
     for title, problems in (("warning: ", report.warnings), ("", report.errors)):
         findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
         for group in grouped(findings):
-            if group.count > _ALIKE and not every:
-                say(console, f"{title}{group}; each of them: --all")
+            if group.count > _ALIKE:
+                say(console, f"{title}{group}; each of them: --json")
                 continue
             for finding in group.members:
                 say(console, f"{title}{finding.source}: {finding.reason}")
@@ -354,12 +339,9 @@ def _check_dataset(root: Path, every: bool, console: Console) -> tuple[int, int,
     return errors, warnings, cast(dict[str, object], plain(report))
 
 
-def _check_files(
-    path: Path, given: Mapping[str, Any], console: Console
-) -> tuple[int, int, dict[str, object]]:
-    from motionloom.datasets.check.files import FileRules, check_file, check_folder
+def _check_files(path: Path, rules: FileRules, console: Console) -> tuple[int, int, dict[str, object]]:
+    from motionloom.datasets.check.files import check_file, check_folder
 
-    rules = FileRules(**given)
     bad, warned, found = 0, 0, []
     for verdict in [check_file(path, rules)] if path.is_file() else check_folder(path, rules):
         say(console, str(verdict))

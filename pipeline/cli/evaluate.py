@@ -26,10 +26,10 @@ def evaluate(
     table: Annotated[
         str | None,
         typer.Option(
-            help="Measure nothing; show a table of a paper, or all, with finished runs' rows: ude/2, ude."
+            help="Measure nothing; show a table of a paper (ude/2), or all of it (ude), with finished runs' "
+            "rows; `list` names the tables."
         ),
     ] = None,
-    tables: Annotated[bool, typer.Option("--tables", help="List the tables of the papers.")] = False,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Markdown file for a table.")] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -40,10 +40,10 @@ def evaluate(
     Example: `motionloom evaluate --table humantomato/7 runs/baselines-tiny runs/humantomato-tiny -o seven.md`
     """
     runs = run_folders or []
-    if tables or table is not None:
+    if table is not None:
         if as_json:
             raise UserError("--json is of figures measured anew; leave it out")
-        _show_table(table, tables, runs, out, measuring=clips or repeats or device != "auto")
+        _show_table(table, runs, out, measuring=clips or repeats or device != "auto")
         return
     if out is not None:
         raise UserError("--out is of a table; name one, like --table humantomato/7")
@@ -61,10 +61,8 @@ def evaluate(
         print_json(figures_in(folder))
 
 
-def _show_table(
-    table: str | None, tables: bool, runs: list[Path], out: Path | None, *, measuring: object
-) -> None:
-    """A table of a paper, or the list of all; what is not of tables is refused."""
+def _show_table(table: str, runs: list[Path], out: Path | None, *, measuring: object) -> None:
+    """Show a table of a paper, or list all; refuse what is not of tables."""
     from motionloom.pipeline.results.paper.compare import compare_with_paper, list_tables
 
     if measuring:
@@ -72,9 +70,9 @@ def _show_table(
             "--clips, --repeats and --device measure anew, and a table shows what was measured; "
             "leave them out"
         )
-    if table is not None:
+    if table != "list":
         compare_with_paper(table, runs, out=out, console=make_console())
     elif runs or out is not None:
-        raise UserError("--tables lists the tables alone; to see one, give --table NAME RUN...")
+        raise UserError("--table list names the tables alone; to see one, give --table NAME RUN...")
     else:
         list_tables(make_console())

@@ -33,8 +33,10 @@ from motionloom.pipeline.cli.options import (
     RunFolder,
     Sampling,
     Sets,
+    fields_of,
     print_json,
     sampling_of,
+    set_option,
 )
 from motionloom.pipeline.cli.search import search
 from motionloom.pipeline.launch.console import SafeConsole, make_console, quiet_libraries
@@ -113,8 +115,6 @@ def run(
     until: Annotated[
         str | None, typer.Option(help="Only this stage and what it needs; several as A,B.")
     ] = None,
-    only: Annotated[str | None, typer.Option(help="Only this stage; its inputs must be finished.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Run the selected stages even if finished.")] = False,
     replace: Annotated[
         bool,
         typer.Option(
@@ -125,9 +125,6 @@ def run(
     verify: Annotated[
         bool, typer.Option("--verify", help="First compare all files of finished stages with their sha256.")
     ] = False,
-    profile: Annotated[
-        int, typer.Option("--profile", metavar="STEPS", min=0, help="Profile so many steps of each training.")
-    ] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
@@ -149,7 +146,7 @@ def run(
             raise UserError("--json is for the plan: give --dry-run too")
         from motionloom.pipeline.runs.dry_run import plan_record
 
-        select = Selection(first, until, only, force)
+        select = Selection(first, until)
         print_json(plan_record(recipe, out, overrides=sets or (), select=select))
         return
     from motionloom.pipeline.runs.api import run_recipe
@@ -158,11 +155,10 @@ def run(
         recipe,
         out,
         overrides=sets or (),
-        select=Selection(first, until, only, force),
+        select=Selection(first, until),
         dry_run=dry_run,
         replace=replace,
         verify=verify,
-        profile=profile,
         console=make_console(),
     )
 
@@ -220,13 +216,13 @@ def serve(
         str, typer.Option(help="Address to listen at; others can reach all but loopback.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port; 0 takes a free one.")] = 8000,
-    allow_host: Annotated[
+    sets: Annotated[
         list[str] | None,
-        typer.Option("--allow-host", help="A name by which the server is reached. May be repeated."),
+        set_option(
+            "A limit: waiting (requests that wait for the model), max_seconds (of a motion), max_sound_mb, "
+            "...; or allow_hosts=[NAME], names by which the server is reached."
+        ),
     ] = None,
-    waiting: Annotated[int, typer.Option(help="Requests that may wait for the model; more get 429.")] = 32,
-    max_seconds: Annotated[float, typer.Option(help="Longest motion.")] = 30.0,
-    max_sound_mb: Annotated[float, typer.Option(help="Largest sound file.")] = 20.0,
     device: Device = "auto",
 ) -> None:
     """A page to type captions, drop music and watch, and a JSON API, on this machine.
@@ -235,19 +231,11 @@ def serve(
 
     Example: `motionloom serve runs/humantomato-tiny`
 
-    Example: `motionloom serve my-model --port 0 --max-seconds 10`
+    Example: `motionloom serve my-model --port 0 --set max_seconds=10`
     """
     from motionloom.pipeline.serve.requests import ServeConfig
 
-    asked = {
-        "host": host,
-        "port": port,
-        "allow_hosts": tuple(allow_host or ()),
-        "waiting": waiting,
-        "max_seconds": max_seconds,
-        "max_sound_mb": max_sound_mb,
-    }
-    config = ServeConfig.parse(asked, "serve")
+    config = ServeConfig.parse({"host": host, "port": port, **fields_of(sets, "--set")}, "serve")
     try:
         from motionloom.pipeline.serve.server import serve as run_server
     except ModuleNotFoundError as error:
@@ -267,9 +255,6 @@ def retrieval(
     stage: Annotated[
         str | None, typer.Option(help="What judges, for example temos or evaluator; default: tma.")
     ] = None,
-    split: Annotated[str | None, typer.Option(help="train, val or test; default: the test split.")] = None,
-    seed: Annotated[int, typer.Option(help="Shuffles the batches of protocols C and D.")] = 0,
-    device: Device = "auto",
 ) -> None:
     """Text-motion retrieval by a run's TMA, TEMOS or evaluator, under the paper's protocols A to D.
 
@@ -279,7 +264,7 @@ def retrieval(
     """
     from motionloom.pipeline.evaluation.retrieval import retrieval_command
 
-    retrieval_command(run_folder, stage=stage, split=split, seed=seed, device=device, console=make_console())
+    retrieval_command(run_folder, stage=stage, console=make_console())
 
 
 @app.command()
@@ -288,7 +273,6 @@ def report(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The page; default RUN/report/report.html.")
     ] = None,
-    device: Device = "auto",
 ) -> None:
     """One self-contained page: motions to watch, figures, where they err, curves, codebooks, what was run.
 
@@ -298,7 +282,7 @@ def report(
     """
     from motionloom.pipeline.runs.api import report_run
 
-    report_run(run_folder, out, device=device, console=make_console())
+    report_run(run_folder, out, console=make_console())
 
 
 @app.command()

@@ -32,6 +32,7 @@ Sets = Annotated[
 Device = Annotated[
     str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
 ]
+Workers = Annotated[int, typer.Option(help="Processes; the shards are the same bytes for any number.")]
 
 Sampling = Annotated[
     list[str] | None,
@@ -43,6 +44,11 @@ Sampling = Annotated[
         "Default: as the model recommends.",
     ),
 ]
+
+
+def set_option(help: str) -> Any:
+    """`--set KEY=VALUE`, for the fields of a config."""
+    return typer.Option("--set", "-s", metavar="KEY=VALUE", help=f"{help} May be repeated.")
 
 
 def fields_of(words: Sequence[str] | None, option: str) -> dict[str, Any]:

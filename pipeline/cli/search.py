@@ -9,8 +9,11 @@ import typer
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.convert import say
-from motionloom.pipeline.cli.options import AsJson, Device, print_json
+from motionloom.pipeline.cli.options import AsJson, print_json
 from motionloom.pipeline.launch.console import make_console
+
+_CLIPS = 12
+"""Clips that are listed."""
 
 
 def search(
@@ -22,8 +25,6 @@ def search(
     model: Annotated[
         str, typer.Option(help="Run, export or shipped model whose TMA reads words and motions.")
     ] = "synthetic",
-    count: Annotated[int, typer.Option(min=1, help="Clips to list.")] = 12,
-    device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
     """List the clips of a data set that are nearest to words, or to a clip.
@@ -39,7 +40,7 @@ def search(
         raise UserError("search: give words or --like, one of them")
     from motionloom.pipeline.evaluation.search import Search
 
-    found = Search.open(root, model, device=device, progress=True)
+    found = Search.open(root, model, progress=True)
     file = Path(like)
     if words:
         query = found.words(words)
@@ -48,7 +49,7 @@ def search(
     else:
         query = found.clip(like)
     hits = []
-    for hit in found.best(query, count, like):
+    for hit in found.best(query, _CLIPS, like):
         texts = found.splits[hit.place.split].texts(hit.place.clip)
         caption = texts[0].text if texts else ""
         say(console, f"{hit.score:5.2f}  {hit.place.split:5}  {hit.id}  {caption}")

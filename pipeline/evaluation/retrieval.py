@@ -159,20 +159,12 @@ def _figures(name: str, meaning: str, values: dict[str, float], facts: dict[str,
     return out
 
 
-def retrieval_command(
-    run: Path,
-    *,
-    stage: str | None = None,
-    split: str | None,
-    seed: int,
-    device: str = "auto",
-    console: Console,
-) -> Path:
+def retrieval_command(run: Path, *, stage: str | None = None, console: Console) -> Path:
     """Print the table and write RUN/retrieval.json; of a `stage` other than the default,
     RUN/retrieval-STAGE.json.
     """
     require_own(run)
-    file = retrieve(run, stage, split=split, seed=seed, device=device)
+    file = retrieve(run, stage)
     print_tables(file.figures, console)
     stage = file.about["stage"]
     path = run / ("retrieval.json" if stage == _judges(run)[0] else f"retrieval-{stage}.json")

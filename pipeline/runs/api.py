@@ -48,19 +48,17 @@ def run_recipe(
     dry_run: bool = False,
     replace: bool = False,
     verify: bool = False,
-    profile: int = 0,
     console: Console | None = None,
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
 
-    With `verify` all files of finished stages are compared with their checksums first. `profile` steps
-    of each training are profiled.
+    With `verify` all files of finished stages are compared with their checksums first.
 
     Without `replace`, a run that would replace finished work that took long (`dry_run.py`), or that would
     write into the folder of another recipe's run, is refused.
     """
     console = console or make_console()
-    loaded = load_recipe(recipe, [*overrides, f"hardware.profile={profile}"] if profile else overrides)
+    loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
     if verify:
         folders = [stage_folder(run, stage.name) for stage in loaded.stages]

@@ -3,8 +3,8 @@ programs (`motionloom run --dry-run`, with `--json`).
 
 Nothing that took long is replaced unless the user asks for it. Guarded are trainings, whatever they took, and
 every other stage that took an hour or more, such as a long conversion **[ours]**. The rest (statistics,
-tokens, figures, pages) is cheap and runs again without asking. `--from` and `--force` ask for the stages that
-they run again; `--replace` asks for all.
+tokens, figures, pages) is cheap and runs again without asking. `--from` asks for the stages that it
+runs again; `--replace` asks for all.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ next to the fingerprint, a digest of all that the fingerprint covers except the 
 is the same and no learning-rate schedule ends with the training, what has been trained is the beginning of
 what is wanted. A schedule that ends with it is lengthened, which is said, and noted in the artifact.
 
-`--from` and `--force` run stages again. Until all of them are done the run folder keeps a note of that
+`--from` runs stages again. Until all of them are done the run folder keeps a note of that
 request, and each stage a note that it was begun for it, so the same command after a kill goes on instead of
 beginning again.
 """
@@ -50,17 +50,13 @@ class Selection:
     """Run this stage and all below it again."""
     until: str | None = None
     """Stop after this stage: only it and what it needs. Several with commas between them."""
-    only: str | None = None
-    """Just this stage; its inputs must be finished."""
-    force: bool = False
-    """Run the selected stages even if they are finished."""
 
 
 class Request(Config):
     """`.again.json`: which command asked for stages to be run again."""
 
     id: str
-    select: dict[str, str | bool | None]
+    select: dict[str, str | None]
 
 
 class Started(Config):
@@ -91,7 +87,7 @@ class PlannedStage:
     started: Started
     """Content of `started.json` in the stage's folder."""
     request: Request | None
-    """The request for which the stage is run again: the selection names it (`--from`, `--force`)."""
+    """The request for which the stage is run again: the selection names it (`--from`)."""
     identities: Mapping[str, str]
     """Identities of its inputs from outside when the plan was made."""
 
@@ -104,9 +100,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     """Decide for every stage, in order, what happens to it."""
     select = select or Selection()
     wanted = selected(recipe, select)
-    forced = _descendants(recipe, select.first) if select.first else set()
-    if select.force:
-        forced |= wanted
+    forced = _descendants(recipe, select.first) & wanted if select.first else set()
     request, done = _request(run, select, forced) if forced else (None, set())
     rows: dict[str, PlannedStage] = {}
     # In the recipe's order, since a fingerprint needs those of the inputs.
@@ -138,12 +132,6 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
         started = started.model_copy(update={"lengthened": lengthened})
         identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
         rows[stage.name] = PlannedStage(stage, action, reason, started, again, identities)
-    if select.only:
-        for role, name in recipe.stage(select.only).inputs.items():
-            if name in rows and rows[name].action != "skip":
-                raise UserError(
-                    f"--only {select.only}: its input '{role}' ({name}) is not finished; run it first"
-                )
     return list(rows.values())
 
 
@@ -158,28 +146,18 @@ def require_fit(rows: Sequence[PlannedStage], hardware: Hardware) -> None:
 
 def selected(recipe: Recipe, select: Selection) -> set[str]:
     """Names of the stages that may run; refuses selections that contradict each other."""
-    first, until, only = select.first, select.until, select.only
+    first, until = select.first, select.until
     last = [name.strip() for name in until.split(",")] if until is not None else []
-    named = [("--from", first), *(("--until", name) for name in last), ("--only", only)]
+    named = [("--from", first), *(("--until", name) for name in last)]
     for option, name in named:
         if name is not None:
             recipe.stage(name, option)
-    for option, name in (("--from", first), ("--until", until)):
-        if only and name and name != only:
-            raise UserError(f"--only {only} runs that stage alone: leave {option} {name} out")
     needed = _ancestors(recipe, *last)
     if first and until and first not in needed:
         raise UserError(
             f"--from {first} --until {until}: '{until}' does not need '{first}', so there is nothing between "
             f"them; leave one out"
         )
-    if first and select.force and not only:
-        raise UserError(
-            f"--from {first} runs that stage and those below it again, --force all that are selected: leave "
-            f"one out"
-        )
-    if only:
-        return {only}
     return needed if until is not None else {stage.name for stage in recipe.stages}
 
 
@@ -224,7 +202,7 @@ def _done(folder: Path, request: Request) -> bool:
 
 def _decide_again(started: Started, before: Started | None, select: Selection) -> tuple[Action, str]:
     """The action of a stage that must run again and has not yet."""
-    reason = "forced" if select.force else f"from {select.first}"
+    reason = f"from {select.first}"
     same = before and (before.request, before.fingerprint) == (started.request, started.fingerprint)
     return ("resume", f"{reason}; started earlier, not finished") if same else ("run", reason)
 

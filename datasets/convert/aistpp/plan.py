@@ -254,7 +254,7 @@ def _find_music(config: AistppConfig) -> _Music:
     if not folder.is_dir():
         if config.music == "require" or config.music_folder is not None:
             raise UserError(
-                f"{folder}: no such folder of music; give --music-folder, or convert with --music none"
+                f"{folder}: no such folder of music; name it, --set music_folder=FOLDER, or --set music=none"
             )
         return music
     for path in sorted(folder.iterdir()):

@@ -42,6 +42,7 @@ class AmassConfig(CaptionConfig):
     """AMASS, or any folder tree of SMPL, SMPL-H or SMPL-X clips in .npz files (`SUBSET/subject/clip.npz`)."""
 
     layouts = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
+    everyday = ("captions",)
 
     name: str = "amass"
     """Name of the data set; part of the shards' file names."""

@@ -188,15 +188,16 @@ def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
         write_text(path, guess.text(key))
     elif path.read_text(encoding="utf-8") != guess.text(key) and guess.certain:
         raise UserError(
-            f"{path}: not the joint map that is guessed; use it with --joint-map {path.parent}, or delete it"
+            f"{path}: not the joint map that is guessed; delete it, or use it: --set joint_map={path.parent}"
         )
-    return f"complete {path} and pass the folder with --joint-map {path.parent}"
+    return f"complete {path} and pass the folder with --set joint_map={path.parent}"
 
 
 class BvhConfig(CaptionConfig):
     """Options of the BVH converter."""
 
     layouts = ("body133", "wholebody313", "wholebody363", "h3d263", "tomato623")
+    everyday = ("captions", "licence")
 
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""

@@ -281,8 +281,8 @@ def settle_captions(config: CaptionConfig, draft: CaptionedPlan[C], found: Listi
         draft.stop = (
             f"{config.captions}: no captions for {len(bare_clips)} of {total} clips ({_some(bare_clips)})"
             + (f"; captions for {_unused(found)}" if found.unused else "")
-            + "; add them, or choose with --uncaptioned (in a recipe uncaptioned): drop leaves these clips "
-            "out, keep converts them without words"
+            + "; add them, or choose --set uncaptioned=drop, which leaves these clips out, or "
+            "uncaptioned=keep, which converts them without words"
         )
 
 

@@ -19,6 +19,8 @@ class ConvertConfig(Config):
     model_config = ConfigDict(use_attribute_docstrings=True)
     layouts: ClassVar[tuple[str, ...]] = LAYOUTS
     """Layouts that can be made from the source."""
+    everyday: ClassVar[tuple[str, ...]] = ()
+    """Fields that the command line has an option for; all others are settings (`--set KEY=VALUE`)."""
 
     source: Path
     """Folder of the source, as its authors publish it."""
@@ -50,6 +52,14 @@ class ConvertConfig(Config):
     most_rejected: float = Field(default=0.5, ge=0, le=1, json_schema_extra={"runtime": True})
     """Share of the clips that may turn out unreadable or unfit; a conversion that loses more fails, although
     what is left of it is written."""
+    strict: bool = Field(default=False, json_schema_extra={"runtime": True})
+    """Stop when a clip is missing or cannot be read."""
+
+    @field_validator("*")
+    @classmethod
+    def _home(cls, value: object) -> object:
+        """Paths with `~` for the home folder, which no shell expands behind `--set KEY=`."""
+        return value.expanduser() if isinstance(value, Path) else value
 
     @field_validator("where")
     @classmethod

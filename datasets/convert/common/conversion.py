@@ -138,27 +138,26 @@ def run_conversion(
     out: Path,
     *,
     workers: int = 1,
-    strict: bool = False,
     seed: int = 0,
     clips_per_shard: int = _CLIPS_PER_SHARD,
     progress: bool = True,
     part: Part | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Manifest:
-    """Write the shards. `strict` stops when anything is missing or cannot be read.
+    """Write the shards.
 
     Before the first clip a few are looked at (`config.look`). `say` gets what an earlier run has finished,
     and what the look found odd. Same input and options give the same bytes for any `workers`; a killed run
     goes on at the first unfinished shard. With `part`, only that part is made, without a manifest (the one
     returned covers the part); the run without one then finds all parts and writes index and manifest.
     """
-    how = WriteOptions(workers, clips_per_shard, seed, strict, progress, part)
+    how = WriteOptions(workers, clips_per_shard, seed, conversion.config.strict, progress, part)
     plan = conversion.plan
     convert: Convert[C] = conversion.converter.convert
     plan.require_settled()
     if plan.items and not conversion.converter.licence(plan):
-        raise UserError(f"{plan.name}: say under which licence the clips are: --licence CC-BY-4.0 (licence)")
-    if strict:
+        raise UserError(f"{plan.name}: say under which licence the clips are: --set licence=CC-BY-4.0")
+    if how.strict:
         plan.require_whole()
     if how.features_only and conversion.converter.features([]) is None:
         raise UserError(

@@ -44,7 +44,7 @@ class Suggestion:
 
     def __str__(self) -> str:
         if self.option in ("up", "unit"):
-            return f"--{self.option} {self.value} ({self.why})"
+            return f"--set {self.option}={self.value} ({self.why})"
         return f"{'in the joint map: ' if self.option == 'joint_map' else ''}{self.value} ({self.why})"
 
 
@@ -241,7 +241,7 @@ class Look:
         tries = "".join(f"; try {suggestion}" for suggestion in self.suggestions)
         raise UserError(
             f"{source}: no people standing on a floor were seen in {self.clips} clips: "
-            f"{'; '.join(self.problems)}{tries}; to convert it as it is: --look 0"
+            f"{'; '.join(self.problems)}{tries}; to convert it as it is: --set look=0"
         )
 
 

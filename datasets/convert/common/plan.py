@@ -231,7 +231,7 @@ class ConversionPlan(Generic[C]):
             raise UserError(self.stop)
 
     def require_whole(self) -> None:
-        """`UserError` when anything is missing or broken (`--strict`)."""
+        """`UserError` when anything is missing or broken (`strict`)."""
         bad = [*self.broken, *self.missing]
         if bad:
             raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")

@@ -73,7 +73,7 @@ class SplitNames:
         more = f"; unknown names and how often: {counts}" if len(self._unknown) > 1 else ""
         raise UserError(
             f"{self._first}: split '{name}' is none of {', '.join(_SYNONYMS)}{more}; say what it means: "
-            f"--set splits_map='{name}=train' (in a recipe splits_map), or val, test, drop (leave its clips "
+            f"--set splits_map='{name}=train', or val, test, drop (leave its clips "
             f"out) or ignore (as if it were not stated)"
         )
 

@@ -1,4 +1,4 @@
-"""`--where "category=dance and seconds<30"`: which clips of a source are wanted, by what is known of them.
+"""`--set where="category=dance and seconds<30"`: which clips of a source are wanted.
 
 Conditions are `NAME OPERATOR VALUE` with =, !=, <, <=, > or >=, joined by `and`; a value that holds `and` or
 an operator stands in quotes. Nothing is evaluated. Words are compared without regard to case, = holds for one

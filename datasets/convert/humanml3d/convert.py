@@ -181,7 +181,7 @@ def _require_same(joints: NDArray[np.float64], others: NDArray[np.float64], clip
     if not away.max() <= AGREEMENT:
         raise UserError(
             f"{clip.label()}: differs from {clip.files[1]} by {away.max():.3g} m at frame "
-            f"{int(away.argmax())}; choose one with --use vecs or --use joints"
+            f"{int(away.argmax())}; choose one with --set use=vecs or --set use=joints"
         )
 
 
@@ -266,7 +266,7 @@ def _list_texts(config: HumanMl3dConfig) -> tuple[str, dict[str, str]]:
     if config.uncaptioned == "keep":
         return "", {}
     hint = "unpack texts.zip" if (config.source / "texts.zip").exists() else "clips would have no captions"
-    raise UserError(f"{config.source}: no texts/ in it; {hint} (or --uncaptioned keep)")
+    raise UserError(f"{config.source}: no texts/ in it; {hint} (or --set uncaptioned=keep)")
 
 
 def _read_splits(config: HumanMl3dConfig, ids: list[str]) -> tuple[dict[str, Split], list[str]]:
@@ -295,7 +295,7 @@ def _scan(
             return replace(found, broken=(drop(label, error),))
     if len(set(lengths.values())) > 1:
         lengths_found = ", ".join(f"{label} {frames}" for label, frames in lengths.items())
-        reason = f"frames differ ({lengths_found}); choose one with --use vecs or --use joints"
+        reason = f"frames differ ({lengths_found}); choose one with --set use=vecs or --set use=joints"
         return replace(found, broken=(Dropped(source=found.files[0], reason=reason),))
     found = replace(found, frames=lengths[found.files[0]])
     if clip_id not in texts:

@@ -89,7 +89,7 @@ def _of_bvh(path: Path) -> RecordedClip:
     if guess is None:
         raise UserError(
             f"{path}: not a skeleton that is known ({guesses[1].doubts()}); convert it with a joint map of "
-            f"its own: motionloom data convert bvh --joint-map"
+            f"its own: motionloom data convert bvh --set joint_map=FILE"
         )
     joint_map = guess.joint_map(str(path))
     unit, up, _ = settled(joint_map, [motion])

@@ -75,7 +75,7 @@ def paper_table(name: str) -> PaperTable:
     shipped = shipped_tables()
     if name not in shipped:
         near = difflib.get_close_matches(name.lower(), shipped, n=1, cutoff=0.5)
-        hint = f"did you mean '{near[0]}'?" if near else "motionloom evaluate --tables lists them"
+        hint = f"did you mean '{near[0]}'?" if near else "motionloom evaluate --table list names them"
         raise UserError(f"--table {name}: no such table; {hint}")
     path = shipped[name]
     return PaperTable.parse(read_yaml(path), str(path))

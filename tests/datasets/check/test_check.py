@@ -303,10 +303,10 @@ def test_cut_joined_and_packed_shards(tmp_path: Path) -> None:
 def test_layouts_of_arrays(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     np.save(path, np.zeros((40, 263), np.float32))
-    assert "--layout h3d263" in str(check_file(path))
+    assert "--set layout=h3d263" in str(check_file(path))
     assert check_file(path, FileRules(layout="h3d263")).ok
     np.save(path, walk(0).astype(np.float32))
-    assert "--layout joints22" in str(check_file(path))
+    assert "--set layout=joints22" in str(check_file(path))
     assert check_file(path, FileRules(layout="joints22")).ok
     np.save(path, 100 * walk(0))
     assert "is the length unit right?" in str(check_file(path, FileRules(layout="joints22")))

@@ -100,10 +100,7 @@ def convert(source: Path, out: Path, captions: Path) -> str:
     said = io.StringIO()
     fields = {"source": source, "joint_map": source / "map.json", "licence": "CC0-1.0", "captions": captions}
     console = Console(file=said, width=200)
-    convert_command(
-        "bvh", fields, out, plan=False, strict=True, workers=1, clips_per_shard=256,
-        console=console,
-    )  # fmt: skip
+    convert_command("bvh", {**fields, "strict": True}, out, plan=False, workers=1, console=console)
     return said.getvalue()
 
 

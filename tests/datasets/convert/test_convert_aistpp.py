@@ -293,4 +293,4 @@ def test_broken_music_is_named_and_its_dances_left_out(
     assert "wavs/mHO9.wav" in told
     assert str(tmp_path) not in str(told)
     with pytest.raises(UserError, match=r"mHO9\.wav"):
-        convert(AistppConfig(source=source), tmp_path / "strict", strict=True)
+        convert(AistppConfig(source=source, strict=True), tmp_path / "strict")

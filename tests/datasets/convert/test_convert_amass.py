@@ -15,7 +15,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.convert.amass.convert import AmassConfig
-from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.splits import hash_split
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.canonical import canonicalize, mirror
@@ -198,8 +197,7 @@ def test_broken_clips_are_left_out_with_their_reason(
     assert list(amass.features(tmp_path / "out")) == ["A/b/good_poses"]
     assert not (tmp_path / "PWNED_amass").exists()
     with pytest.raises(UserError, match=r"bad_poses\.npz"):
-        conversion = prepare(AmassConfig(source=tmp_path / "in"))
-        run_conversion(conversion, tmp_path / "strict", strict=True, progress=False)
+        amass.make(tmp_path / "in", tmp_path / "strict", strict=True)
 
 
 def test_stated_sizes_are_not_believed(amass: ModuleType, tmp_path: Path) -> None:

@@ -277,7 +277,7 @@ def test_broken_files_are_reported_and_skipped(copy: Path, shared: Path, tmp_pat
     assert len(told) == 9
     assert all("broken/bvh" not in reason and str(copy) not in reason for reason in told.values())
     with pytest.raises(UserError, match="strict"):
-        convert(given, tmp_path / "strict", strict=True)
+        convert(given.model_copy(update={"strict": True}), tmp_path / "strict")
 
 
 def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> None:
@@ -337,7 +337,7 @@ def test_damaged_archive_keeps_what_came_before(copy: Path, tmp_path: Path) -> N
     assert 0 < sum(s.samples for s in manifest.shards) < 6
     assert sum("listed, but its file is not in the source" in r for r in told.values()) > 0
     with pytest.raises(UserError, match="damaged archive"):
-        convert(config(copy), tmp_path / "strict", strict=True)
+        convert(config(copy, strict=True), tmp_path / "strict")
 
 
 def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:

@@ -106,10 +106,12 @@ def toeless(folder: Path) -> Path:
 
 def test_what_is_not_certain_is_refused_with_a_map_to_complete(tmp_path: Path) -> None:
     source, out = toeless(tmp_path / "mocap"), tmp_path / "out"
-    with pytest.raises(UserError, match=r"left_foot \(LeftA or LeftB\?\).*; complete .* --joint-map") as e:
+    with pytest.raises(
+        UserError, match=r"left_foot \(LeftA or LeftB\?\).*; complete .* --set joint_map="
+    ) as e:
         convert(source, out)
     (path,) = (out / "joint_maps").iterdir()
-    assert f"complete {path} and pass the folder with --joint-map {path.parent}" in str(e.value)
+    assert f"complete {path} and pass the folder with --set joint_map={path.parent}" in str(e.value)
     with pytest.raises(UserError, match="still to be filled in"):
         convert(source, out, joint_map=path)
     fill_in(path)
@@ -289,7 +291,7 @@ def test_a_plan_needs_no_licence_and_a_conversion_does(clips: Path, tmp_path: Pa
     config = BvhConfig(source=clips)
     prepared = prepare(config, out=tmp_path / "out")
     assert prepared.plan.items
-    with pytest.raises(UserError, match="--licence"):
+    with pytest.raises(UserError, match="--set licence="):
         run_conversion(prepared, tmp_path / "out", progress=False)
 
 

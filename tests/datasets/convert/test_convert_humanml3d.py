@@ -32,9 +32,9 @@ def fixture(shared: Path) -> Path:
     return shared / "data/layouts/humanml3d"
 
 
-def convert(source: Path, out: Path, *, workers: int = 1, strict: bool = False, **options: Any) -> Manifest:
+def convert(source: Path, out: Path, *, workers: int = 1, **options: Any) -> Manifest:
     conversion = prepare(HumanMl3dConfig(source=source, **options), workers=workers)
-    return run_conversion(conversion, out, workers=workers, strict=strict, progress=False, clips_per_shard=2)
+    return run_conversion(conversion, out, workers=workers, progress=False, clips_per_shard=2)
 
 
 def plan(source: Path, **options: Any) -> Any:

@@ -115,20 +115,20 @@ def test_real_people_are_seen_as_they_are(source: Path) -> None:
         (
             {"up": "z"},
             r"5 of 5 clips \(100%\) show figures whose head is not above the pelvis",
-            ["--up y (the head is above the pelvis along the +y axis of the files)"],
+            ["--set up=y (the head is above the pelvis along the +y axis of the files)"],
         ),
         (
             {"unit": "m"},
             r"are not 1.2 to 2.2 m tall \(median 155 m; a wrong length unit\?\)",
-            ["--unit cm (then the figures are 1.55 m tall)"],
+            ["--set unit=cm (then the figures are 1.55 m tall)"],
         ),
-        ({"unit": "inch"}, r"median 3\.9\d m", ["--unit cm (then the figures are 1.55 m tall)"]),
+        ({"unit": "inch"}, r"median 3\.9\d m", ["--set unit=cm (then the figures are 1.55 m tall)"]),
         (
             {"unit": "mm", "up": "z"},
             r"median 0.155 m",
             [
-                "--up y (the head is above the pelvis along the +y axis of the files)",
-                "--unit cm (then the figures are 1.55 m tall)",
+                "--set up=y (the head is above the pelvis along the +y axis of the files)",
+                "--set unit=cm (then the figures are 1.55 m tall)",
             ],
         ),
     ],
@@ -164,7 +164,7 @@ def test_a_floating_source_is_refused_and_a_floating_set_fails_the_check(
     source: Path, tmp_path: Path
 ) -> None:
     given = config(source, up="z")
-    with pytest.raises(UserError, match=r"no people standing on a floor .* try --up y .* --look 0$"):
+    with pytest.raises(UserError, match=r"no people standing on a floor .* try --set up=y .* --set look=0$"):
         convert(given, tmp_path / "out")
     assert not list((tmp_path / "out").glob("*.tar"))
     convert(given.model_copy(update={"look": 0}), tmp_path / "out")

@@ -1,4 +1,4 @@
-"""`--where`: what an expression chooses, and what is said of one that cannot be read."""
+"""`where`: what an expression chooses, and what is said of one that cannot be read."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import shlex
@@ -21,13 +22,17 @@ from foreign_tools import FOREIGN
 from safetensors.numpy import load_file
 
 from motionloom.datasets.base.files import write_json
+from motionloom.datasets.check.files import FileRules
+from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.schema import Manifest
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.cli.options import plain
+from motionloom.pipeline.serve.requests import ServeConfig
 
 Call = Callable[..., Any]
+ROOT = Path(__file__).parents[3]
 
 
 def commands(group: Any, *path: str) -> list[tuple[str, ...]]:
@@ -43,6 +48,31 @@ COMMANDS = commands(typer.main.get_command(app))
 
 def text_of(out: str) -> str:
     return re.sub(r"[\s│]+", " ", out)
+
+
+OTHERS = {
+    "sbatch and srun": "cpus-per-task dependency gpus-per-task jobs kill-on-bad-exit kill-on-invalid-dep "
+    "noheader ntasks-per-node parsable requeue",
+    "typer": "help",
+}
+"""Options in our strings that are other programs'."""
+
+
+def test_every_option_and_setting_that_a_string_of_the_sources_names_exists() -> None:
+    known = {f"--{name}" for names in OTHERS.values() for name in names.split()}
+    for words in COMMANDS:
+        command: Any = typer.main.get_command(app)
+        for word in words:
+            command = command.get_command(None, word)
+        known |= {option for each in command.params for option in (*each.opts, *each.secondary_opts)}
+    known |= {option for each in typer.main.get_command(app).params for option in each.opts}
+    configs = [kind.config_class for kind in converters()] + [SynthConfig, FileRules, ServeConfig]
+    settings = {key for config in configs for key in config.model_fields}
+    for path in (path for top in ("pipeline", "datasets", "models") for path in (ROOT / top).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Constant) and isinstance(node.value, str):
+                assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", node.value)) <= known, path
+                assert set(re.findall(r"--set (\w+)=", node.value)) <= settings, path
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
@@ -87,7 +117,6 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "unknown recipe": (["run", "humantomato-tin"], "did you mean 'humantomato-tiny'"),
     "unknown stage": (["run", "humantomato-tiny", "--set", "tmaa.optim.lr=1"], "did you mean 'tma'"),
     "unknown --until": (["run", "humantomato-tiny", "--until", "gtp", "--dry-run"], "did you mean 'gpt'"),
-    "unfinished input": (["run", "humantomato-tiny", "--only", "gpt"], "is not finished"),
     "no source folder": (["run", "bvh-body", "--set", "data.source=nowhere"], "nowhere: no such folder"),
     "no shards": (
         ["run", "humantomato-paper", "--set", "data.path=nowhere"],
@@ -111,10 +140,10 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "check nothing": (["data", "check", "nowhere"], "nowhere: no such folder"),
     "stats of nothing": (["data", "stats", "nowhere"], "nowhere/manifest.json: no such file"),
     "convert nothing": (
-        ["data", "convert", "bvh", "nowhere", "out", "--joint-map", "map.json", "--licence", "CC0"],
+        ["data", "convert", "bvh", "nowhere", "out", "--set", "joint_map=map.json", "--licence", "CC0"],
         "map.json: cannot read the joint map",
     ),
-    "synth of a wrong layout": (["data", "synth", "out", "--layout", "body13"], "layout"),
+    "synth of a wrong layout": (["data", "synth", "out", "--set", "layout=body13"], "layout"),
     "synth of no clips": (["data", "synth", "out", "--clips", "0"], "clips"),
     "generate before a model is opened": (
         ["generate", "nowhere", "a person walks", "-o", "file/sub"],
@@ -123,8 +152,8 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "report": (["report", "nowhere", "-o", "folder"], "folder: is a folder; name a file"),
     "data stats": (["data", "stats", "SHARDS", "-o", "folder"], "folder: is a folder; name a file"),
     "check with the options of files": (
-        ["data", "check", "SHARDS", "--layout", "foo", "--seconds", "3"],
-        "--layout, --seconds is for single files",
+        ["data", "check", "SHARDS", "--set", "layout=h3d263", "--set", "seconds=3"],
+        "--set layout, seconds is for single files",
     ),
     "run of an empty recipe": (["evaluate", "empty"], "empty/recipe.yaml: a recipe is a mapping"),
     "model of an empty recipe": (["generate", "empty", "jump"], "empty/recipe.yaml: holds no stages"),
@@ -168,14 +197,14 @@ def test_a_run_on_damaged_shards_is_refused(damaged: Path, tmp_path: Path, call:
 
 def test_synth_writes_the_same_shards_as_the_function(shards: Path, tmp_path: Path, call: Call) -> None:
     out = tmp_path / "made"
-    done = call("data", "synth", out, "--clips", 6, "--layout", "body133", "--workers", 1)
+    done = call("data", "synth", out, "--clips", 6, "--set", "layout=body133", "--workers", 1)
     assert done.code == 0 and "body133" in done.out
     assert call("data", "check", out).code == 0
     made = {path: path.read_bytes() for path in out.iterdir()}
-    other = call("data", "synth", out, "--clips", 4, "--layout", "wholebody363", "--workers", 1)
+    other = call("data", "synth", out, "--clips", 4, "--set", "layout=wholebody363", "--workers", 1)
     assert other.code == 2 and "clips 6 -> 4" in other.err and "choose another folder" in other.err
     assert made == {path: path.read_bytes() for path in out.iterdir()}
-    again = call("data", "synth", out, "--clips", 6, "--layout", "body133", "--workers", 1)
+    again = call("data", "synth", out, "--clips", 6, "--set", "layout=body133", "--workers", 1)
     assert again.code == 0 and made == {path: path.read_bytes() for path in out.iterdir()}
 
 
@@ -206,10 +235,20 @@ def test_convert_plans_and_converts(tmp_path: Path, call: Call) -> None:
     text = write_clip(source / "control_ok.bvh", 0).read_text()
     (source / "frame_time_zero.bvh").write_text(re.sub(r"Frame Time: .*", "Frame Time: 0.0", text))
     joint_map = write_map(tmp_path / "joint_map.json")
-    words = ("data", "convert", "bvh", source, out, "--joint-map", joint_map, "--licence", "CC-BY-NC-4.0")
+    words = (
+        "data",
+        "convert",
+        "bvh",
+        source,
+        out,
+        "--set",
+        f"joint_map={joint_map}",
+        "--licence",
+        "CC-BY-NC-4.0",
+    )
     plan = call(*words, "--plan")
     assert plan.code == 0 and "frame_time_zero.bvh" in plan.out and not out.exists()
-    strict = call(*words, "--strict", "--workers", 1)
+    strict = call(*words, "--set", "strict=true", "--workers", 1)
     assert strict.code == 2 and "frame_time_zero.bvh" in strict.err and "Frame Time" in strict.err
 
 
@@ -218,16 +257,18 @@ def test_a_wrong_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, call:
     for seed in range(3):
         write_clip(source / f"{seed}.bvh", seed, z_up=True)
     joint_map = write_map(tmp_path / "joint_map.json")
-    more = ("--joint-map", joint_map, "--licence", "CC0", "--workers", 1, "--up", "y")
+    more = ("--set", f"joint_map={joint_map}", "--licence", "CC0", "--workers", 1, "--set", "up=y")
     words = ("data", "convert", "bvh", source, out, *more)
     plan = call(*words, "--plan")
     assert plan.code == 0 and not out.exists()
-    assert "0 of 3, along +z of the files" in plan.out and "try: --up z" in plan.out
-    assert plan.out.rstrip().endswith(f"--joint-map {joint_map} --up z")
+    assert "0 of 3, along +z of the files" in plan.out and "try: --set up=z" in plan.out
+    assert plan.out.rstrip().endswith(f"--set joint_map={joint_map} --set up=z")
     refused = call(*words)
-    assert refused.code == 2 and "no people standing on a floor" in refused.err and "--up z" in refused.err
-    assert call(*words, "--up", "z").code == 0
-    again = call(*words, "--up", "z")
+    assert (
+        refused.code == 2 and "no people standing on a floor" in refused.err and "--set up=z" in refused.err
+    )
+    assert call(*words, "--set", "up=z").code == 0
+    again = call(*words, "--set", "up=z")
     assert again.code == 0 and "finished already, " in again.out
     lying = tmp_path / "lying"
     assert call(*words[:4], lying, *more, "--set", "look=0").code == 0
@@ -367,7 +408,7 @@ def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:
     (tmp_path / "mocap").mkdir()
     write_clip(tmp_path / "mocap" / "a.bvh", 1)
     words = ("data", "convert", "bvh", tmp_path / "mocap", tmp_path / "out", "--licence", "x")
-    words += ("--joint-map", write_map(tmp_path / "map.json"), "--workers", "1")
+    words += ("--set", f"joint_map={write_map(tmp_path / 'map.json')}", "--workers", "1")
     plan = loaded(call(*words, "--plan", "--json").out)
     assert plan["found"] == 1 and sum(plan["clips"].values()) == 1 and not plan["unreadable"]
     refused = call(*words, "--json")
@@ -381,7 +422,7 @@ def test_info_the_version_and_a_table(call: Call) -> None:
     said = call("info").out
     for word in ("motionloom 0.", "torch 2.", "runs on:", "encoder: minilm", "humantomato-tiny", "bvh-body"):
         assert word in said
-    refused = call("evaluate", "--tables", "--json")
+    refused = call("evaluate", "--table", "list", "--json")
     assert refused.code == 2 and "leave it out" in refused.err
 
 

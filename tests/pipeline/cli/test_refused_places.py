@@ -59,8 +59,8 @@ WRITING: dict[str, Sequence[str]] = {
     "export": ("export", "{root}/run", "--out", "{out}"),
     "data synth": ("data", "synth", "{out}", "--clips", "3", "--workers", "1"),
     "data convert": (
-        "data", "convert", "bvh", "{root}/mocap", "{out}", "--joint-map", "{root}/map.json", "--licence", "x",
-        "--workers", "1",
+        "data", "convert", "bvh", "{root}/mocap", "{out}", "--set", "joint_map={root}/map.json",
+        "--licence", "x", "--workers", "1",
     ),
     "data report": ("data", "report", "{root}/shards", "--out", "{out}/page.html"),
     "data stats": ("data", "stats", "{root}/shards", "--out", "{out}/stats.safetensors"),

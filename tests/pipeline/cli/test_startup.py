@@ -46,7 +46,7 @@ def imported(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         "help": ["--help"],
         "run help": ["run", "--help"],
         "convert help": ["data", "convert", "bvh", "--help"],
-        "tables": ["evaluate", "--tables"],
+        "tables": ["evaluate", "--table", "list"],
         "table of a run": ["evaluate", "--table", "humantomato/7", str(small_run.folder)],
         "compare": ["compare", str(small_run.folder), str(twin), "-o", str(made / "page.html")],
         "check": ["data", "check", str(shards)],

@@ -114,17 +114,17 @@ def test_selection(tmp_path: Path) -> None:
         go(tmp_path, select=Selection(until="left,ones"))
     go(tmp_path)
     assert go(tmp_path, select=Selection(first="both")) == ["both", "top"]
-    assert go(tmp_path, select=Selection(only="one", force=True)) == ["one"]
-    with pytest.raises(UserError, match="is not finished"):
-        go(tmp_path, "right.add=4", select=Selection(only="top"))
+    for _ in range(2):
+        assert go(tmp_path, select=Selection(first="one", until="one")) == ["one"]
 
 
 @pytest.mark.parametrize(
     ("select", "asked"),
     [
-        (Selection(force=True), ALL),
+        (Selection(first="left"), ["left", "both", "top"]),
         (Selection(first="both"), ["both", "top"]),
-        (Selection(only="one", force=True), ["one"]),
+        (Selection(first="left", until="both"), ["left", "both"]),
+        (Selection(first="one", until="one"), ["one"]),
     ],
 )
 def test_what_a_command_began_to_run_again_the_same_command_goes_on_with(
@@ -156,12 +156,12 @@ def test_what_a_command_began_to_run_again_the_same_command_goes_on_with(
 
 def test_another_command_between_drops_the_request(tmp_path: Path) -> None:
     go(tmp_path)
-    select = Selection(force=True)
+    select = Selection(first="right")
     loaded, run = recipe(tmp_path), tmp_path / "run"
     write_json(run / REQUEST_FILE, Request(id="x", select=asdict(select)).dump())
     assert [row.action for row in make_plan(loaded, run, Selection(first="left"))].count("run") == 3
     assert go(tmp_path, "one.add=2") == ["one"] and not (run / REQUEST_FILE).exists()
-    assert go(tmp_path, "one.add=2", select=select) == ALL
+    assert go(tmp_path, "one.add=2", select=select) == ["right", "both", "one", "top"]
 
 
 SEVERAL = """

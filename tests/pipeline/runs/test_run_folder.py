@@ -171,7 +171,7 @@ def test_what_is_cheap_is_made_anew_without_asking(go: Go, tmp_path: Path) -> No
 def test_what_is_asked_for_by_name_is_made_anew_and_what_was_begun_is_named(go: Go) -> None:
     go()
     assert "3 of 9 stages to run" in go("gpt.add=2", first="gpt")
-    assert "9 of 9 stages to run" in go("tokenizer.add=2", force=True)
+    assert "9 of 9 stages to run" in go("tokenizer.add=2", first="data")
     with pytest.raises(UserError, match="  tokenizer: changed: add 2 -> 3"):
         go("tokenizer.add=3", first="gpt")
     with pytest.raises(KeyboardInterrupt):
@@ -183,12 +183,8 @@ def test_what_is_asked_for_by_name_is_made_anew_and_what_was_begun_is_named(go: 
     ("select", "said"),
     [
         ({"first": "gpt", "until": "tma"}, "'tma' does not need 'gpt'"),
-        ({"until": "gpt", "only": "tma"}, "--only tma runs that stage alone: leave --until gpt out"),
-        ({"first": "gpt", "only": "tma"}, "--only tma runs that stage alone: leave --from gpt out"),
-        ({"first": "gpt", "force": True}, "leave one out"),
         ({"first": "tokens", "until": "gpt"}, "2 of 9 stages to run"),
         ({"first": "gpt", "until": "gpt"}, "1 of 9 stages to run"),
-        ({"only": "gpt", "force": True}, "1 of 9 stages to run"),
     ],
 )
 def test_options_that_contradict_each_other_and_that_do_not(

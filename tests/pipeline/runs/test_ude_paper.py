@@ -85,7 +85,7 @@ def test_it_runs_to_the_end_and_fills_the_tables(
     sets = ("humanml_index=h/index.csv", "humanml_texts=h/texts", "splits=h", "mirror=true")
     options = [word for one in sets for word in ("--set", one)]
     for words in (["amass", "h/amass", "texts", *options], ["aistpp", "aist", "dances"]):
-        done = call("data", "convert", *words, "--layout", "smpl75", "--workers", 1)
+        done = call("data", "convert", *words, "--set", "layout=smpl75", "--workers", 1)
         assert done.code == 0, done.err
     Path("small.yaml").write_text(SMALL)
     done = call("run", "small.yaml", "-o", "run")

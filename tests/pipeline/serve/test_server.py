@@ -320,7 +320,7 @@ def test_without_the_extra_it_says_so(
 
 
 def test_wrong_options_are_one_sentence(call: Callable[..., Any], tmp_path: Path) -> None:
-    assert "'waiting' = 0" in call("serve", tmp_path, "--waiting", "0").err
+    assert "'waiting' = 0" in call("serve", tmp_path, "--set", "waiting=0").err
     assert "no such folder" in call("serve", tmp_path / "missing").err
 
 

@@ -38,7 +38,7 @@ def run(small_run: Any, tmp_path: Path, call: Callable[..., Any]) -> Callable[..
         recipe["stages"]["more"] = more
         path = tmp_path / "more.yaml"
         path.write_text(yaml.safe_dump(recipe))
-        return call("run", path, "--out", folder, "--only", "more", *arguments), folder / "stages/more"
+        return call("run", path, "--out", folder, "--until", "more", *arguments), folder / "stages/more"
 
     return go
 

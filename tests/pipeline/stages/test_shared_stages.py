@@ -64,7 +64,7 @@ def test_two_processes_make_what_one_makes(
         shutil.copytree(small.folder, folder)
         for stage in stages:
             run(
-                start, "run", tmp_path / "shared.yaml", "--out", folder, "--only", stage, "--force",
+                start, "run", tmp_path / "shared.yaml", "--out", folder, "--from", stage, "--until", stage,
                 "--set", f"hardware.devices={devices}",
             )  # fmt: skip
         assert not list(folder.glob("stages/*/work"))
@@ -87,7 +87,7 @@ def test_two_processes_make_what_one_makes(
     for stage in (name for name in stages if name.startswith("evaluate")):
         where = f"{stage}.inputs.generators={json.dumps(generators)}"
         run(
-            start, "run", tmp_path / "shared.yaml", "--out", folder, "--only", stage, "--force",
+            start, "run", tmp_path / "shared.yaml", "--out", folder, "--from", stage, "--until", stage,
             "--set", where,
         )  # fmt: skip
         found = json.loads((folder / "stages" / stage / stages[stage]).read_text())

@@ -54,7 +54,7 @@ def finished(small_run: Any, recipe: Path) -> Path:
     """A copy of the small run with the captioner, not to be changed."""
     run = recipe.parent / "run"
     shutil.copytree(small_run.folder, run)
-    run_recipe(recipe, run, select=Selection(only="captioner"), console=Console(quiet=True))
+    run_recipe(recipe, run, select=Selection(until="captioner"), console=Console(quiet=True))
     return run
 
 
@@ -72,7 +72,7 @@ def test_a_captioner_is_trained_killed_exported_and_asked(
     whole = (folder / "artifact.json").read_bytes()
     for name in ("artifact.json", "model.json", "model.safetensors", "checkpoints/step=00000006.ckpt"):
         (folder / name).unlink()
-    done = call("run", recipe, "--out", trained, "--only", "captioner")
+    done = call("run", recipe, "--out", trained, "--until", "captioner")
     assert done.code == 0 and "resuming captioner at step 4" in done.out
     assert (folder / "artifact.json").read_bytes() == whole
 
@@ -103,7 +103,7 @@ def test_captions_are_measured_beside_those_that_need_no_model(
     trained: Path, recipe: Path, call: Callable[..., Any]
 ) -> None:
     """What true captions claim holds; a clip's own other caption shares more words than the most frequent."""
-    done = call("run", recipe, "--out", trained, "--only", "evaluate_captions")
+    done = call("run", recipe, "--out", trained, "--until", "evaluate_captions")
     assert done.code == 0, done.err
     found = FigureFile.read(trained / "stages/evaluate_captions/metrics.json")
     rows = {figure.row for figure in found.figures}
@@ -134,11 +134,11 @@ def test_text_to_motion_is_trained_killed_exported_and_asked(
 ) -> None:
     """Beside the GPT of the run, as a stage that a recipe lists."""
     folder = trained / "stages/seq2seq"
-    assert call("run", recipe, "--out", trained, "--only", "seq2seq").code == 0
+    assert call("run", recipe, "--out", trained, "--until", "seq2seq").code == 0
     whole = (folder / "artifact.json").read_bytes()
     for name in ("artifact.json", "model.json", "model.safetensors", "checkpoints/step=00000006.ckpt"):
         (folder / name).unlink()
-    done = call("run", recipe, "--out", trained, "--only", "seq2seq")
+    done = call("run", recipe, "--out", trained, "--until", "seq2seq")
     assert done.code == 0 and "resuming seq2seq at step 4" in done.out
     assert (folder / "artifact.json").read_bytes() == whole
     logged = [row for row in read_training_log(folder) if "val/inverse" in row]

@@ -28,6 +28,8 @@ class Row(NamedTuple):
 class BvhSetConfig(BvhConfig):
     """Options of published sets of BVH files."""
 
+    everyday = ()
+
     unit: Unit = "cm"
     """Length unit of the files."""
     up: Up = "y"

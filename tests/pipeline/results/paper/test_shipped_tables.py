@@ -53,7 +53,7 @@ def test_an_unknown_table_names_the_nearest() -> None:
         UserError, match=r"--table humantomatoes/7: no such table; did you mean 'humantomato/7'\?"
     ):
         paper_table("humantomatoes/7")
-    with pytest.raises(UserError, match="no such table; motionloom evaluate --tables lists them"):
+    with pytest.raises(UserError, match="no such table; motionloom evaluate --table list names them"):
         paper_table("x")
     with pytest.raises(UserError, match=r"nowhere\.yaml: cannot be read"):
         paper_table("nowhere.yaml")

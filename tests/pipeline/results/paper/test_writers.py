@@ -90,7 +90,7 @@ def test_a_papers_name_is_all_of_its_tables(call: Call, tmp_path: Path) -> None:
 
 
 def test_the_list_of_tables(call: Call) -> None:
-    shown = call("evaluate", "--tables")
+    shown = call("evaluate", "--table", "list")
     assert shown.code == 0
     assert re.findall(r"(?:humantomato|ude)/\d+", shown.out) == list(shipped_tables())
 
@@ -118,7 +118,7 @@ def test_a_table_of_ones_own(baselines: Callable[..., Path], tmp_path: Path) -> 
         (["--table", "ude/1", "--clips", "4"], "--clips, --repeats and --device measure anew"),
         (["--table", "ude/1", "-o", "x.csv"], "x.csv: a table is written as Markdown"),
         (["--table", "gone.yaml"], "gone.yaml: cannot be read"),
-        (["--tables", "runs"], "--tables lists the tables alone"),
+        (["--table", "list", "runs"], "--table list names the tables alone"),
         (["runs", "-o", "x.md"], "--out is of a table"),
         (["one", "two"], "2 run folders to evaluate; name one"),
         ([], "0 run folders to evaluate; name one"),
