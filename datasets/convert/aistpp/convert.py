@@ -1,40 +1,45 @@
 """AIST++ -> shards: SMPL dances at 60 fps with their music (UDE section 4.1).
 
-Choices:
-- Metres are smpl_trans / smpl_scaling. The floor of the source is anywhere: like every other source, a clip
-  is moved to the canonical place (floor 0, first root above the origin, first heading +Z).
-- `smpl75` keeps the parameters, turned and moved to that place (`common/features.py`).
+`motions/SEQUENCE.pkl` are the annotations, `splits/crossmodal_{train,val,test}.txt` and `ignore_list.txt` the
+lists, `wavs/` the music: `SEQUENCE.wav`, or `MUSIC.wav` for every dance to a piece. Metres are smpl_trans /
+smpl_scaling. The floor of the source is anywhere: like every other source, a clip is moved to the canonical
+place (floor 0, first root above the origin, first heading +Z).
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
 
-from motionloom.datasets.audio.features import VERSION, AudioSettings
+import numpy as np
+from pydantic import Field
+
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.aistpp.plan import (
-    FPS,
-    MOTION_LICENCE,
-    MOTIONS,
-    MUSIC_LICENCE,
-    AistClip,
-    AistppConfig,
-    genre_of,
-    music_of,
-    plan_aistpp,
-)
-from motionloom.datasets.convert.common.converter import Converter, PlanSettings
-from motionloom.datasets.convert.common.features import body_of, canonical_smpl75, features_of, require_human
-from motionloom.datasets.convert.common.files import inside
-from motionloom.datasets.convert.common.look import SourceJoints
-from motionloom.datasets.convert.common.music import cut_of
+from motionloom.datasets.convert.common.converter import PlanSettings
+from motionloom.datasets.convert.common.music import SOUND_SUFFIXES
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.motion.body.smpl import smpl_joints
+from motionloom.datasets.convert.common.splits import join_splits, read_ids
+from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
+from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
-from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import Caption, UserError
-from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
+
+FPS = 60.0
+MOTIONS = "motions"
+MOTION_LICENCE = "CC-BY-4.0"
+MUSIC_LICENCE = "CC-BY-4.0 AND LicenseRef-AIST-Dance-DB"
+"""Annotations: CC BY 4.0. Music: the terms of use of the AIST Dance Video Database, which no converter can
+grant; shards that hold sound, or features made from it, stand under both.
+"""
+
+_SEQUENCE = re.compile(r"g([A-Z]{2})_s([A-Z]{2})_c(?:All|\d\d)_d(\d+)_m([A-Z]{2}\d+)_ch(\d+)")
+"""Genre, situation (BM basic, FM advanced), dancer, music, choreography."""
+_FACTS = ("genre", "situation", "dancer", "music", "choreography")
+_SUFFIXES = (".json", ".pkl")
+"""What may stand behind a sequence in the lists."""
 
 GENRES = {
     "BR": "break dance",
@@ -50,7 +55,37 @@ GENRES = {
 }
 
 
-class Aistpp(Converter[AistppConfig, AistClip]):
+class AistppConfig(BodyConfig):
+    """Options of the AIST++ converter; `source` is the folder of the annotations, with motions/ in it."""
+
+    layouts = ("body133", "h3d263", "smpl75")
+
+    name: str = "aistpp"
+    """Name of the data set; part of the shards' file names."""
+    layout: str = "body133"
+    """`body133` or `h3d263` from the joints, or `smpl75`: UDE's translation and axis-angles."""
+    splits: Path | None = None
+    """Folder of crossmodal_train.txt, _val.txt and _test.txt; default: splits/ in the source."""
+    unlisted: Literal["drop", "hash"] = "drop"
+    """Sequences in no split file: left out, or split 80/5/15 by a hash of their music."""
+    ignore_list: Path | None = None
+    """List of bad sequences; default: ignore_list.txt in the source."""
+    sound: Literal["optional", "require", "none"] = "require"
+    """Whether a sequence needs its music; `none` converts the motion alone."""
+    music_folder: Path | None = None
+    """Folder of `<sequence>.wav` or `<music>.wav` (also flac, mp3, ogg); default: wavs/ in the source."""
+    music_offset: float = Field(default=0.0, ge=0)
+    """Second of the music at which the motion begins."""
+    caption_genre: bool = False
+    """Give every clip the caption "a dancer performs ...", by the genre in its name."""
+
+    @property
+    def stores_music(self) -> bool:
+        """Whether shards hold sound, or features of it."""
+        return self.sound != "none" and (self.audio_features or self.sound_rate > 0)
+
+
+class Aistpp(BodyRelease[AistppConfig]):
     """The AIST++ converter."""
 
     name = "aistpp"
@@ -58,63 +93,134 @@ class Aistpp(Converter[AistppConfig, AistClip]):
     summary = "AIST++: SMPL dances with their music to shards."
     example = "aist_plusplus_final shards"
     config_class = AistppConfig
+    terms = MOTION_LICENCE
+    model = "SMPL"
 
     def __init__(self, config: AistppConfig) -> None:
         super().__init__(config)
-        self.body = body_of(config.body_model, "smpl22")
-        self._audio = config.audio_settings() if config.music != "none" else None
+        self.sound_folder = config.music_folder or config.source / "wavs"
+        self.sound_start = config.music_offset
 
-    def plan(self, settings: PlanSettings) -> ConversionPlan[AistClip]:
-        return plan_aistpp(self.config, settings)
+    def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        folder = self.config.source / MOTIONS
+        if not folder.is_dir():
+            raise UserError(
+                f"{self.config.source}: no {MOTIONS}/ in it; give the folder of the AIST++ annotations"
+            )
+        splits, ignored = self._lists(draft)
+        music = self._music()
+        here = sorted(path.stem for path in folder.glob("*.pkl") if path.name[0] != ".")
+        absent = [name for name in splits if name not in ignored and name not in here]
+        for name in (*here, *absent):
+            try:
+                facts = _facts(name)
+            except UserError as error:
+                note_broken(draft, f"{MOTIONS}/{name}.pkl", error)
+                continue
+            problem = "on the ignore list" if name in ignored else ""
+            if name not in splits and splits and self.config.unlisted == "drop":
+                problem = problem or "in no split file"
+            genre = GENRES.get(facts["genre"], f"{facts['genre']} dance")
+            caption = Caption(text=f"a dancer performs {genre}", source="genre")
+            # By music: pieces are shared by many dances, and one in two splits would leak.
+            yield Entry(
+                name, f"{MOTIONS}/{name}.pkl", (caption,) if self.config.caption_genre else (),
+                splits.get(name), group=facts["music"], facts=dict(facts),
+                sound=music.get(name) or music.get(facts["music"]), problem=problem,
+            )  # fmt: skip
 
-    def depends_on(self, clip: AistClip) -> list[object]:
-        size = (self.config.source / clip.label()).stat().st_size
-        sound = (self.config.sound_folder / clip.sound).stat().st_size if clip.sound else 0
-        return [clip.id, clip.split, clip.used, size, clip.sound, sound]
+    def _lists(self, draft: ConversionPlan[ReleaseClip]) -> tuple[dict[str, Split], set[str]]:
+        """Splits of sequences, by `crossmodal_SPLIT.txt` or else `SPLIT.txt`; and the ignored sequences.
 
-    def options(self) -> dict[str, object]:
-        version = VERSION if self._audio else None
-        return super().options() | {"body_model": self.body.statement, "audio_version": version}
+        A sequence in two splits is a `UserError` that names both files. Absent lists are noted, or an error
+        where the options name them.
+        """
+        config = self.config
+        folder = config.splits or config.source / "splits"
+        choices = {split: (folder / f"crossmodal_{split}.txt", folder / f"{split}.txt") for split in SPLITS}
+        found = {split: [path for path in paths if path.is_file()] for split, paths in choices.items()}
+        lists = [(split, paths[0]) for split, paths in found.items() if paths]
+        splits, notes = join_splits(lists, _SUFFIXES)
+        absent = [choices[split][0].name for split, paths in found.items() if not paths]
+        if config.splits and not lists:
+            raise UserError(f"{folder}: no crossmodal_train.txt, crossmodal_val.txt or crossmodal_test.txt")
+        if not lists:
+            notes.append("no split files: split 80/5/15 by a hash of the music")
+        elif absent:
+            notes.append(f"no {', '.join(absent)} beside the other split files")
+        path, ignored = config.ignore_list or config.source / "ignore_list.txt", set[str]()
+        if path.is_file():
+            ids, more = read_ids(path, _SUFFIXES)
+            notes += more
+            ignored = set(ids)
+        elif config.ignore_list:
+            raise UserError(f"{path}: no such file")
+        else:
+            notes.append("no ignore_list.txt: bad sequences of the release are not left out")
+        if both := sorted(splits.keys() & ignored):
+            some = ", ".join(both[:3])
+            notes.append(f"{len(both)} sequences of the split files are on the ignore list: {some}")
+        draft.notes += notes
+        return splits, ignored
 
-    def licence(self, plan: ConversionPlan[AistClip]) -> str:
+    def _music(self) -> dict[str, str]:
+        """Music files by name without suffix, with their folder."""
+        folder, sound = self.sound_folder, self.config.sound
+        if sound == "none":
+            return {}
+        if not folder.is_dir():
+            if sound == "require" or self.config.music_folder is not None:
+                raise UserError(
+                    f"{folder}: no such folder of music; --set music_folder=FOLDER, or --set sound=none"
+                )
+            return {}
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SOUND_SUFFIXES)
+        return {path.stem: path.name for path in reversed(files) if path.name[0] != "."}
+
+    def split_lists(self) -> dict[str, Split] | None:
+        return None  # read in `entries`
+
+    def with_sound(
+        self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
+    ) -> Iterator[tuple[Entry, str]]:
+        for entry, reason in super().with_sound(entries, draft):
+            both = entry.sound is not None and self.config.stores_music
+            yield replace(entry, licence=MUSIC_LICENCE if both else None), reason
+
+    def plan(self, settings: PlanSettings) -> ConversionPlan[ReleaseClip]:
+        plan = super().plan(settings)
+        pieces = {
+            split: {str(clip.entry.facts["music"]) for own, clip in plan.items if own == split}
+            for split in SPLITS
+        }
+        for split in ("val", "test"):
+            if shared := sorted(pieces["train"] & pieces[split]):
+                some = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
+                plan.notes.append(f"{len(shared)} pieces of music are in train and in {split}: {some}")
+        return plan
+
+    def licence(self, plan: ConversionPlan[ReleaseClip]) -> str:
         return self.config.licence or (MUSIC_LICENCE if self.config.stores_music else MOTION_LICENCE)
 
-    def audio(self) -> AudioSettings | None:
-        return self._audio
+    def subset(self, clip: ReleaseClip) -> str:
+        return str(clip.entry.facts["genre"])
 
-    def subset(self, clip: AistClip) -> str:
-        return genre_of(clip.id)
+    def song(self, clip: ReleaseClip) -> str:
+        return str(clip.entry.facts["music"])
 
-    def joints(self, clip: AistClip) -> SourceJoints:
-        poses, trans = self._read_dance(clip)
-        return SourceJoints(smpl_joints(poses[:, :BODY_JOINTS], trans, self.body), FPS)
+    def length(self, path: Path, label: str) -> tuple[int, float]:
+        return len(read_aist_motion(path, label).poses), FPS
 
-    def convert(self, clip: AistClip) -> Sample:
-        layout = self.layout
-        poses, trans = self._read_dance(clip)
-        joints = smpl_joints(poses[:, :BODY_JOINTS], trans, self.body)
-        require_human(joints, FPS)
-        if layout.family == "raw":
-            motion = canonical_smpl75(poses, trans, self.body, FPS, layout.fps)
-        else:
-            motion = features_of(joints, FPS, layout)
-        rows, wav = None, None
-        if clip.sound is not None:
-            start, seconds = self.config.music_offset, len(motion) / layout.fps
-            rows, wav = cut_of(self.config, self.config.sound_folder, clip.sound, start, seconds)
-        texts = []
-        if self.config.caption_genre:
-            genre = genre_of(clip.id)
-            text = f"a dancer performs {GENRES.get(genre, f'{genre} dance')}"
-            texts.append(Caption(text=text, source="genre"))
-        meta = self.meta(clip, motion, licence=clip.licence).model_copy(update={"song": music_of(clip.id)})
-        return Sample(meta=meta, motion=motion, texts=texts, audio=rows, wav=wav)
+    def figure(self, path: Path, label: str) -> Figure:
+        motion = read_aist_motion(path, label)
+        rotations = motion.poses.reshape(-1, SMPL_JOINTS, 3).astype(np.float64)
+        return Figure(rotations=rotations, trans=np.asarray(motion.metres(), dtype=np.float64))
 
-    def _read_dance(self, clip: AistClip) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Axis-angles [T, 24, 3] and translation [T, 3] in metres of the frames that are used."""
-        label = clip.label()
-        source = read_aist_motion(inside(self.config.source / MOTIONS, f"{clip.id}.pkl", label), label)
-        if len(source.poses) != clip.frames:
-            raise UserError(f"{label}: {len(source.poses)} frames, {clip.frames} when the plan was made")
-        poses = source.poses[: clip.used].reshape(-1, SMPL_JOINTS, 3).astype(np.float64)
-        return poses, np.asarray(source.metres()[: clip.used], dtype=np.float64)
+
+def _facts(sequence: str) -> dict[str, str]:
+    """What a name says: genre `BR` and music `mBR0` of `gBR_sBM_cAll_d04_mBR0_ch01`."""
+    match = _SEQUENCE.fullmatch(sequence)
+    if match is None:
+        raise UserError(f"'{sequence}' is not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01")
+    facts = dict(zip(_FACTS, match.groups(), strict=True))
+    return facts | {"music": f"m{facts['music']}"}

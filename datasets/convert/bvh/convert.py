@@ -23,12 +23,12 @@ from motionloom.datasets.convert.bvh.plan import (
     plan_bvh,
     read_motion,
 )
-from motionloom.datasets.convert.bvh.settle import added_frames, named_unit
+from motionloom.datasets.convert.bvh.settle import added_frames
 from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
 from motionloom.datasets.convert.common.features import features_of
-from motionloom.datasets.convert.common.look import SourceJoints
+from motionloom.datasets.convert.common.look import SourceJoints, named_unit
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands

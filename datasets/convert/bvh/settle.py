@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
-from motionloom.datasets.motion.bvh.joint_map import METRES, JointMap, NamedUnit, Unit, Up, metres
+from motionloom.datasets.convert.common.look import ADULT_METRES, named_unit
+from motionloom.datasets.motion.bvh.joint_map import JointMap, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.frame_rate import wrong_rate
-from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
+from motionloom.datasets.motion.plausibility import measure
 from motionloom.datasets.motion.skeleton import Skeleton
 
-ADULT_METRES = 1.7
 _ABOVE = 0.8
 """Cosine between an axis and the way from pelvis to head from which a figure stands along it."""
 _JUMP_METRES, _JUMP_TIMES = 0.05, 5.0
@@ -48,12 +48,6 @@ def doubted_rate(motion: BvhMotion) -> str:
     unit, up, _ = settled(joint_map, [motion])
     joints = joint_map.apply(motion, unit=unit, up=up)
     return wrong_rate(joints[added_frames(joints) :], motion.fps)
-
-
-def named_unit(height: float) -> NamedUnit | None:
-    """The known unit in which a figure of this height in lengths of the file is a person, if any is."""
-    fits = [unit for unit, size in METRES.items() if PERSON_METRES[0] <= height * size <= PERSON_METRES[1]]
-    return min(fits, key=lambda unit: abs(np.log(height * METRES[unit] / ADULT_METRES)), default=None)
 
 
 def up_of(clips: Sequence[NDArray[np.floating]]) -> Up:

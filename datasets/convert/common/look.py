@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -22,12 +22,15 @@ from rich.table import Table
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.motion.bvh.joint_map import METRES, metres
+from motionloom.datasets.motion.bvh.joint_map import METRES, NamedUnit, metres
 from motionloom.datasets.motion.frame_rate import wrong_rate
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import MOST, PERSON_METRES, PlausibilityStats, measure
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import grouped
+
+ADULT_METRES = 1.7
+"""Height of an ordinary adult: of two units that make a person of a figure, the nearer one is meant."""
 
 Names = tuple[str | tuple[str, ...], ...]
 """What stands for each joint in a file; empty where no joint map says it."""
@@ -68,75 +71,56 @@ def stats_of(clips: Iterable[SeenClip]) -> PlausibilityStats:
     return stats
 
 
-def suggest(clips: list[SeenClip], config: ConvertConfig, names: Names) -> list[Suggestion]:
-    """Changes that together make people of the clips, one after the other: axis, unit, sides."""
+def _suggest(clips: list[SeenClip], config: ConvertConfig, names: Names) -> list[Suggestion]:
+    """Changes that together make people of the clips: axis, unit, sides."""
     out: list[Suggestion] = []
-    now = stats_of(clips)
-    if now.upright <= MOST:
+    seen = stats_of(clips)
+    if seen.upright <= MOST:
         axis = head_axis(clips)
-        clips = [replace(clip, joints=_turned(clip.joints, clip.up, axis)) for clip in clips]
         why = f"the head is above the pelvis along the {axis} axis of the files"
         turn = Suggestion("source", "turn the files so that y or z points up", why)
         is_option = hasattr(config, "up") and axis in ("+y", "+z")
         out.append(Suggestion("up", axis[1], why) if is_option else turn)
-        now = stats_of(clips)
-    if not PERSON_METRES[0] <= now.height <= PERSON_METRES[1]:
-        factor, suggestion = _unit_suggestion(now.height, config)
-        out.append(suggestion)
-        now = stats_of([replace(clip, joints=clip.joints * factor) for clip in clips])
-    if any(oddity.kind == "left and right" and oddity.is_error for oddity in now.oddities()):
-        mapped = Suggestion("joint_map", "exchange the left and the right rows", "the feet point backwards")
-        plain = Suggestion("source", "exchange left and right in the source", mapped.why)
-        out.append(mapped if names else plain)
+    # A height is made of lengths, so it is right along any axis; sides show in upright figures alone.
+    if not PERSON_METRES[0] <= seen.height <= PERSON_METRES[1]:
+        out.append(_suggest_unit(seen.height, config))
+    if not out and any(oddity.kind == "left and right" and oddity.is_error for oddity in seen.oddities()):
+        why = "the feet point backwards"
+        mapped = Suggestion("joint_map", "exchange the left and the right rows", why)
+        out.append(mapped if names else Suggestion("source", "exchange left and right in the source", why))
     return out
 
 
-def _unit_suggestion(height: float, config: ConvertConfig) -> tuple[float, Suggestion]:
+def named_unit(height: float) -> NamedUnit | None:
+    """The known unit in which a figure of this height in lengths of the file is a person, if any is."""
+    fits = [unit for unit, size in METRES.items() if PERSON_METRES[0] <= height * size <= PERSON_METRES[1]]
+    return min(fits, key=lambda unit: abs(np.log(height * METRES[unit] / ADULT_METRES)), default=None)
+
+
+def _suggest_unit(height: float, config: ConvertConfig) -> Suggestion:
+    """The unit that makes people of figures that are `height` metres tall in the unit that was taken."""
     own: Any = getattr(config, "unit", "m")
-    given = 1.0 if own == "auto" else metres(own)
-    factors = {unit: metres / given for unit, metres in METRES.items()}
-    fits = {u: f for u, f in factors.items() if PERSON_METRES[0] <= height * f <= PERSON_METRES[1]}
-    if not fits:
+    in_files = height / (1.0 if own == "auto" else metres(own))
+    unit = named_unit(in_files)
+    if unit is None:
         why = f"the figures are {height:.3g} m tall, and no unit makes 1.2 to 2.2 m of it"
-        factor = 1.7 / max(height, 1e-9)
-        if hasattr(config, "unit"):
-            return factor, Suggestion("unit", f"{factor * given:.4g}", why)
-        return factor, Suggestion("source", "scale the files", why)
-    unit, factor = min(fits.items(), key=lambda item: abs(np.log(height * item[1] / 1.7)))
-    why = f"then the figures are {height * factor:.2f} m tall"
+        scale = Suggestion("unit", f"{ADULT_METRES / max(in_files, 1e-9):.4g}", why)
+        return scale if hasattr(config, "unit") else Suggestion("source", "scale the files", why)
+    why = f"then the figures are {in_files * METRES[unit]:.2f} m tall"
     if hasattr(config, "unit"):
-        return factor, Suggestion("unit", unit, why)
-    return factor, Suggestion("source", f"the lengths look like {unit}: scale the files to metres", why)
-
-
-def _file_axes(vectors: NDArray[np.floating], up: str) -> NDArray[np.floating]:
-    """Vectors [..., 3] with Y up, in the axes of the files, of which `up` was taken for the upward one."""
-    if up == "z":
-        return np.stack([vectors[..., 0], -vectors[..., 2], vectors[..., 1]], axis=-1)
-    return vectors
+        return Suggestion("unit", unit, why)
+    return Suggestion("source", f"the lengths look like {unit}: scale the files to metres", why)
 
 
 def head_axis(clips: Iterable[SeenClip]) -> str:
     """The axis of the files along which the head lies from the pelvis in most clips."""
-    found: Counter[str] = Counter()
+    votes: Counter[str] = Counter()
     for clip in clips:
-        way = _file_axes(np.array(measure(clip.joints, clip.fps).up), clip.up)
-        axis = int(np.abs(way).argmax())
-        found[("+" if way[axis] > 0 else "-") + "xyz"[axis]] += 1
-    return found.most_common(1)[0][0]
-
-
-def _turned(joints: NDArray[np.float64], up: str, axis: str) -> NDArray[np.float64]:
-    x, y, z = np.moveaxis(_file_axes(joints, up), -1, 0)
-    turned = {
-        "+y": (x, y, z),
-        "-y": (x, -y, -z),
-        "+z": (x, z, -y),
-        "-z": (x, -z, y),
-        "+x": (-y, x, z),
-        "-x": (y, -x, z),
-    }[axis]
-    return np.stack(turned, axis=-1)
+        x, y, z = measure(clip.joints, clip.fps).up
+        along = np.array((x, -z, y) if clip.up == "z" else (x, y, z))
+        axis = int(np.abs(along).argmax())
+        votes[("+" if along[axis] > 0 else "-") + "xyz"[axis]] += 1
+    return votes.most_common(1)[0][0]
 
 
 MOST_CLIPS = 96
@@ -360,4 +344,4 @@ def _judge(
                 for oddity in stats_of(members).oddities()
                 if oddity.is_error and oddity.kind not in known
             ]
-    return problems, warnings, suggest(clips, config, names) if problems else []
+    return problems, warnings, _suggest(clips, config, names) if problems else []

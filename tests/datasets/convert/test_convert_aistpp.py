@@ -13,9 +13,8 @@ import soundfile
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features
 from motionloom.datasets.check.dataset import check
-from motionloom.datasets.convert.aistpp.convert import AistppConfig
+from motionloom.datasets.convert.aistpp.convert import MUSIC_LICENCE, AistppConfig
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.aistpp.plan import MUSIC_LICENCE
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
@@ -61,7 +60,7 @@ def save_motion(folder: Path, name: str, frames: int = 120, **changes: Any) -> N
 
 
 def silent(source: Path, **options: Any) -> AistppConfig:
-    return AistppConfig(source=source, music="none", **options)
+    return AistppConfig(source=source, sound="none", **options)
 
 
 def convert(config: AistppConfig, out: Path, **options: Any) -> Manifest:
@@ -105,7 +104,7 @@ def test_a_genuine_file_agrees_with_a_slow_forward(shared: Path, tmp_path: Path)
     path = shared / f"data/real/aistpp/{REAL}.pkl"
     (tmp_path / "motions").mkdir()
     shutil.copy(path, tmp_path / "motions")
-    prepared = prepare(AistppConfig(source=tmp_path, music="none", unlisted="hash"))
+    prepared = prepare(AistppConfig(source=tmp_path, sound="none", unlisted="hash"))
     joints = prepared.converter.joints(prepared.plan.items[0][1]).joints
     data = pickle.loads(path.read_bytes())
     rest = BodyModel.neutral("smpl22").rest_joints()
@@ -266,7 +265,7 @@ def test_twenty_frames_and_an_offset(source: Path, tmp_path: Path) -> None:
             assert np.array_equal(wav[0][:20000], sound[12000:])
     # 1.5 s later, the long clip finds 1.5 s of music too little.
     manifest = Manifest.load_json(late / "manifest.json")
-    assert any("12.00 s of motion, but 10.50 s of music" in d.reason for d in manifest.dropped)
+    assert any("12.00 s of motion, but 10.50 s of sound" in d.reason for d in manifest.dropped)
 
 
 def test_lengths_that_differ_are_cut_or_left_out(source: Path) -> None:
@@ -274,12 +273,12 @@ def test_lengths_that_differ_are_cut_or_left_out(source: Path) -> None:
     soundfile.write(source / "wavs/mBR0.wav", music[: round(11.3 * rate)], rate, subtype="FLOAT")
     plan = prepare(AistppConfig(source=source)).plan
     clip = next(clip for _, clip in plan.items if clip.id == REAL)
-    assert (clip.frames, clip.used) == (720, 678)
+    assert clip.last == 678
     assert plan.frames["train"] == 226
-    assert "1 sequences end with their music, at most 1 s early" in plan.notes
+    assert "1 clips end with their sound, at most 1 s early" in plan.notes
     soundfile.write(source / f"wavs/{REAL}.wav", music[: round(10.9 * rate)], rate)  # its own comes first
     plan = prepare(AistppConfig(source=source)).plan
-    assert any("12.00 s of motion, but 10.90 s of music" in d.reason for d in plan.dropped)
+    assert any("12.00 s of motion, but 10.90 s of sound" in d.reason for d in plan.dropped)
 
 
 @pytest.mark.parametrize("name", ["truncated", "zero_samples", "sample_rate_zero", "not_riff"])
@@ -289,7 +288,7 @@ def test_broken_music_is_named_and_its_dances_left_out(
     shutil.copy(shared / f"data/broken/wav/{name}.wav", source / "wavs/mHO9.wav")
     manifest = convert(AistppConfig(source=source, audio_features=False), tmp_path / "out")
     told = {d.source: d.reason for d in manifest.dropped}
-    assert "no readable music" in told[f"motions/{TEST}.pkl"]
+    assert "no readable sound" in told[f"motions/{TEST}.pkl"]
     assert "wavs/mHO9.wav" in told
     assert str(tmp_path) not in str(told)
     with pytest.raises(UserError, match=r"mHO9\.wav"):

@@ -14,6 +14,7 @@ from motionloom.datasets.audio.features import VERSION, AudioSettings
 from motionloom.datasets.audio.sound import sound_seconds
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
+from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import (
     body_of,
     canonical_smpl75,
@@ -61,7 +62,7 @@ Cfg = TypeVar("Cfg", bound=BodyConfig)
 class BodyRelease(Release[Cfg]):
     """A set of SMPL-H or SMPL-X parameters."""
 
-    model: ClassVar[Literal["SMPL-H", "SMPL-X"]]
+    model: ClassVar[Literal["SMPL", "SMPL-H", "SMPL-X"]]
     """Whose shapes and rest pose the parameters mean."""
 
     def __init__(self, config: Cfg) -> None:
@@ -75,6 +76,10 @@ class BodyRelease(Release[Cfg]):
         self._audio = config.audio_settings() if config.sound != "none" else None
         self._sounds: dict[str, float] = {}
         """Seconds of every sound file that can be read."""
+        self.sound_folder = config.source
+        self.sound_start = 0.0
+        """Second of a sound at which its motion begins."""
+        self._cut = 0
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         header = read_motion_header(path, label)
@@ -93,6 +98,13 @@ class BodyRelease(Release[Cfg]):
     def audio(self) -> AudioSettings | None:
         return self._audio
 
+    def plan(self, settings: PlanSettings) -> ConversionPlan[ReleaseClip]:
+        plan = super().plan(settings)
+        if self._cut:
+            gap = self.config.max_music_gap
+            plan.notes.append(f"{self._cut} clips end with their sound, at most {gap:g} s early")
+        return plan
+
     def with_sound(
         self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
     ) -> Iterator[tuple[Entry, str]]:
@@ -100,9 +112,12 @@ class BodyRelease(Release[Cfg]):
         for sound in dict.fromkeys(entry.sound for entry in entries if self.config.sound != "none"):
             if sound is not None:
                 try:
-                    lengths[sound] = sound_seconds(inside(self.config.source, sound), sound)
+                    label = sound
+                    if self.sound_folder != self.config.source:
+                        label = f"{self.sound_folder.name}/{sound}"
+                    lengths[sound] = sound_seconds(inside(self.sound_folder, sound, label), label)
                 except UserError as error:
-                    note_broken(draft, sound, error)
+                    note_broken(draft, label, error)
         for entry in entries:
             heard = entry.sound if entry.sound in lengths else None
             silent += heard is None and self.config.sound != "none"
@@ -117,16 +132,21 @@ class BodyRelease(Release[Cfg]):
     def cut_to_sound(self, entry: Entry, last: int, fps: float) -> tuple[int, str]:
         if entry.sound is None:
             return last, ""
-        heard = self._sounds[entry.sound]
-        cut = min(last, int(heard * fps + 1e-6))
-        if last - cut <= self.config.max_music_gap * fps:
-            return cut, ""
-        return cut, f"{last / fps:.2f} s of motion, but {heard:.2f} s of sound in {entry.sound}"
+        seconds = max(self._sounds[entry.sound] - self.sound_start, 0.0)
+        end = min(last, int(seconds * fps + 1e-6))
+        if last - end <= self.config.max_music_gap * fps:
+            self._cut += end < last
+            return end, ""
+        return end, f"{last / fps:.2f} s of motion, but {seconds:.2f} s of sound in {entry.sound}"
 
     def depends_on(self, clip: ReleaseClip) -> list[object]:
         sound = clip.entry.sound
-        size = (self.config.source / sound).stat().st_size if sound else 0
+        size = (self.sound_folder / sound).stat().st_size if sound else 0
         return [*super().depends_on(clip), sound, size]
+
+    def song(self, clip: ReleaseClip) -> str | None:
+        """Name of what is heard; clips with the same one dance to the same piece."""
+        return clip.entry.sound
 
     def posed(self, figure: Figure) -> NDArray[np.float64]:
         rotations, trans = self._parameters(figure)
@@ -145,8 +165,10 @@ class BodyRelease(Release[Cfg]):
         if layout.family == "raw":
             require_human(joints, clip.fps)
             rotations, trans = self._parameters(figure)
-            palms = np.zeros((len(trans), SMPL_JOINTS - BODY_JOINTS, 3))
-            poses = np.concatenate([rotations[:, :BODY_JOINTS], palms], axis=1)
+            poses = rotations
+            if self.model != "SMPL":  # whose two hand joints the other models do not have
+                palms = np.zeros((len(trans), SMPL_JOINTS - BODY_JOINTS, 3))
+                poses = np.concatenate([rotations[:, :BODY_JOINTS], palms], axis=1)
             motion = canonical_smpl75(poses, trans, self.body, clip.fps, layout.fps)
         else:
             face = figure.face if layout.has("face") else None
@@ -162,7 +184,7 @@ class BodyRelease(Release[Cfg]):
         rows, wav = None, None
         if clip.entry.sound is not None:
             seconds = len(motion) / layout.fps
-            source, start = self.config.source, clip.first / clip.fps
-            rows, wav = cut_of(self.config, source, clip.entry.sound, start, seconds)
-            meta = meta.model_copy(update={"song": clip.entry.sound})
+            start = self.sound_start + clip.first / clip.fps
+            rows, wav = cut_of(self.config, self.sound_folder, clip.entry.sound, start, seconds)
+        meta = meta.model_copy(update={"song": self.song(clip)})
         return Sample(meta, motion, texts=list(clip.entry.texts), audio=rows, wav=wav)

@@ -166,7 +166,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         for file, state in scanned.items():
             if isinstance(state, UserError):
                 draft.fail(file, state)
-        listed = read_split_files(config.splits)[0] if config.splits else None
+        listed = self.split_lists()
         seen: dict[str, str] = {}
         for entry, reason in self.with_sound(entries, draft):
             state = scanned[entry.file]
@@ -185,6 +185,10 @@ class Release(Converter[Cfg, ReleaseClip]):
             frames=lambda clip: frames_after(clip.last - clip.first, clip.fps, layout),
             licence=lambda clip: clip.licence,
         )
+
+    def split_lists(self) -> dict[str, Split] | None:
+        """Splits of clips by the user's own lists, which overrule the set's; None without any."""
+        return read_split_files(self.config.splits)[0] if self.config.splits else None
 
     def with_sound(
         self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
