@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from motionloom.datasets.convert.motionx.plan import MotionXClip, MotionXConfig
+from motionloom.datasets.convert.motionx.convert import MotionXConfig, MotionXEntry
 from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.convert.sets.shared.release import ReleaseClip
 
 WAVE = "idea400/subset_0001/bandai_wave_right_hand_clip_1"
 TURN = "idea400/subset_0001/bandai_Walking_And_Turn_Left_clip_2"
@@ -25,5 +26,9 @@ def config(folder: Path, **changes: Any) -> MotionXConfig:
     return MotionXConfig(source=folder, **changes)
 
 
-def planned(folder: Path, **changes: Any) -> dict[str, MotionXClip]:
+def clips_of(folder: Path, **changes: Any) -> dict[str, ReleaseClip]:
     return {clip.id: clip for _, clip in prepare(config(folder, **changes)).plan.items}
+
+
+def planned(folder: Path, **changes: Any) -> dict[str, MotionXEntry]:
+    return {clip_id: clip.entry for clip_id, clip in clips_of(folder, **changes).items()}

@@ -110,8 +110,10 @@ class Aistpp(BodyRelease[AistppConfig]):
         splits, ignored = self._lists(draft)
         music = self._music()
         here = sorted(path.stem for path in folder.glob("*.pkl") if path.name[0] != ".")
-        absent = [name for name in splits if name not in ignored and name not in here]
-        for name in (*here, *absent):
+        for name, split in splits.items():
+            if name not in ignored and name not in here:
+                draft.miss(f"{MOTIONS}/{name}.pkl", f"listed in split '{split}', but not here")
+        for name in here:
             try:
                 facts = _facts(name)
             except UserError as error:
@@ -211,8 +213,9 @@ class Aistpp(BodyRelease[AistppConfig]):
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return len(read_aist_motion(path, label).poses), FPS
 
-    def figure(self, path: Path, label: str) -> Figure:
-        motion = read_aist_motion(path, label)
+    def figure(self, clip: ReleaseClip) -> Figure:
+        label = clip.entry.file
+        motion = read_aist_motion(self.path_of(label), label)
         rotations = motion.poses.reshape(-1, SMPL_JOINTS, 3).astype(np.float64)
         return Figure(rotations=rotations, trans=np.asarray(motion.metres(), dtype=np.float64))
 

@@ -8,20 +8,47 @@ Choices, beside those of docs/sources.md:
   `smplx322` keeps all columns.
 - Nothing is invented: zero is what the sources of Motion-X hold where they know nothing (EgoBody's hands, for
   instance), so clips with nothing but zeros there have `has_face` or `has_hands` False.
+
+Only the motion is required: splits, captions, face motion and face texts are taken where they are. A plan
+reads headers and texts; motion data only of a few `aist/` clips, whose scale is examined.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.common.arrays import load_array
-from motionloom.datasets.convert.common.converter import Converter, PlanSettings
+from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
+from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
-from motionloom.datasets.convert.common.look import SourceJoints
-from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.splits import original_of
-from motionloom.datasets.convert.motionx.files import read_frame_texts
+from motionloom.datasets.convert.common.files import read_in_threads
+from motionloom.datasets.convert.common.plan import ConversionPlan, drop
+from motionloom.datasets.convert.common.splits import (
+    SplitNames,
+    hash_splits,
+    keep_mirrors_together,
+    original_of,
+    read_split_files,
+)
+from motionloom.datasets.convert.motionx.files import (
+    HUMANML,
+    SOURCE,
+    Kind,
+    MotionXFiles,
+    find_files,
+    official_id,
+    read_frame_texts,
+    read_sentences,
+    subset_of,
+)
 from motionloom.datasets.convert.motionx.parameters import (
     BETAS,
     EXPRESSION,
@@ -29,28 +56,96 @@ from motionloom.datasets.convert.motionx.parameters import (
     HANDS,
     RAW,
     TRANS,
+    aist_scale,
     resample_parameters,
     scale_aist,
     value_limits,
     with_face,
     z_up_to_y_up,
 )
-from motionloom.datasets.convert.motionx.plan import (
-    AIST,
-    FPS,
-    LICENCE,
-    MotionXClip,
-    MotionXConfig,
-    plan_motionx,
-)
-from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
+from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
+from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.schema import Caption, Dropped, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.text.clean import emotion_of
 
+FPS = 30.0
+AIST = "aist"
+MOCAP = ("humanml", "EgoBody", "GRAB")
+"""Subsets whose faces come in files of their own."""
 
-class MotionX(Converter[MotionXConfig, MotionXClip]):
+LICENCE = "Motion-X-noncommercial"
+LICENCES = {
+    "humanml": "AMASS-noncommercial",
+    "GRAB": "GRAB-noncommercial",
+    "EgoBody": "EgoBody-noncommercial",
+    "aist": "Motion-X-noncommercial AND AIST++-annotations-CC-BY-4.0",
+    "HAA500": "Motion-X-noncommercial AND HAA500-terms",
+    "humman": "Motion-X-noncommercial AND HuMMan-terms",
+}
+"""Our reading, on the careful side: motion that the user gets from its own site keeps that site's licence,
+all that Motion-X hands out needs its agreement as well, and both count where it has a first owner."""
+
+_SPLIT_FOLDERS = ("", "split", "splits", "datasets")
+_LOOKED_AT = 8
+"""Clips of `aist/` that the plan reads to tell their scale."""
+
+
+class MotionXConfig(ReleaseConfig):
+    """Options of the Motion-X converter. `source` is the folder that holds motion_data/ and texts/, under
+    any of the names they have had."""
+
+    layouts = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
+
+    name: str = "motionx"
+    """Name of the data set; part of the shards' file names."""
+    layout: str = "wholebody363"
+    """Feature layout of the shards; `smplx322` keeps all columns."""
+    fps: float = FPS
+    """Frame rate of the shards; clips are resampled by time."""
+    subsets: tuple[str, ...] = ()
+    """Convert only these subsets (`GRAB`, `idea400`, ...); empty means all."""
+    splits: Path | None = None
+    """Folder of train.txt, val.txt, test.txt; else searched at the top of the source, in `split/`, `splits/`
+    and `datasets/`; else 80/5/15 by hash of the id."""
+    body_model: Path | None = None
+    """Your SMPL-X or SMPL-H model (.npz), for joints with each clip's own shape; else a neutral skeleton."""
+    up: Literal["y", "z"] = "y"
+    """Up axis of the source. The release is Y up; `z` is for own files that no script has turned yet."""
+    uncaptioned: Literal["drop", "keep"] = "drop"
+    """What to do with clips that have no usable caption."""
+    frame_texts: bool = False
+    """Add the sentences about single frames (body_texts, hand_texts) as captions of 1/30 s and longer, with
+    source `body` and `hand`. They are many: about one a frame."""
+
+    @property
+    def skeleton(self) -> SkeletonName:
+        """The skeleton that is posed: of smplx322 and layouts with fingers, the one with fingers."""
+        return "smpl22" if self.motion_layout().skeleton_name == "smpl22" else "smplx52"
+
+
+@dataclass(frozen=True)
+class MotionXEntry(Entry):
+    """A clip with what else Motion-X has of it."""
+
+    face_texts: tuple[Caption, ...] = ()
+    face: str | None = None
+    """Face motion to write in."""
+    frame_texts: tuple[tuple[str, str], ...] = ()
+    """(source of the captions, file) of sentences about frames."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Every file the sample is made of, but for texts."""
+        return (self.file, *([self.face] if self.face else []), *(file for _, file in self.frame_texts))
+
+
+_Found = tuple[MotionXEntry, list[Dropped], list[str]]
+"""A clip; its files that cannot be read; and what is wrong with its captions."""
+
+
+class MotionX(Release[MotionXConfig]):
     """The Motion-X converter."""
 
     name = "motionx"
@@ -58,34 +153,163 @@ class MotionX(Converter[MotionXConfig, MotionXClip]):
     summary = "Motion-X: SMPL-X parameters (322-d), body, hand and face texts to shards."
     example = "Motion-X shards"
     config_class = MotionXConfig
+    terms = LICENCE
 
     def __init__(self, config: MotionXConfig) -> None:
         super().__init__(config)
         self.body = body_of(config.body_model, config.skeleton)  # a wrong one fails here
 
-    def plan(self, settings: PlanSettings) -> ConversionPlan[MotionXClip]:
-        return plan_motionx(self.config, settings)
+    def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        config = self.config
+        files = find_files(config.source)
+        motion = files.by_kind["motion"]
+        ids = sorted(clip_id for clip_id in motion if self._wanted(clip_id))
+        if not ids:
+            present = sorted({subset_of(clip_id) for clip_id in motion})
+            raise UserError(f"{config.source}: none of {config.subsets} in it, but {', '.join(present)}")
+        splits, notes = self._splits(ids)
+        for clip_id, split in splits.items():
+            if clip_id not in motion:
+                draft.miss(clip_id, f"listed in {split}.txt, but its motion is not here")
+        how = self.settings
+        read = partial(self._entry, files, splits)
+        made: list[_Found] = list(read_in_threads(read, ids, workers=how.workers, progress=how.progress))
+        entries = [entry for entry, _, _ in made]
+        unwanted = len(motion) - len(ids)
+        texts_alone = [clip_id for clip_id in files.by_kind["captions"] if clip_id not in motion]
+        draft.dropped += files.repeated
+        draft.broken += [*files.broken, *(problem for _, broken, _ in made for problem in broken)]
+        draft.notes += [
+            *files.notes(),
+            *notes,
+            *self._subset_notes(entries),
+            *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),
+            *([f"{len(texts_alone)} caption files have no motion"] if texts_alone else []),
+            *(problem for _, _, problems in made for problem in problems),
+        ]
+        return entries
 
-    def depends_on(self, clip: MotionXClip) -> list[object]:
-        sizes = [(self.config.source / file).stat().st_size for file in clip.files]
-        texts = [caption.dump() for caption in (*clip.texts, *clip.face_texts)]
-        return [clip.id, clip.files, sizes, clip.licence, texts]
+    def _wanted(self, clip_id: str) -> bool:
+        return not self.config.subsets or subset_of(clip_id) in self.config.subsets
+
+    def _splits(self, ids: list[str]) -> tuple[dict[str, Split], list[str]]:
+        """Split of every wanted id, and notes."""
+        config, names = self.config, SplitNames()
+        if config.splits is not None:
+            folder, origin = config.splits, "splits: from the folder given"
+        else:
+            here = [name for name in _SPLIT_FOLDERS if names.files(config.source / name)]
+            if not here:
+                return hash_splits(ids)
+            folder, origin = config.source / here[0], f"splits: {here[0] or '.'}/"
+        listed, notes = read_split_files(folder)
+        keep_mirrors_together(listed, folder)
+        splits: dict[str, Split] = {}
+        for clip_id, split in listed.items():
+            official = official_id(clip_id.removesuffix(".npy"))
+            if splits.setdefault(official, split) != split:
+                raise UserError(
+                    f"{folder}: '{official}' is in {splits[official]}.txt and {split}.txt; that leaks"
+                )
+        return {key: split for key, split in splits.items() if self._wanted(key)}, [origin, *notes]
+
+    def split_lists(self) -> dict[str, Split] | None:
+        return None  # read in `entries`
+
+    def _entry(self, files: MotionXFiles, splits: dict[str, Split], clip_id: str) -> _Found:
+        """A clip with its texts. Segments of humanml's captions are checked when its length is known."""
+        source, broken, problems = self.config.source, list[Dropped](), list[str]()
+
+        def read(kind: Kind, reader: Callable[..., tuple[list[Caption], list[str]]]) -> tuple[Caption, ...]:
+            file = files.by_kind[kind].get(clip_id)
+            if file is None:
+                return ()
+            try:
+                texts, wrong = reader(source / file, name=file)
+            except UserError as error:
+                broken.append(drop(file, error))
+                return ()
+            problems.extend([f"{file}: {'; '.join(wrong)}"] if wrong else [])
+            return tuple(texts)
+
+        in_grammar = subset_of(clip_id) == HUMANML
+        captions = partial(read_humanml_captions, seconds=None) if in_grammar else read_sentences
+        face = files.by_kind["face motion"].get(clip_id)
+        if face is not None:
+            try:
+                check_array_header(source / face, width=FACE_WIDTH, name=face)
+            except UserError as error:
+                broken.append(drop(face, error))
+                face = None
+        by_frames = (("body", files.by_kind["body texts"]), ("hand", files.by_kind["hand texts"]))
+        frame_texts = tuple((kind, table[clip_id]) for kind, table in by_frames if clip_id in table)
+        subset = subset_of(clip_id)
+        entry = MotionXEntry(
+            clip_id, files.by_kind["motion"][clip_id],
+            read("captions", partial(captions, source=SOURCE)),
+            splits.get(clip_id), facts={"subset": subset}, mirror_of=original_of(clip_id),
+            licence=LICENCES.get(subset, LICENCE),
+            problem="" if clip_id in splits else "in no split file",
+            face_texts=read("face texts", partial(read_sentences, source="face")),
+            face=face, frame_texts=frame_texts if self.config.frame_texts else (),
+        )  # fmt: skip
+        return entry, broken, problems
+
+    def _subset_notes(self, entries: list[MotionXEntry]) -> list[str]:
+        """Notes on captions and faces that subsets lack, and on the scale of `aist/`."""
+        notes = []
+        by_subset: dict[str, list[MotionXEntry]] = {}
+        for entry in entries:
+            by_subset.setdefault(subset_of(entry.id), []).append(entry)
+        humanml = by_subset.get(HUMANML, [])
+        if humanml and not any(entry.texts for entry in humanml):
+            notes.append(
+                "humanml/ has no captions: unpack HumanML3D's texts.zip as humanml/ beside the others"
+            )
+        mocap = [entry for subset in MOCAP for entry in by_subset.get(subset, [])]
+        if faceless := sum(entry.face is None for entry in mocap):
+            notes.append(
+                f"{faceless} of {len(mocap)} clips of {', '.join(MOCAP)} have no face motion file: unless "
+                f"their own columns hold an expression, their face is masked"
+            )
+        states: Counter[str] = Counter()
+        for entry in sorted(by_subset.get(AIST, []), key=lambda one: sha256_of_json(one.id))[:_LOOKED_AT]:
+            try:
+                states[aist_scale(self._load(entry.file))] += 1
+            except UserError:
+                states["broken"] += 1  # the conversion reports why
+        if states:
+            counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
+            notes.append(
+                f"aist/: of {states.total()} clips looked at, {counts}; raw ones are brought to metres once "
+                f"(/ 94, z negated), each judged by itself"
+            )
+        return notes
+
+    def _load(self, file: str) -> NDArray[np.floating]:
+        return load_array(self.path_of(file), width=RAW.dim, name=file, limit=value_limits())
+
+    def length(self, path: Path, label: str) -> tuple[int, float]:
+        return check_array_header(path, width=RAW.dim, name=label), FPS
+
+    def path_of(self, file: str) -> Path:
+        return self.config.source / file  # `find_files` has looked where links lead
+
+    def depends_on(self, clip: ReleaseClip) -> list[object]:
+        entry = _with_face(clip)
+        sizes = [self.path_of(file).stat().st_size for file in entry.files]
+        texts = [caption.dump() for caption in (*entry.texts, *entry.face_texts)]
+        return [clip.id, entry.files, sizes, clip.licence, texts]
 
     def options(self) -> dict[str, object]:
         return super().options() | {"body_model": self.body.statement}
 
-    def licence(self, plan: ConversionPlan[MotionXClip]) -> str:
-        return self.config.licence or (next(iter(plan.licences)) if len(plan.licences) == 1 else LICENCE)
+    def figure(self, clip: ReleaseClip) -> Figure:
+        return Figure(joints=parameters_to_joints(self.parameters(clip), self.body))
 
-    def subset(self, clip: MotionXClip) -> str:
-        return clip.subset
-
-    def joints(self, clip: MotionXClip) -> SourceJoints:
-        return SourceJoints(parameters_to_joints(read_parameters(self.config, clip), self.body), FPS)
-
-    def convert(self, clip: MotionXClip) -> Sample:
-        config, layout = self.config, self.layout
-        values = read_parameters(config, clip)
+    def convert(self, clip: ReleaseClip) -> Sample:
+        config, layout, entry = self.config, self.layout, _with_face(clip)
+        values = self.parameters(clip)
         has_face = bool(values[:, EXPRESSION].any())
         joints = parameters_to_joints(values, self.body)
         if layout.family == "raw":
@@ -94,38 +318,44 @@ class MotionX(Converter[MotionXConfig, MotionXClip]):
         else:
             face = values[:, EXPRESSION] if layout.has("face") and has_face else None
             motion = features_of(joints, FPS, layout, face=face, same_bones=config.retarget)
-        meta = self.meta(
+        meta = self.clip_meta(
             clip,
             motion,
-            licence=clip.licence,
             hands=layout.num_joints > BODY_JOINTS and bool(values[:, HANDS].any()),
             face=layout.has("face") and has_face,
-            mirror_of=original_of(clip.id),
         )
-        texts = [*clip.texts, *_frame_captions(config, clip)]
-        faces = list(clip.face_texts)
-        emotion = None if faces or not meta.has_face else emotion_of(caption.text for caption in clip.texts)
+        texts = list(entry.texts)
+        for source, file in entry.frame_texts:
+            path = config.source / file
+            texts += read_frame_texts(path, source=source, frames=clip.last, fps=FPS, name=file)
+        faces = list(entry.face_texts)
+        # A clip with a face but no words about it takes the emotion that its captions name.
+        emotion = None if faces or not meta.has_face else emotion_of(caption.text for caption in entry.texts)
         if emotion is not None:
             faces = [Caption(text=emotion, source="emotion")]
         return Sample(meta=meta, motion=motion, texts=texts, face_texts=faces)
 
+    def parameters(self, clip: ReleaseClip) -> NDArray[np.float64]:
+        """The clip's columns [T, 322], repaired: metres, Y up, face motion written in."""
+        entry, subset = _with_face(clip), subset_of(clip.id)
+        values = self._load(entry.file).astype(np.float64)
+        if len(values) != clip.last:
+            raise UserError(
+                f"{entry.file}: {len(values)} frames, {clip.last} when the plan was made; convert again"
+            )
+        if subset == AIST:
+            values = scale_aist(values)
+        if self.config.up == "z":
+            values = z_up_to_y_up(values)
+        if entry.face is not None:
+            face = load_array(self.path_of(entry.face), width=FACE_WIDTH, name=entry.face, limit=1000.0)
+            values = with_face(values, face, keep_jaw=subset == "GRAB")
+        return values
 
-def read_parameters(config: MotionXConfig, clip: MotionXClip) -> NDArray[np.float64]:
-    """The clip's columns [T, 322], repaired: metres, Y up, face motion written in."""
-    raw = load_array(config.source / clip.path, width=RAW.dim, name=clip.path, limit=value_limits())
-    if len(raw) != clip.frames:
-        raise UserError(
-            f"{clip.path}: {len(raw)} frames, {clip.frames} when the plan was made; convert again"
-        )
-    values = raw.astype(np.float64)
-    if clip.subset == AIST:
-        values = scale_aist(values)
-    if config.up == "z":
-        values = z_up_to_y_up(values)
-    if clip.face is not None:
-        face = load_array(config.source / clip.face, width=FACE_WIDTH, name=clip.face, limit=1000.0)
-        values = with_face(values, face, keep_jaw=clip.subset == "GRAB")
-    return values
+
+def _with_face(clip: ReleaseClip) -> MotionXEntry:
+    assert isinstance(clip.entry, MotionXEntry)
+    return clip.entry
 
 
 def parameters_to_joints(values: NDArray[np.float64], body: BodyModel) -> NDArray[np.float64]:
@@ -134,13 +364,3 @@ def parameters_to_joints(values: NDArray[np.float64], body: BodyModel) -> NDArra
     rotations = values[:, : 3 * count].reshape(len(values), count, 3)
     # The shape is one a clip; where a fit let it waver, the median is that of most frames.
     return smpl_joints(rotations, values[:, TRANS], body, np.median(values[:, BETAS], axis=0))
-
-
-def _frame_captions(config: MotionXConfig, clip: MotionXClip) -> list[Caption]:
-    return [
-        caption
-        for source, file in clip.frame_texts
-        for caption in read_frame_texts(
-            config.source / file, source=source, frames=clip.frames, fps=FPS, name=file
-        )
-    ]

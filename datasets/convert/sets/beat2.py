@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -133,9 +132,9 @@ class Beat2(BodyRelease[Beat2Config]):
             start, end, said = (start if said else begin), stop, [*said, word]
         yield from captions_of(" ".join(said), "speech", start, end)
 
-    def figure(self, path: Path, label: str) -> Figure:
-        figure = super().figure(path, label)
-        with NpzFile(path, label) as file:
+    def figure(self, clip: ReleaseClip) -> Figure:
+        figure, label = super().figure(clip), clip.entry.file
+        with NpzFile(self.path_of(label), label) as file:
             face = (
                 file.numbers("expressions")
                 if "expressions" in file.names

@@ -110,8 +110,9 @@ class FineDance(BodyRelease[FineDanceConfig]):
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return check_array_header(path, width=WIDTH, name=label), SOURCE_FPS
 
-    def figure(self, path: Path, label: str) -> Figure:
-        values = load_array(path, width=WIDTH, name=label, limit=_LIMITS).astype(np.float64)
+    def figure(self, clip: ReleaseClip) -> Figure:
+        label = clip.entry.file
+        values = load_array(self.path_of(label), width=WIDTH, name=label, limit=_LIMITS).astype(np.float64)
         rotations = rotvecs_of_rows(values[:, 3:].reshape(len(values), JOINTS, 6), label)
         return Figure(rotations=rotations, trans=values[:, :3])
 

@@ -148,8 +148,10 @@ class Motion272(Release[Motion272Config]):
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return check_array_header(path, width=WIDTH, name=label), self.config.source_fps
 
-    def figure(self, path: Path, label: str) -> Figure:
-        return Figure(joints=joints_of_272(load_array(path, width=WIDTH, name=label, limit=1e3)))
+    def figure(self, clip: ReleaseClip) -> Figure:
+        label = clip.entry.file
+        values = load_array(self.path_of(label), width=WIDTH, name=label, limit=1e3)
+        return Figure(joints=joints_of_272(values))
 
 
 def joints_of_272(values: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -89,8 +89,9 @@ class SnapMoGen(Release[SnapMoGenConfig]):
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return check_array_header(path, width=WIDTH, name=label), FPS
 
-    def figure(self, path: Path, label: str) -> Figure:
-        values = load_array(path, width=WIDTH, name=label, limit=1e4)
+    def figure(self, clip: ReleaseClip) -> Figure:
+        label = clip.entry.file
+        values = load_array(self.path_of(label), width=WIDTH, name=label, limit=1e4)
         return Figure(joints=joints_of_296(values)[:, ORDER] * self.config.metres)
 
 

@@ -164,18 +164,6 @@ def test_a_source_that_is_mostly_rejected_fails(tmp_path: Path) -> None:
     assert convert(source, out, most_rejected=1).shards
 
 
-def test_swapped_sides_are_refused(tmp_path: Path) -> None:
-    built = build(LAFAN1)
-    swap = {"Left": "Right", "Right": "Left"}
-    built.names = [
-        next((swap[s] + n.removeprefix(s) for s in swap if n.startswith(s)), n) for n in built.names
-    ]
-    write_figure(tmp_path / "mocap/a.bvh", built, frames=66, twisted=True)
-    with pytest.raises(UserError, match="exchange the left and the right rows"):
-        convert(tmp_path / "mocap", tmp_path / "out")
-    assert not convert(tmp_path / "mocap", tmp_path / "out", look=0).dropped
-
-
 def test_a_guess_needs_no_whole_first_file_and_no_folder(tmp_path: Path) -> None:
     source = tmp_path / "mocap"
     for name in ("a", "b"):

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.splits import hash_split
-from motionloom.datasets.convert.humanml3d.convert import HumanMl3dConfig
 from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.convert.sets.humanml3d import HumanMl3dConfig
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout

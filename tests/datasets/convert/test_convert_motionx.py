@@ -25,14 +25,14 @@ from motionx_clips import (
     TEXTS,
     TURN,
     WAVE,
+    clips_of,
     config,
-    planned,
 )
 from numpy.typing import NDArray
 
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.common.conversion import run_conversion
-from motionloom.datasets.convert.motionx.convert import MotionX, parameters_to_joints, read_parameters
+from motionloom.datasets.convert.motionx.convert import MotionX, parameters_to_joints
 from motionloom.datasets.convert.motionx.parameters import (
     RAW,
     aist_scale,
@@ -57,7 +57,7 @@ def fixture(shared: Path) -> Path:
 
 
 def sample(folder: Path, clip_id: str, **changes: Any) -> Sample:
-    return MotionX(config(folder, **changes)).convert(planned(folder, **changes)[clip_id])
+    return MotionX(config(folder, **changes)).convert(clips_of(folder, **changes)[clip_id])
 
 
 def convert(folder: Path, out: Path, *, workers: int = 1, **changes: Any) -> Manifest:
@@ -274,7 +274,7 @@ def test_dirty_clips_are_dropped_with_reasons(copy: Path, shared: Path, tmp_path
 
 def test_resampled_parameters_turn_evenly(fixture: Path) -> None:
     """20 from 30 fps: every second output frame is an input frame, and joints stay near those in between."""
-    values = read_parameters(config(fixture), planned(fixture)[WAVE])
+    values = MotionX(config(fixture)).parameters(clips_of(fixture)[WAVE])
     slow = resample_parameters(values, 30.0, 20.0)
     assert len(slow) == 33
     body = BodyModel.neutral("smplx52")
@@ -290,7 +290,7 @@ def test_body_model_gives_shapes(fixture: Path, amass: ModuleType, tmp_path: Pat
     conversion = prepare(config(fixture, body_model=path))
     assert conversion.options["body_model"]["kind"] == "SMPL-X"
     assert str(tmp_path) not in json.dumps(conversion.options)
-    made = conversion.converter.convert(planned(fixture)[BOW])
+    made = conversion.converter.convert(clips_of(fixture)[BOW])
     assert isinstance(made, Sample)
     beta = float(np.median(np.load(fixture / MOTION / f"{BOW}.npy")[:, 312]))
     skeleton = BodyModel.neutral("smplx52").skeleton

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from motionx_clips import ALL, BOW, DANCE, HUMANML, MOTION, MUG, TEXTS, TURN, WAVE, config, planned
+from motionx_clips import ALL, BOW, DANCE, HUMANML, MOTION, MUG, TEXTS, TURN, WAVE, clips_of, config, planned
 
 from motionloom.datasets.convert.registry import prepare
 
@@ -43,7 +43,7 @@ def test_captions_of_both_grammars(fixture: Path) -> None:
     assert [c.text for c in clips[BOW].face_texts] == ["happy"]
     assert clips[BOW].face_texts[0].source == "face"
     notes = prepare(config(fixture)).plan.notes
-    assert any(f"{HUMANML}.txt: line 3: the segment 0.5..2.5 s" in note for note in notes)
+    assert any(f"{HUMANML}: a caption at 0.5 s is beyond its 1.7 s" in note for note in notes)
 
 
 def test_segments_are_seconds_at_30_fps(copy: Path) -> None:
@@ -58,7 +58,7 @@ def test_names_and_empty_captions(copy: Path) -> None:
     (copy / TEXTS / f"{TURN}.txt").write_bytes(b"caf\xe9 dance")
     (copy / TEXTS / f"{MUG}.txt").unlink()
     plan = prepare(config(copy)).plan
-    clips = {clip.id: clip for _, clip in plan.items}
+    clips = {clip.id: clip.entry for _, clip in plan.items}
     assert [c.text for c in clips[WAVE].texts] == ["Dance Break Back Cc"]
     assert {d.source for d in plan.dropped} == {f"{MOTION}/{i}.npy" for i in (BOW, TURN, MUG)}
     assert {d.reason for d in plan.dropped} == {"no usable caption"}
@@ -100,9 +100,13 @@ def test_every_known_naming(copy: Path, fixture: Path, moves: dict[str, str], no
         (copy / new).parent.mkdir(parents=True, exist_ok=True)
         (copy / old).rename(copy / new)
     plan = prepare(config(copy)).plan
-    found = {clip.id: (split, clip.texts, clip.face_texts, bool(clip.face)) for split, clip in plan.items}
-    base = {clip.id: (split, clip.texts, clip.face_texts, bool(clip.face))
-            for split, clip in prepare(config(fixture)).plan.items}  # fmt: skip
+    found, base = (
+        {
+            clip.id: (split, clip.entry.texts, clip.entry.face_texts, bool(clip.entry.face))
+            for split, clip in each.items
+        }
+        for each in (plan, prepare(config(fixture)).plan)
+    )
     assert found == base
     for note in notes:
         assert any(note in told for told in plan.notes), plan.notes
@@ -162,4 +166,4 @@ def test_subsets_limit_and_licences(fixture: Path) -> None:
     assert {clip.id for _, clip in plan.items} == {MUG}
     assert {clip.licence for _, clip in prepare(config(fixture, licence="mine")).plan.items} == {"mine"}
     assert prepare(config(fixture, licence="mine")).facts().licence == "mine"
-    assert planned(fixture)[DANCE].licence.endswith("AIST++-annotations-CC-BY-4.0")
+    assert clips_of(fixture)[DANCE].licence.endswith("AIST++-annotations-CC-BY-4.0")

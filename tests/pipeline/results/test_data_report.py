@@ -149,7 +149,7 @@ def test_raw_sets_without_captions_have_a_page(name: str, tmp_path: Path) -> Non
 
 def test_commands(call: Callable[..., Any], nasty: Path, tmp_path: Path) -> None:
     copied = shutil.copytree(nasty, tmp_path / "set")
-    done = call("data", "report", copied, "--clips", 1)
+    done = call("data", "report", copied)
     assert done.code == 0 and (copied / "report.html").is_file()
     assert call("data", "check", copied).code == 0  # the page does not disturb the set
     strict = call("data", "check", copied, "--strict")

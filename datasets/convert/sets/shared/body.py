@@ -87,8 +87,8 @@ class BodyRelease(Release[Cfg]):
             raise UserError(f"{label}: parameters of {header.kind}; {self.title} has those of {self.model}")
         return header.frames, header.fps or SOURCE_FPS
 
-    def figure(self, path: Path, label: str) -> Figure:
-        motion = read_motion(path, label, hands=True)
+    def figure(self, clip: ReleaseClip) -> Figure:
+        motion = read_motion(self.path_of(clip.entry.file), clip.entry.file, hands=True)
         return Figure(rotations=motion.rotations, trans=motion.trans, betas=motion.betas)
 
     def options(self) -> dict[str, object]:

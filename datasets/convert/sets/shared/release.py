@@ -137,6 +137,8 @@ class Release(Converter[Cfg, ReleaseClip]):
 
     terms: ClassVar[str]
     """The licence of clips that state none of their own."""
+    settings = PlanSettings()
+    """How the source is looked through."""
 
     @abstractmethod
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
@@ -149,11 +151,11 @@ class Release(Converter[Cfg, ReleaseClip]):
         """Frames and frame rate of a motion file, by its header."""
 
     @abstractmethod
-    def figure(self, path: Path, label: str) -> Figure:
-        """What a motion file holds."""
+    def figure(self, clip: ReleaseClip) -> Figure:
+        """The whole motion file of a clip."""
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[ReleaseClip]:
-        config, layout = self.config, self.layout
+        config, self.settings = self.config, settings
         if not config.source.is_dir():
             raise UserError(f"{config.source}: no such folder")
         draft = ConversionPlan[ReleaseClip](config, audit=Audit(self.stated()))
@@ -182,9 +184,17 @@ class Release(Converter[Cfg, ReleaseClip]):
         draft.limit(lambda clip: clip.id)
         return draft.finish(
             found=sum(state is not None for state in scanned.values()),
-            frames=lambda clip: frames_after(clip.last - clip.first, clip.fps, layout),
+            frames=self.frames,
             licence=lambda clip: clip.licence,
         )
+
+    def path_of(self, file: str) -> Path:
+        """Where a motion file is; `UserError` for one outside of the source."""
+        return inside(self.config.source, file)
+
+    def frames(self, clip: ReleaseClip) -> int:
+        """Frames of a clip's features."""
+        return frames_after(clip.last - clip.first, clip.fps, self.layout)
 
     def split_lists(self) -> dict[str, Split] | None:
         """Splits of clips by the user's own lists, which overrule the set's; None without any."""
@@ -203,7 +213,7 @@ class Release(Converter[Cfg, ReleaseClip]):
     def _scan(self, file: str) -> tuple[int, float, int] | UserError | None:
         """Frames, rate and bytes of a motion file; None when it is not there."""
         try:
-            path = inside(self.config.source, file)
+            path = self.path_of(file)
             if not path.is_file():
                 return None
             return (*self.length(path, file), path.stat().st_size)
@@ -259,11 +269,10 @@ class Release(Converter[Cfg, ReleaseClip]):
 
     def read(self, clip: ReleaseClip) -> Figure:
         """The frames of a clip."""
-        file = clip.entry.file
-        figure = self.figure(inside(self.config.source, file), file)
+        figure = self.figure(clip)
         if len(figure) < clip.last:
             raise UserError(
-                f"{file}: {len(figure)} frames, {clip.last} when the plan was made; convert again"
+                f"{clip.entry.file}: {len(figure)} frames, {clip.last} when the plan was made; convert again"
             )
         return figure.cut(clip.first, clip.last)
 

@@ -1,1 +1,0 @@
-"""HumanML3D to shards."""
