@@ -24,8 +24,8 @@ from motionloom.datasets.convert.bvh.plan import (
     read_motion,
 )
 from motionloom.datasets.convert.bvh.settle import added_frames
-from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
+from motionloom.datasets.convert.common.facts import Audit
 from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.look import SourceJoints, named_unit

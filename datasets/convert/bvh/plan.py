@@ -20,13 +20,12 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
-from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.converter import PlanSettings
+from motionloom.datasets.convert.common.facts import Audit, Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
-from motionloom.datasets.convert.common.where import Fact, Facts
 from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import (
     JointMap,

@@ -8,7 +8,7 @@ from typing import ClassVar, get_args
 from pydantic import ConfigDict, Field, field_validator
 from pydantic.fields import FieldInfo
 
-from motionloom.datasets.convert.common.where import parse_where
+from motionloom.datasets.convert.common.facts import parse_where
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import Config, MotionType, UserError
 

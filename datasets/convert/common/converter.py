@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.common.audit import Published
 from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import C, ConversionPlan

@@ -17,10 +17,9 @@ from rich.table import Table
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.base.progress import duration
-from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.facts import Audit, Facts, parse_where, require_known
 from motionloom.datasets.convert.common.look import Look
-from motionloom.datasets.convert.common.where import Facts, parse_where, require_known
 from motionloom.datasets.schema import SPLITS, AuditRow, Dropped, Split, UserError
 from motionloom.datasets.shards.left_out import grouped, grouped_notes
 

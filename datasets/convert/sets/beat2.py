@@ -15,10 +15,9 @@ from typing import Literal
 import numpy as np
 
 from motionloom.datasets.convert.common.arrays import check_values
-from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.where import Fact
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv

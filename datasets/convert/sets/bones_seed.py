@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.scan import ARCHIVES, Batch, list_batches
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state
 from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv, read_json_lines

@@ -13,14 +13,13 @@ from typing import Literal
 import numpy as np
 
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import hash_share
-from motionloom.datasets.convert.common.where import Fact
 from motionloom.datasets.convert.sets.shared.body import SOURCE_FPS, BodyConfig, BodyRelease
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
-from motionloom.datasets.convert.sets.shared.rotations import rotvecs_of_rows
 from motionloom.datasets.convert.sets.shared.tables import captions_of, read_json, require_record
+from motionloom.datasets.convert.sets.shared.vectors import rotvecs_of_rows
 from motionloom.datasets.schema import Split, UserError
 
 JOINTS = 52

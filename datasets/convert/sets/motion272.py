@@ -24,11 +24,10 @@ from pydantic import Field
 
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import original_of, read_split_files
-from motionloom.datasets.convert.common.where import Fact
 from motionloom.datasets.convert.sets.shared.release import (
     Entry,
     Figure,

@@ -13,11 +13,10 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
-from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.files import inside, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import hash_share
-from motionloom.datasets.convert.common.where import Fact
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.sets.shared.release import Entry, ReleaseClip, note_broken
 from motionloom.datasets.convert.sets.shared.tables import captions_of, read_json, require_record

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import join_splits
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig

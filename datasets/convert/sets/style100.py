@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.common.audit import Published
+from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state, stem
 from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv
 from motionloom.datasets.schema import UserError

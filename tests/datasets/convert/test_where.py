@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from motionloom.datasets.convert.amass.plan import AmassConfig
-from motionloom.datasets.convert.common.audit import Audit, Published
-from motionloom.datasets.convert.common.where import parse_where, require_known
+from motionloom.datasets.convert.common.facts import Audit, Published, parse_where, require_known
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.schema import UserError
 

@@ -1,7 +1,7 @@
 """Guess the joint map of any figure: names first, checked and completed by its tree.
 
-1. Legs and arms by the words of their names along a chain (`limbs.py`), their feet also at End Sites
-   (`feet.py`).
+1. Legs and arms by the words of their names along a chain (`limbs.py`), their feet also at End
+   Sites.
 2. Pelvis, spine, neck and head between and above them, fingers below the wrists.
 3. A joint that is missing between two others is a mean of its neighbours.
 
@@ -17,7 +17,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from motionloom.datasets.convert.bvh.joint_guess.feet import with_feet
 from motionloom.datasets.convert.bvh.joint_guess.figure import CONVENTIONS, Figure
 from motionloom.datasets.convert.bvh.joint_guess.limbs import (
     How,
@@ -29,6 +28,7 @@ from motionloom.datasets.convert.bvh.joint_guess.limbs import (
     fill_trunk,
     named_limbs,
     roots,
+    with_feet,
 )
 from motionloom.datasets.motion.bvh.joint_map import JointMap, map_text
 from motionloom.datasets.motion.bvh.motion import END, BvhMotion

@@ -16,15 +16,14 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.common.audit import Audit
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
+from motionloom.datasets.convert.common.facts import Audit, Fact
 from motionloom.datasets.convert.common.features import features_of, frames_after
 from motionloom.datasets.convert.common.files import inside, read_in_threads
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.splits import hash_split, read_split_files
-from motionloom.datasets.convert.common.where import Fact
 from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 
