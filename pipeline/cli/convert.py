@@ -221,6 +221,7 @@ def proposed(
     kind: str, config: ConvertConfig, out: Path, plan: ConversionPlan[Any], *, licensed: bool
 ) -> str:
     """The command that converts what was planned: the settings given, and what else the plan found needed."""
+    # Whatever would stop the conversion is decided here in the careful way, for the user to see and change.
     changes: dict[str, object] = {} if licensed else {"licence": "unknown"}
     if plan.stop:
         changes["uncaptioned"] = "drop"
@@ -273,7 +274,7 @@ def say_manifest(manifest: Manifest, out: Path, console: Console) -> None:
 
 
 def _say_left_out(manifest: Manifest, out: Path, console: Console) -> None:
-    """How much was left out, a line for each reason, and where the whole list is."""
+    """Print how much was left out, a line for each reason, and where the whole list is."""
     if not manifest.dropped:
         return
     listed = out / LEFT_OUT_FILE

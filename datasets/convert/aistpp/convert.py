@@ -39,7 +39,7 @@ _SEQUENCE = re.compile(r"g([A-Z]{2})_s([A-Z]{2})_c(?:All|\d\d)_d(\d+)_m([A-Z]{2}
 """Genre, situation (BM basic, FM advanced), dancer, music, choreography."""
 _FACTS = ("genre", "situation", "dancer", "music", "choreography")
 _SUFFIXES = (".json", ".pkl")
-"""What may stand behind a sequence in the lists."""
+"""Suffixes that the lists may write behind a sequence."""
 
 GENRES = {
     "BR": "break dance",
@@ -221,7 +221,7 @@ class Aistpp(BodyRelease[AistppConfig]):
 
 
 def _facts(sequence: str) -> dict[str, str]:
-    """What a name says: genre `BR` and music `mBR0` of `gBR_sBM_cAll_d04_mBR0_ch01`."""
+    """Return the facts in a name: genre `BR` and music `mBR0` of `gBR_sBM_cAll_d04_mBR0_ch01`."""
     match = _SEQUENCE.fullmatch(sequence)
     if match is None:
         raise UserError(f"'{sequence}' is not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01")

@@ -66,8 +66,8 @@ class IndexRow:
         """
         step = thinning(fps)
         lead = LEADS.get(self.subset, 0)
-        there = max(math.ceil(frames / step) - lead, 0)
-        start, end, _ = slice(self.start, self.end).indices(there)
+        thinned = max(math.ceil(frames / step) - lead, 0)
+        start, end, _ = slice(self.start, self.end).indices(thinned)
         if end <= start:
             return 0, 0
         return (lead + start) * step, (lead + end - 1) * step + 1
@@ -79,7 +79,7 @@ def thinning(fps: float) -> int:
 
 
 def clip_key(path: str) -> str:
-    """What a file and its row of the index have in common, over the AMASS releases.
+    """Return the key that a file and its row of the index share over the AMASS releases.
 
     The last three parts of the path (subset, subject, clip) without the endings `_poses` and `_stageii`;
     later releases write `_` for spaces.

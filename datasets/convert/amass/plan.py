@@ -271,6 +271,7 @@ def _rows_by_file(rows: list[IndexRow], files: list[AmassFile], draft: Draft) ->
         first = by_key.setdefault(clip_key(file.label), file)
         if first is not file:
             draft.leave_out(file.label, f"the same clip as {first.label}")
+    # Rows whose recordings are no part of AMASS are told apart from files that the user lacks.
     for row in rows:
         match = by_key.get(clip_key(row.source))
         if match is not None:
@@ -316,7 +317,7 @@ def _rate(config: AmassConfig, file: AmassFile, header: MotionHeader, draft: Dra
 
 
 def _body_problem(config: AmassConfig, models: Mapping[str, str], header: MotionHeader) -> str:
-    """Why the parameters do not fit the layout or the body models; empty when they do."""
+    """Return the reason that parameters do not fit layout or body models; empty when they do."""
     if config.motion_layout().num_joints > BODY_JOINTS and not header.hands:
         return f"{header.kind} without finger rotations; layout {config.layout} has fingers"
     if not models:

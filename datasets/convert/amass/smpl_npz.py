@@ -36,7 +36,7 @@ _PARTS = {"root_orient": 3, "pose_body": BODY - 3, "pose_hand": HANDS}
 
 @dataclass(frozen=True)
 class MotionHeader:
-    """What a file states before its data are read."""
+    """Length, rate and model of a file, read without its motion."""
 
     frames: int
     fps: float | None

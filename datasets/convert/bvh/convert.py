@@ -54,11 +54,11 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def __init__(self, config: BvhConfig) -> None:
         super().__init__(config)
-        self.given = load_maps(config.joint_map, config.mapped_skeleton())  # a wrong one fails here
+        self.own_maps = load_maps(config.joint_map, config.mapped_skeleton())  # a wrong one fails here
         self.maps: JointMaps = {}
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
-        plan, self.maps = plan_bvh(self.config, self.given, settings, Audit(self.stated()))
+        plan, self.maps = plan_bvh(self.config, self.own_maps, settings, Audit(self.stated()))
         return plan
 
     def depends_on(self, clip: BvhClip) -> list[object]:
@@ -88,8 +88,8 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         batches = []
         for number, group in sorted(groups.items()):
             labels = {clip.label(): self._content(clip) for clip in group}
-            made = partial(self._batch, group[0].batch, tuple(labels))
-            batches.append(FeatureBatch(number, labels, self.layout.dim, made_from, made))
+            encode = partial(self._batch, group[0].batch, tuple(labels))
+            batches.append(FeatureBatch(number, labels, self.layout.dim, made_from, encode))
         return FeatureStep(batches, operator.attrgetter("number"), self._sample)
 
     def convert(self, clip: BvhClip) -> Sample:
@@ -140,7 +140,9 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         unit = joint_map.unit or ("cm" if config.unit == "auto" else config.unit)
         up = "y" if config.up == "auto" else config.up
         joints = joint_map.apply(motion, unit=unit, up=up)
-        if config.unit == "auto" and not any(one.unit and one.where == joint_map.where for one in self.given):
+        if config.unit == "auto" and not any(
+            one.unit and one.where == joint_map.where for one in self.own_maps
+        ):
             height = measure(joints, motion.fps).height
             own = named_unit(height / metres(unit))
             if own is not None and not PERSON_METRES[0] <= height <= PERSON_METRES[1]:

@@ -73,29 +73,31 @@ def load_maps(choice: Path | str, target: Skeleton) -> list[JointMap]:
 
 def choose_maps(
     config: BvhConfig,
-    given: Sequence[JointMap],
+    own_maps: Sequence[JointMap],
     plan: ConversionPlan[BvhClip],
     joints: Mapping[str, tuple[str, ...]],
     folder: Path | None,
 ) -> JointMaps:
-    """A map for every skeleton (`joints` of each) of the planned clips: a given one, else a certain guess.
+    """A map for every skeleton (`joints` of each) of the planned clips: a own_maps one, else a certain guess.
 
     Clips of other skeletons leave the plan. Guesses are written into `folder`, where there is one, to be
-    completed. `UserError` when no skeleton has a map, and when a given map fits none.
+    completed. `UserError` when no skeleton has a map, and when one of `own_maps` fits none.
     """
     target = config.mapped_skeleton()
     maps: dict[str, JointMap] = {}
     doubts: dict[str, str] = {}
     misfits: dict[str, str] = {}
     skeletons = {clip.found.skeleton: clip.label() for _, clip in reversed(plan.items) if clip.found.skeleton}
+    # The user's own maps come first: what a person wrote down is never overruled by a guess.
     for key, label in skeletons.items():
-        for one in given:
+        for one in own_maps:
             if one.skeleton in ("", key) and key not in maps:
                 try:
                     one.require_fit(joints[key], label)
                     maps[key] = one
                 except UserError as error:
                     misfits.setdefault(one.where, str(error))
+    # Only skeletons that need a guess or a measured unit are read here: in an archive that takes long.
     settles = skeletons.keys() if "auto" in (config.unit, config.up) else set[str]()
     first_clips = _first_clips(plan, settles | (skeletons.keys() - maps.keys()))
     for key, motions in first_clips.items():
@@ -108,10 +110,12 @@ def choose_maps(
             plan.notes.append(f"joint map guessed from {guess.source}; {guess.summary()}")
         else:
             doubts[key] = f"the joint map of {guess.source} is not certain: {guess.doubts()}; {written}"
+    # A map that fits no file is a mistake, unless it lies in a folder with the maps of other sources.
     used = {one.where for one in maps.values()}
-    for one in given:
-        if one.where not in used and (len(given) == 1 or one.where in misfits):
+    for one in own_maps:
+        if one.where not in used and (len(own_maps) == 1 or one.where in misfits):
             raise UserError(misfits.get(one.where, f"{one.where}: no file has its skeleton '{one.skeleton}'"))
+    # An uncertain skeleton costs its clips, not the conversion, as long as any other clip is left.
     left = [clip for _, clip in plan.items if clip.found.skeleton in doubts]
     if left and len(left) == len(plan.items):
         raise UserError(f"{config.source}: {next(iter(doubts.values()))}")
@@ -128,22 +132,22 @@ def _settle(
     config: BvhConfig, joint_map: JointMap, motions: Sequence[BvhMotion], plan: ConversionPlan[BvhClip]
 ) -> JointMap:
     """The map with unit and upward axis as some of its clips settle them, which the plan tells."""
-    given = replace(
+    stated = replace(
         joint_map,
         unit=joint_map.unit or (None if config.unit == "auto" else config.unit),
         up=joint_map.up or (None if config.up == "auto" else config.up),
     )
-    unit, up, height = settled(given, motions)
-    name, made = motions[0].name, replace(given, unit=unit, up=up)
-    if given.unit is None:
+    unit, up, height = settled(stated, motions)
+    name, measured = motions[0].name, replace(stated, unit=unit, up=up)
+    if stated.unit is None:
         named = f"{metres(unit):.4g} m ({unit if isinstance(unit, str) else 'no known unit fits'})"
         tall = f"the figures are then {height:.2f} m tall"
         plan.notes.append(f"unit by body size, from {name}: {named}; {tall}")
-    if up != "y" and given.up is None:
+    if up != "y" and stated.up is None:
         plan.notes.append(f"upward axis by where heads are, from {name}: {up}")
-    if any(added_frames(made.apply(motion)) for motion in motions):
+    if any(added_frames(measured.apply(motion)) for motion in motions):
         plan.notes.append(f"first frames that are an added T-pose are left out, as in {name}")
-    return made
+    return measured
 
 
 def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str, list[BvhMotion]]:
@@ -220,20 +224,20 @@ class BvhConfig(CaptionConfig):
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton."""
     fingers: Literal["recorded", "resting", "missing"] = "recorded"
-    """Of layouts with hands: the files have them (`recorded`, which needs a joint map with fingers); they
+    """For layouts with hands: the files have them (`recorded`, which needs a joint map with fingers); they
     have none, and each clip gets hands at rest, which count as motion (`resting`) or do not (`missing`).
     """
 
     def batches(self) -> list[Batch]:
-        """Where the motion files are."""
+        """Batches of the motion files."""
         return list_batches(self.source)
 
     def about(self, path: str) -> Facts:
-        """What metadata of the set say of a file; nothing for plain folders."""
+        """Facts of a file in the set's metadata; none for plain folders."""
         return {}
 
     def unfit(self, path: str) -> str:
-        """Why the lists of the set leave a file out; empty when they do not."""
+        """Return the reason that the set's lists leave a file out; empty when they do not."""
         return ""
 
     def cut(self, label: str) -> slice:
@@ -258,7 +262,7 @@ class BvhClip:
     split: Split
     texts: tuple[Caption, ...]
     frames: int
-    """Of the file that are used."""
+    """Frames of the file that are used."""
     fps: float
     about: Facts
 
@@ -278,7 +282,7 @@ class BvhClip:
 
 
 def plan_bvh(
-    config: BvhConfig, given: Sequence[JointMap], settings: PlanSettings, audit: Audit
+    config: BvhConfig, own_maps: Sequence[JointMap], settings: PlanSettings, audit: Audit
 ) -> tuple[ConversionPlan[BvhClip], JointMaps]:
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
     batches = config.batches()
@@ -287,7 +291,7 @@ def plan_bvh(
     )
     draft = _decide(config, batches, scans, audit)
     joints = {key: names for scan in scans for key, names in scan.joints.items()}
-    maps = choose_maps(config, given, draft, joints, settings.maps)
+    maps = choose_maps(config, own_maps, draft, joints, settings.maps)
     draft.limit(lambda clip: clip.id)
     layout = config.motion_layout()
     draft.finish(
@@ -360,8 +364,8 @@ def _decide(
         contents.setdefault(clip.sha256, clip.label)
         texts = listing.texts_of(clip.path)
         split, about = listing.split_of(clip.path), config.about(clip.path)
-        made = BvhClip(batches[number], number, clip, clip_id, split, texts, frames, fps, about)
-        draft.decide(made, texts, reason)
+        planned = BvhClip(batches[number], number, clip, clip_id, split, texts, frames, fps, about)
+        draft.decide(planned, texts, reason)
     if other_rate:
         draft.notes.append(
             f"{other_rate} captions state another frame rate than their file; the file's counts"

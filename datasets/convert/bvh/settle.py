@@ -1,4 +1,4 @@
-"""What a motion file does not say, by the figures in it: unit, upward axis, and an added first frame.
+"""Unit, upward axis and an added first frame of a motion file, measured on the figures in it.
 
 A unit is the known one that makes the most ordinary adult of the figure; where none makes a person at all,
 the scale that makes it 1.7 m tall. The upward axis is that along which heads are above pelvises in most
@@ -40,7 +40,7 @@ _PELVIS, _HEAD = _NAMED.index("pelvis"), _NAMED.index("head")
 
 
 def doubted_rate(motion: BvhMotion) -> str:
-    """Why a motion's frame rate cannot be true; empty where nothing speaks against it, or no figure seen."""
+    """Return the reason that a frame rate cannot be true; empty without one, or without a known figure."""
     guess = guess_joint_map(motion, _NAMED)
     if not guess.certain:
         return ""
@@ -68,20 +68,23 @@ def settled(joint_map: JointMap, motions: Sequence[BvhMotion]) -> tuple[Unit, Up
 
 
 def added_frames(joints: NDArray[np.floating]) -> int:
-    """How many frames a writer put in front of joints [T, N, 3] in metres: a T- or A-pose, from which the
-    motion begins with a jump, and the frames into which it was blended.
+    """Count the frames that a writer put in front of joints [T, N, 3] in metres: a T- or A-pose, from which
+    the motion begins with a jump, and the frames into which it was blended.
     """
     if len(joints) < 4:
         return 0
+    # The motion's own pace, past the frames that may be blended, is what the first step is compared with.
     steps = np.linalg.norm(np.diff(joints[: _LATER + 1], axis=0), axis=-1).max(axis=-1)
     usual = float(np.median(steps[_BLENDED:] if len(steps) > 2 * _BLENDED else steps[1:]))
     if steps[0] < max(_JUMP_METRES, _JUMP_TIMES * usual):
         return 0
+    # A jump alone may be a lost marker: a writer's pose also has straight limbs and spread arms.
     arms, legs = joints[0][_ARMS], joints[0][_LEGS]
     ways = arms[:, 2] - arms[:, 0]
     cosine = float(ways[0] @ ways[1] / max(float(np.prod(np.linalg.norm(ways, axis=-1))), 1e-9))
     if cosine > _SPREAD or not all(_is_straight(limb) for limb in (*arms, *legs)):
         return 0
+    # The last rough step ends the blend from the added pose into the motion.
     rough = np.flatnonzero(steps[:_BLENDED] > _JUMP_TIMES * usual + 0.1 * _JUMP_METRES)
     return int(rough.max(initial=0)) + 1
 

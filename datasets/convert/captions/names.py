@@ -1,4 +1,4 @@
-"""What the names of motion files say: words of a label, and whose motion it is.
+"""Names of motion files: the words of a label, and the subject.
 
 HDM05 names its cuts `HDM_bd_kickLFront1Reps_003_120`: actor, label, number, frame rate. CMU's trials are
 `01_02`: subject and trial. AMASS puts subjects in folders.
@@ -29,22 +29,22 @@ def label_words(path: str) -> str:
     found = _HDM05.fullmatch(stem)
     words = [word.lower() for word in _WORD.findall(found[2] if found else stem)]
     words = words if found else [word for word in words if not word.isdigit()]
-    said: list[str] = []
+    label: list[str] = []
     while words:
         word = words.pop(0)
         if word.isdigit() and words[:1] == ["reps"]:
             words.pop(0)
-            said.append("once" if word == "1" else f"{word} times")
+            label.append("once" if word == "1" else f"{word} times")
         elif word == "1" and words and words[0].endswith("s"):
-            said += [word, words.pop(0)[:-1]]
+            label += [word, words.pop(0)[:-1]]
         elif word in _SIDES and "start" in words[:2]:
             at = words.index("start")
-            said[-1:] = [f"{one}," for one in said[-1:]]
-            said += ["starting with the", _SIDES[word], *words[:at]]
+            label[-1:] = [f"{one}," for one in label[-1:]]
+            label += ["starting with the", _SIDES[word], *words[:at]]
             words = words[at + 1 :]
         else:
-            said.append(_SIDES.get(word, word))
-    return " ".join(said).strip()
+            label.append(_SIDES.get(word, word))
+    return " ".join(label).strip()
 
 
 def subject_of(path: str) -> str:
@@ -66,6 +66,7 @@ def subject_splits(paths: Sequence[str]) -> tuple[dict[str, Split], list[str]]:
     for path in paths:
         groups.setdefault(subject_of(path), []).append(path)
     splits: dict[str, Split] = {}
+    # Subjects are taken in the order of a hash until each split has its share of the *files*.
     done, subjects = 0, dict.fromkeys(("train", "val", "test"), 0)
     # Those with many clips come last: a test set of one of them would be too large.
     order = sorted(groups, key=lambda name: (len(groups[name]) > len(paths) / 4, sha256_of_json(name)))

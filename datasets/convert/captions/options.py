@@ -65,7 +65,7 @@ def _ends(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Listing:
-    """What captions and split files say of the files of a source, by their paths there."""
+    """Captions and splits of the files of a source, by their paths there."""
 
     rows: dict[str, CaptionRow]
     splits: dict[str, Split] | None
@@ -89,7 +89,7 @@ class Listing:
         return self.rows[path].texts if path in self.rows else ()
 
     def problem(self, path: str) -> str:
-        """Why the lists leave a file out; empty when they do not."""
+        """Return the reason that the lists leave a file out; empty when they do not."""
         if self.splits is not None and path not in self.splits:
             return "in no split file"
         left_out = path in self.rows and self.rows[path].left_out
@@ -107,6 +107,8 @@ def list_clips(
     found: dict[str, CaptionRow] = {}
     missing: dict[str, str] = {}
     unused: list[CaptionRow] = []
+    # A catalogue lists a whole collection under other folders, so only the ends of its paths can fit, and
+    # clips that are not here are no mistake.
     for row in rows:
         if row.catalogue:
             path = names.find_end(row.file or row.id) or names.find_end(row.id)
@@ -122,6 +124,7 @@ def list_clips(
             raise UserError(f"{row.where}: '{row.id}' and '{found[path].id}' both mean {path}")
         else:
             found[path] = row
+    # Split files may use the ids that the captions give to files.
     for path, row in found.items():
         names.call(row.id, path)
     splits: dict[str, Split] = {}
@@ -133,6 +136,7 @@ def list_clips(
             raise UserError(
                 f"'{name}' in {split}.txt means {path}, which is in {splits[path]}.txt too; that leaks"
             )
+    # An empty split would train, or test, on nothing without a word.
     for split in dict.fromkeys((listed or {}).values()):
         if split not in splits.values():
             raise UserError(f"{split}.txt: none of its clips is in the source, so the split would be empty")
@@ -153,7 +157,7 @@ def _stem(name: str) -> str:
 
 
 BY_NAMES, BY_SUBJECTS = "names", "subjects"
-"""What stands for a file of captions and for a folder of splits."""
+"""Words in place of a file of captions, and of a folder of splits."""
 
 _SHOWN = 3
 """Names that a sentence lists."""
@@ -172,12 +176,11 @@ class CaptionConfig(ConvertConfig):
     captions' `split`, else 80/5/15 by hash of the id.
     """
     splits_map: str = ""
-    """What other names of splits mean: `fold1=train,extra=drop`; `NAME=ignore` as if none were stated;
+    """Meaning of other names of splits: `fold1=train,extra=drop`; `NAME=ignore` as if none were stated;
     `ignore` or `drop` alone for all others. `valid`, `dev`, `training` and the like need none.
     """
     uncaptioned: Literal["stop", "drop", "keep"] = "stop"
-    """What to do with clips that the given captions do not name: stop and say which, leave them out, or keep
-    them.
+    """Clips that the given captions do not name: stop and say which, leave them out, or keep them.
     """
 
     @property
@@ -192,11 +195,11 @@ class CaptionConfig(ConvertConfig):
         return mapping
 
     def options(self) -> dict[str, object]:
-        """What the output depends on; `stop` is `drop`: where it does not stop, every clip has captions."""
+        """Return the fields that the output depends on; `stop` counts as `drop`: both write captions."""
         return super().options() | {"uncaptioned": "drop" if self.uncaptioned == "stop" else self.uncaptioned}
 
     def listing(self, paths: Sequence[str]) -> Listing:
-        """What captions and split files say of motion files, by their paths in the source."""
+        """Return the captions and splits of motion files, by their paths in the source."""
         names = SplitNames(self.splits_map)
         rows: Iterable[CaptionRow] = ()
         if str(self.captions) == BY_NAMES and not Path(BY_NAMES).exists():
@@ -270,12 +273,12 @@ def settle_captions(config: CaptionConfig, draft: CaptionedPlan[C], found: Listi
     bare_clips, captioned = draft.bare_clips, draft.captioned
     file, total = config.captions.name, captioned + len(bare_clips)
     become = {"stop": "", "drop": " and are left out", "keep": " and are kept"}[config.uncaptioned]
-    said = [f"{captioned} of {total} clips have captions in {file}"]
+    sentences = [f"{captioned} of {total} clips have captions in {file}"]
     if bare_clips:
-        said.append(f"{len(bare_clips)} have none{become} ({_some(bare_clips)})")
+        sentences.append(f"{len(bare_clips)} have none{become} ({_some(bare_clips)})")
     if found.unused:
-        said.append(f"captions for {_unused(found)}")
-    draft.captions = "; ".join(said)
+        sentences.append(f"captions for {_unused(found)}")
+    draft.captions = "; ".join(sentences)
     draft.notes.append(draft.captions)
     if bare_clips and config.uncaptioned == "stop":
         draft.stop = (
@@ -292,7 +295,7 @@ def _some(names: list[str]) -> str:
 
 
 def _unused(found: Listing) -> str:
-    """How many clips have captions and no file, and the first of them with the nearest names."""
+    """Count the clips that have captions and no file, and name the first with the nearest names."""
     shown = []
     for row in found.unused[:_SHOWN]:
         near = found.nearest(row)

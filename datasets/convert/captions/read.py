@@ -27,7 +27,7 @@ SOURCE = "captions"
 ID_KEYS = ("id", "clip_id", "clip", "name")
 FILE_KEYS = ("file", "filename", "file_name", "path")
 TEXT_KEYS = ("caption", "text", "description")
-"""What a caption's key may be called, in the order of preference; also with an `s` or a number at the end."""
+"""Keys of captions, in the order of preference; also with an `s` or a number at the end."""
 
 _TEXT = {word: re.compile(rf"{word}s?(?:_?\d+)?") for word in TEXT_KEYS}
 _SUFFIX = re.compile(r"\.(?:bvh|amc|npz|npy|pkl|fbx|c3d|glb|txt|json|csv|mp4|wav)$", re.IGNORECASE)
@@ -41,7 +41,7 @@ _RECORD = '{"id": "walk-001", "captions": ["a person walks"]}'
 
 @dataclass(frozen=True)
 class CaptionRow:
-    """What is said about one clip."""
+    """The captions of one clip, with its file and split."""
 
     id: str
     texts: tuple[Caption, ...]
@@ -58,7 +58,7 @@ class CaptionRow:
 
 
 class _Given(Config):
-    """What a record says beside its captions."""
+    """Fields of a record beside its captions."""
 
     model_config = ConfigDict(extra="ignore", coerce_numbers_to_str=True)
 
@@ -82,6 +82,7 @@ def read_captions(path: Path, splits: SplitNames | None = None) -> dict[str, Cap
     `splits` says what other names of splits mean.
     """
     names, rows, files = splits or SplitNames(), dict[str, CaptionRow](), dict[str, str]()
+    # Two records of one clip are joined if each holds one caption, and a mistake if they hold whole lists.
     for where, values in _records(path):
         catalogue = bool(values.pop(_CATALOGUE, False))
         row, is_list = _row(where, values, names)
@@ -107,15 +108,16 @@ def _row(where: str, values: dict[str, object], splits: SplitNames) -> tuple[Cap
     if name is None or not keys:
         lacks = "name its clip (id, name or file)" if name is None else "hold a caption or captions"
         raise UserError(f"{where}: the record does not {lacks}; expected the likes of {_RECORD}")
+    # A name without a file's suffix is the id, whatever path or tool wrote it.
     clip_id = bare(name)
     if about.id is None and re.match(r"/|[A-Za-z]:/", clip_id):  # only its own machine knows such a path
         clip_id = clip_id.rsplit("/", 1)[-1]
     check_id(clip_id, where)
     is_list = any(isinstance(values.get(key), list) for key in keys)
-    given: dict[str, object] = {"source": SOURCE}
+    shared: dict[str, object] = {"source": SOURCE}
     if not is_list:
-        given |= {"start": about.start, "end": about.end}
-    texts = [text for key in keys for text in _captions(f"{where}: '{key}'", values.get(key), given)]
+        shared |= {"start": about.start, "end": about.end}
+    texts = [text for key in keys for text in _captions(f"{where}: '{key}'", values.get(key), shared)]
     choice = splits.of(about.split, lambda: where) if about.split else None
     stated = None if choice == "drop" else choice
     file = about.file and about.file.strip().replace("\\", "/").removeprefix("./")
@@ -123,13 +125,13 @@ def _row(where: str, values: dict[str, object], splits: SplitNames) -> tuple[Cap
     return row, is_list
 
 
-def _captions(where: str, value: object, given: dict[str, object]) -> Iterator[Caption]:
-    """The captions under one key that hold words; `given` is what the record says of all."""
+def _captions(where: str, value: object, shared: dict[str, object]) -> Iterator[Caption]:
+    """The captions under one key that hold words; `shared` holds what the record says of all."""
     for item in value if isinstance(value, list) else [] if value is None else [value]:
         if isinstance(item, Caption):  # read by its grammar already
             yield item
             continue
-        caption = Caption.parse(given | (item if isinstance(item, dict) else {"text": item}), where)
+        caption = Caption.parse(shared | (item if isinstance(item, dict) else {"text": item}), where)
         if not 0 <= caption.start < (float("inf") if caption.end is None else caption.end):
             raise UserError(f"{where}: the caption ends at {caption.end} s and starts at {caption.start:g} s")
         words = " ".join(caption.text.split())
@@ -252,19 +254,19 @@ def _of_folder(folder: Path) -> Iterator[tuple[str, dict[str, object]]]:
     humanml = any(_HUMANML.fullmatch(line) for line in firsts)
     for path, lines in texts.items():
         name = path.relative_to(folder).as_posix().removesuffix(".txt")
-        made = _humanml(path, lines) if humanml else [line for line in lines if line.strip()]
-        yield f"{path}:1", {"id": name, "captions": made}
+        captions = _humanml(path, lines) if humanml else [line for line in lines if line.strip()]
+        yield f"{path}:1", {"id": name, "captions": captions}
 
 
 def _humanml(path: Path, lines: Iterable[str]) -> list[Caption]:
-    made = []
+    captions = []
     for number, line in enumerate(lines, start=1):
         if line.strip():
             try:
-                made.append(parse_caption(line, seconds=None, source=SOURCE))
+                captions.append(parse_caption(line, seconds=None, source=SOURCE))
             except UserError as error:
                 raise UserError(f"{path}:{number}: {error}; expected caption#tokens#start#end") from None
-    return made
+    return captions
 
 
 def _of_table(path: Path, text: str) -> Iterator[tuple[str, dict[str, object]]]:

@@ -1,1 +1,1 @@
-"""What every converter shares."""
+"""Parts that all converters share: configs, plans, splits, files, features."""

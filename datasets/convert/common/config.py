@@ -75,19 +75,19 @@ class ConvertConfig(Config):
         return MotionLayout.named(self.layout, fps=self.fps)
 
     def options(self) -> dict[str, object]:
-        """What the output depends on, for the manifest: never a local path, whose content counts instead."""
+        """Return the fields that the output depends on: no local path, whose content counts instead."""
         fields = type(self).model_fields
         kept = {name for name, field in fields.items() if not _is_local(field)}
         return {key: value for key, value in self.dump().items() if key in kept}
 
     def licence_problem(self, licence: str) -> str:
-        """Why a clip under `licence` is left out; empty when it may come."""
+        """Return the reason to leave out a clip under `licence`; empty when it may come."""
         if not self.allow_licence or licence in self.allow_licence:
             return ""
         return f"licence '{licence}' is not allowed (allow_licence: {', '.join(self.allow_licence)})"
 
     def length_problem(self, seconds: float) -> str:
-        """Why a clip of this length is left out; empty when it may come."""
+        """Return the reason to leave out a clip of this length; empty when it may come."""
         if seconds < self.min_seconds:
             return f"{seconds:.2f} s, shorter than {self.min_seconds:g} s"
         if self.max_seconds is not None and seconds > self.max_seconds:

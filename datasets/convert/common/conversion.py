@@ -38,7 +38,7 @@ _label = operator.methodcaller("label")
 
 @dataclass(frozen=True)
 class Conversion(Generic[C]):
-    """What to write: a source, opened by its converter, and the plan of what becomes of its files."""
+    """A source, opened by its converter, and the plan for each of its files."""
 
     converter: Converter[Any, C]
     plan: ConversionPlan[C]
@@ -50,7 +50,7 @@ class Conversion(Generic[C]):
 
     @cached_property
     def options(self) -> dict[str, object]:
-        """What the output depends on, as plain JSON; never a local path."""
+        """Everything the output depends on, as plain JSON; never a local path."""
         content = [self.converter.depends_on(clip) for _, clip in self.plan.items]
         return self.converter.options() | {"source_sha256": sha256_of_json(content)}
 
@@ -169,12 +169,14 @@ def run_conversion(
     ) as writer:
         if writer.progress_line:
             say(writer.progress_line)
+        # Parts of a cluster's job do not look: the run that planned them has.
         if part is None and writer.pending():
             seen = plan.look or conversion.look()
             if seen is not None:
                 seen.require_people(plan.name)
                 for warning in seen.warnings:
                     say(f"warning: {warning}")
+        # Archives are read front to back once, before shards pick clips in their own order.
         if (features := conversion.converter.features(writer.pending())) is not None:
             convert = features.make(writer.pending(), writer.work_folder, writer.pool, how, say)
         manifest = writer.write(convert)

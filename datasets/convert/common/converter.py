@@ -33,7 +33,7 @@ Cfg = TypeVar("Cfg", bound=ConvertConfig)
 
 @dataclass(frozen=True)
 class PlanSettings:
-    """How a source is looked through; changes no result."""
+    """Workers and files for planning; no effect on the result."""
 
     workers: int = 1
     progress: bool = False
@@ -53,10 +53,10 @@ class Converter(ABC, Generic[Cfg, C]):
     summary: ClassVar[str]
     """One line for the help."""
     example: ClassVar[str]
-    """What follows `motionloom data convert NAME` in the example of the help."""
+    """Words behind `motionloom data convert NAME` in the example of the help."""
     config_class: ClassVar[type[ConvertConfig]]
     published: ClassVar[Published | None] = None
-    """What the makers of a set say there is in it."""
+    """Numbers that the makers of a set state."""
     version: ClassVar[int] = 1
     """Raised when the same source gives other samples: finished shards are then made again."""
 
@@ -81,8 +81,8 @@ class Converter(ABC, Generic[Cfg, C]):
 
     @abstractmethod
     def depends_on(self, clip: C) -> list[object]:
-        """What the sample of a clip is made from, as plain JSON: its id, sizes or checksums of its files,
-        captions. When it changes, the clip is made again.
+        """Return all that the sample of a clip is made from, as plain JSON: its id, sizes or checksums of its
+        files, captions. When it changes, the clip is made again.
         """
 
     def stated(self) -> Published | None:
@@ -94,7 +94,7 @@ class Converter(ABC, Generic[Cfg, C]):
         return self.config.licence or next(iter(plan.licences), "")
 
     def options(self) -> dict[str, object]:
-        """What the samples depend on beside the source: options, and the facts of files that they name."""
+        """Return all that samples depend on beside the source: options, and facts of the files they name."""
         return self.config.options()
 
     def audio(self) -> AudioSettings | None:

@@ -21,7 +21,7 @@ from functools import lru_cache
 from motionloom.datasets.schema import AuditRow, UserError
 
 Fact = str | float | tuple[str, ...]
-"""What is known of a clip under one name: words, a number, or several words."""
+"""Value of a fact of a clip: words, a number, or several words."""
 Facts = Mapping[str, Fact]
 
 _ORDER: dict[str, Callable[[float, float], bool]] = {
@@ -102,7 +102,7 @@ class Published:
     """Numbers that the makers of a set state."""
 
     by: str
-    """Where, such as `card, 2026-03`."""
+    """Document that states them, such as `card, 2026-03`."""
     counts: Mapping[str, float]
 
 

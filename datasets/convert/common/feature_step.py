@@ -34,7 +34,7 @@ _VALUES = np.dtype("<f4")
 
 
 class BatchIndex(Config):
-    """What one batch file holds."""
+    """Index of one batch file."""
 
     fingerprint: str
     dim: int
@@ -79,17 +79,17 @@ class FeatureBatch:
         )
         frames, path = 0, _path(folder, self.number)
         with atomic_file(path) as file:
-            for label, made in self.clips():
-                if isinstance(made, Dropped):
-                    index.dropped.append(made)
+            for label, features in self.clips():
+                if isinstance(features, Dropped):
+                    index.dropped.append(features)
                     continue
-                if made.ndim != 2 or made.shape[1] != self.dim or label in index.clips:
+                if features.ndim != 2 or features.shape[1] != self.dim or label in index.clips:
                     raise UserError(
-                        f"{label}: features {list(made.shape)} are not [T, {self.dim}], or came twice"
+                        f"{label}: features {list(features.shape)} are not [T, {self.dim}], or came twice"
                     )
-                file.write(made.astype(_VALUES, copy=False).tobytes())
-                index.clips[label] = (frames, len(made))
-                frames += len(made)
+                file.write(features.astype(_VALUES, copy=False).tobytes())
+                index.clips[label] = (frames, len(features))
+                frames += len(features)
         write_json(path.with_suffix(".json"), index.dump())
 
     def trial(self, seconds: float) -> int:
@@ -103,7 +103,7 @@ class FeatureBatch:
 
 @dataclass(frozen=True)
 class FeatureStep(Generic[C]):
-    """How the features of a conversion are made batch by batch, and how a clip is picked from them."""
+    """The features of a conversion: made batch by batch, and picked clip by clip."""
 
     batches: Sequence[FeatureBatch]
     number_of: Callable[[C], int]
@@ -130,10 +130,10 @@ class FeatureStep(Generic[C]):
                 f"run the parts of step 'features' first"
             )
         left = sum(batch.size for batch in todo)
-        made = len(needed) - len(todo)
-        if made and todo:
+        kept = len(needed) - len(todo)
+        if kept and todo:
             count = sum(batch.size for _, batch in needed) - left
-            say(f"{folder.parent}: goes on after {made:,} of {len(needed):,} batches ({count:,} clips)")
+            say(f"{folder.parent}: goes on after {kept:,} of {len(needed):,} batches ({count:,} clips)")
         if todo:
             folder.mkdir(parents=True, exist_ok=True)
         with Meter("converting clips", left, shown=how.progress and bool(clips)) as meter:

@@ -60,10 +60,12 @@ def require_human(joints: NDArray[np.floating], fps: float) -> None:
     if not np.isfinite(joints).all():
         frame, joint = np.argwhere(~np.isfinite(joints).all(axis=-1))[0]
         raise UserError(f"NaN or infinity at frame {frame}, joint {joint}")
+    # The largest frame counts: lying or squatting, a figure is small in any single one.
     extent = float(np.ptp(joints, axis=1).max())
     if not FIGURE_METRES[0] < extent < FIGURE_METRES[1]:
         raise UserError(f"the figure measures {extent:.3g} m; is the length unit right?")
     if len(joints) > 1:
+        # A share of frames, since markers are swapped now and then in good recordings too.
         speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * fps
         if (speed.max(axis=-1) > MAX_SPEED).mean() > MOST_JUMPS:
             frame, joint = np.unravel_index(int(speed.argmax()), speed.shape)
@@ -122,6 +124,7 @@ def mirrored(
     poses: NDArray[np.floating], trans: NDArray[np.floating], body: BodyModel
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Parameters [T, 24, 3] and [T, 3] of the mirror image: left and right swapped, x negated."""
+    # Mirrored, an axis-angle (a, b, c) is (a, -b, -c); a translation moves the pelvis, not the origin.
     swapped = [*body.skeleton.mirror.tolist(), SMPL_JOINTS - 1, SMPL_JOINTS - 2]
     pelvis = body.rest_joints()[0]
     return poses[:, swapped] * [1.0, -1.0, -1.0], (trans + pelvis) * [-1.0, 1.0, 1.0] - pelvis

@@ -85,7 +85,7 @@ def inside(root: Path, relative: str, name: str | None = None) -> Path:
 def read_in_threads(
     read: Callable[[T], R], items: Sequence[T], *, workers: int, progress: bool, before: int = 0
 ) -> Iterator[R]:
-    """What `read` makes of every item, in their order; the bar counts `before` items as done already.
+    """Yield `read(item)` for every item, in their order; the bar counts `before` items as done already.
 
     Threads are enough: opening many files waits for the disk, unpacking and hashing run outside the
     interpreter's lock.

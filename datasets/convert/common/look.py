@@ -33,7 +33,7 @@ ADULT_METRES = 1.7
 """Height of an ordinary adult: of two units that make a person of a figure, the nearer one is meant."""
 
 Names = tuple[str | tuple[str, ...], ...]
-"""What stands for each joint in a file; empty where no joint map says it."""
+"""Name in the file of each joint, or several names; empty where no joint map is used."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Suggestion:
 
     option: Literal["up", "unit", "joint_map", "source"]
     value: str
-    """What to give it: an axis, a unit, or lines of the joint map; a sentence where no option helps."""
+    """An axis, a unit, or lines of the joint map; a sentence where no option helps."""
     why: str
 
     def __str__(self) -> str:
@@ -139,16 +139,16 @@ class SourceJoints:
     """World positions [T, N, 3] in metres, Y up, after the options for unit and axis."""
     fps: float
     names: Names = ()
-    """What stands for each joint in the file (several: their mean), where a joint map says it."""
+    """Name in the file of each joint (several: their mean), where a joint map is used."""
     remarks: tuple[str, ...] = ()
-    """What a user should know about the file, the same words for the same thing."""
+    """Remarks for the user about the file, in equal words for equal things, which are counted."""
     up: str = "y"
     """The upward axis of the file."""
 
 
 @dataclass(frozen=True)
 class SubsetLook:
-    """What was seen of one subset."""
+    """The measured clips of one subset."""
 
     name: str
     clips: int
@@ -165,20 +165,20 @@ class SubsetLook:
     walking: int
     """Clips in which the figure goes somewhere."""
     backwards: int
-    """Of these, those in which it goes backwards."""
+    """Clips in which it goes backwards."""
     fps: tuple[float, ...]
     """Frame rates of the files."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What was seen of a source."""
+    """The measured clips of a source, and the verdict."""
 
     subsets: tuple[SubsetLook, ...]
     problems: tuple[str, ...] = ()
-    """Why these are no people standing on a floor; the conversion is refused for them."""
+    """Reasons to refuse the conversion: these are no people standing on a floor."""
     warnings: tuple[str, ...] = ()
-    """What is odd, but may be meant."""
+    """Odd measurements that may be meant."""
     suggestions: tuple[Suggestion, ...] = ()
     remarks: tuple[str, ...] = ()
     all_subsets: int = field(default=0)
@@ -258,6 +258,7 @@ def look_at(
             reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
             failed.append((name, Dropped(source=label(item), reason=reason.removeprefix(f"{label(item)}: "))))
             continue
+        # Ten frames a second are enough for medians, and keep hundreds of clips in memory.
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))
         body = np.asarray(seen.joints[::step, :BODY_JOINTS], dtype=np.float64)
         clips.append(SeenClip(name, body, seen.fps / step, seen.fps, seen.up))
@@ -272,6 +273,7 @@ def look_at(
     ]
     problems, warnings, suggestions = _judge(clips, config, names)
     warnings += rates
+    # One reason for every clip is a wrong option or map; several reasons are damaged files.
     groups = grouped([drop for _, drop in failed])
     if failed and not clips and len(groups) == 1:
         problems = [f"none could be read: {groups[0]}"]
@@ -299,6 +301,7 @@ def _choose(
     for item in items:
         by_subset[subset_of(item)].append(item)
     names = sorted(by_subset)
+    # A hash chooses, so that neither the order of files nor the number of workers changes the verdict.
     if len(names) > MOST_CLIPS:
         names = sorted(sorted(names, key=sha256_of_json)[:MOST_CLIPS])
     each = max(1, min(count, MOST_CLIPS // max(1, len(names))))
@@ -336,6 +339,7 @@ def _judge(
     by_subset: dict[str, list[SeenClip]] = defaultdict(list)
     for clip in clips:
         by_subset[clip.subset].append(clip)
+    # A subset may be wrong although the source as a whole is not: that is a warning, not a refusal.
     known = {oddity.kind for oddity in oddities if oddity.is_error}
     for name, members in sorted(by_subset.items()):
         if len(by_subset) > 1:

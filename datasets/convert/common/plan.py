@@ -1,4 +1,4 @@
-"""What every converter shares: the plan it shows first.
+"""The plan of a conversion.
 
 A converter plans before it converts: the plan lists what was found, what is missing and what will be left out
 and why, so nothing is skipped silently (`convert ... --plan` prints it and stops).
@@ -46,7 +46,7 @@ C = TypeVar("C", bound=PlannedClip)
 
 @dataclass
 class ConversionPlan(Generic[C]):
-    """What a conversion would do. `items` become samples; everything else is listed with its reason.
+    """The outcome for every file of a source: `items` become samples, all else is listed with its reason.
 
     A converter fills it while it decides what becomes of every file, and ends with `finish`.
     """
@@ -76,11 +76,11 @@ class ConversionPlan(Generic[C]):
     """Estimated time on the planned number of workers, start-up included, from a few clips converted for the
     purpose."""
     captions: str = ""
-    """How many clips have captions, and which have none, where captions were brought for them."""
+    """Number of clips with captions, and those without, where the user brought captions."""
     stop: str = ""
-    """Why it must not be carried out before the user decides something; empty when nothing is open."""
+    """Decision that the user must take before it is carried out; empty when nothing is open."""
     look: Look | None = None
-    """What a few clips showed; None when none was looked at."""
+    """Measurements of a few clips; None when none was read."""
     audit: Audit = field(default_factory=Audit)
     """Clips found and taken, beside what the makers of the source state."""
     known: set[str] = field(default_factory=set)
@@ -174,7 +174,7 @@ class ConversionPlan(Generic[C]):
         return table
 
     def audit_table(self) -> Table | None:
-        """What is stated, found and taken; numbers of which nothing was found share a row."""
+        """Counts stated, found and taken; numbers of which nothing was found share a row."""
         rows = self.audit_rows()
         if not rows:
             return None
@@ -190,7 +190,7 @@ class ConversionPlan(Generic[C]):
         return table
 
     def audit_rows(self) -> list[AuditRow]:
-        """What is stated, found and taken, and why clips were left out."""
+        """Counts stated, found and taken, and the reasons for clips left out."""
         why = "; ".join(str(group) for group in grouped(self.left_out())[:5])
         return self.audit.rows(len(self.items), why)
 
@@ -237,7 +237,7 @@ class ConversionPlan(Generic[C]):
 
 
 def facts_of(clip: PlannedClip) -> Facts:
-    """What is known of a clip by name, for `where`; converters whose clips have more add `facts` to them."""
+    """Facts of a clip by name, for `where`: id, split, and the clip's own `facts`."""
     facts: Facts = getattr(clip, "facts", {})
     return {"id": clip.id, "split": clip.split, **facts}
 

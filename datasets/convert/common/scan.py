@@ -43,7 +43,7 @@ class SourceFile:
     path: str
     data: bytes
     error: str = ""
-    """Why there are no data (unreadable, too large)."""
+    """Reason for having no data (unreadable, too large)."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def _read_archive(path: Path, label: str) -> Iterator[SourceFile]:
 
 
 def _skeleton_names(name: str) -> list[str]:
-    """Where the .asf of an .amc may be, best first: `01_02.asf`, then `01.asf` for `01_02.amc`."""
+    """Names of the .asf of an .amc, best first: `01_02.asf`, then `01.asf` for `01_02.amc`."""
     path = PurePosixPath(name)
     words = path.stem.split("_")
     return [str(path.with_name("_".join(words[:count]) + ".asf")) for count in range(len(words), 0, -1)]
@@ -169,7 +169,7 @@ def _too_large(size: int) -> str:
 
 _VERSION = 2
 _SAVE_SECONDS = 30.0
-"""How much of a long scan a kill may cost."""
+"""Seconds of a long scan that a kill may cost."""
 
 
 class FoundFile(Config):
@@ -185,11 +185,11 @@ class FoundFile(Config):
     skeleton: str
     """The same in files with one hierarchy; empty when it cannot be read."""
     problem: str
-    """Why the file cannot be read; empty when it can."""
+    """Reason that the file cannot be read; empty when it can."""
 
 
 class BatchScan(Config):
-    """What one batch holds; `problem` when it is damaged somewhere."""
+    """The content of one batch; `problem` when it is damaged somewhere."""
 
     files: list[FoundFile]
     problem: Dropped | None
@@ -219,6 +219,7 @@ def scan_batches(
     kept = {key: known[key] for key in keys if key in known}
     todo = [(key, batch) for key, batch in zip(keys, batches, strict=True) if key not in kept]
     found, saved = dict(kept), time.monotonic()
+    # Results are saved now and then, since a scan of archives takes hours and may be killed.
     read = partial(_scan, header)
     new = [batch for _, batch in todo]
     scans = read_in_threads(read, new, workers=workers, progress=progress, before=len(kept))
@@ -250,7 +251,7 @@ def _save(path: Path | None, batches: dict[str, BatchScan]) -> None:
 
 
 def _scan(header: Header, batch: Batch) -> tuple[BatchScan, bool]:
-    """What a batch holds, and whether that depends on the files alone (and not on a right to read them)."""
+    """Scan one batch; also whether the result depends on the files alone, not on a right to read them."""
     files: list[FoundFile] = []
     joints: dict[str, tuple[str, ...]] = {}
     certain = True

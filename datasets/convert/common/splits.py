@@ -30,7 +30,7 @@ _MIRRORED = re.compile(r"((?:.*/)?)M(\d+)")
 
 
 class SplitNames:
-    """What names of splits mean: ours and their usual synonyms by themselves, others as a mapping says.
+    """Names of splits: ours and their usual synonyms, and others by a mapping.
 
     The mapping is `NAME=SPLIT,...` with `train`, `val`, `test`, `drop` (leave such clips out) or `ignore` (as
     if no split were stated) for SPLIT; `ignore` or `drop` alone is for all other names.
@@ -55,7 +55,7 @@ class SplitNames:
                 )
 
     def of(self, name: str, place: Callable[[], str]) -> Split | Literal["drop"] | None:
-        """What a name stated at a place means, None for no split; unknown ones are counted for
+        """Return the split of a name stated at a place, None for no split; unknown names are counted for
         `require_known`."""
         key = name.strip().lower()
         if key in self._known:
@@ -101,7 +101,7 @@ def hash_share(clip_id: str) -> float:
 
 
 def hash_splits(ids: Iterable[str]) -> tuple[dict[str, Split], list[str]]:
-    """What stands for `read_split_files` in a source without any: mirrored clips go with their originals."""
+    """Splits in a source without split files: mirrored clips go with their originals. Returns a note too."""
     note = "no train.txt, val.txt or test.txt: split 80/5/15 by hash of the id"
     return {clip_id: hash_split(original_of(clip_id) or clip_id) for clip_id in ids}, [note]
 
@@ -176,11 +176,11 @@ def keep_mirrors_together(splits: Mapping[str, Split], folder: Path) -> None:
     """
     for clip_id, split in splits.items():
         original = original_of(clip_id)
-        there = splits.get(original) if original is not None else None
-        if original is not None and there is not None and there != split:
+        other = splits.get(original) if original is not None else None
+        if original is not None and other is not None and other != split:
             raise UserError(
                 f"{_line_of(clip_id, split, folder)}: '{clip_id}' mirrors '{original}', which is in "
-                f"{_line_of(original, there, folder)}; a clip and its mirror image in two splits leak"
+                f"{_line_of(original, other, folder)}; a clip and its mirror image in two splits leak"
             )
 
 

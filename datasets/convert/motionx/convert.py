@@ -114,7 +114,7 @@ class MotionXConfig(ReleaseConfig):
     up: Literal["y", "z"] = "y"
     """Up axis of the source. The release is Y up; `z` is for own files that no script has turned yet."""
     uncaptioned: Literal["drop", "keep"] = "drop"
-    """What to do with clips that have no usable caption."""
+    """Leave out or keep clips that have no usable caption."""
     frame_texts: bool = False
     """Add the sentences about single frames (body_texts, hand_texts) as captions of 1/30 s and longer, with
     source `body` and `hand`. They are many: about one a frame."""

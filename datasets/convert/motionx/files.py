@@ -1,4 +1,4 @@
-"""Where a copy of Motion-X keeps what: every release and every set of scripts names its folders differently.
+"""The files of a copy of Motion-X: every release and every set of scripts names its folders differently.
 
 Nothing about the tree is assumed but names: a folder called like one of `_KINDS`, or like the zip file it
 came from (`motionx_seq_text_v1.1`), holds that kind of file, at most a few levels below the source. What
@@ -64,14 +64,14 @@ def read_frame_texts(path: Path, *, source: str, frames: int, fps: float, name: 
             raise UserError(f"{name}: '{key[:20]}' is not a frame number with a sentence")
         if int(key[:18]) < frames and usable_caption(text):
             sentences[int(key)] = clean_caption(text)
-    made: list[Caption] = []
+    captions: list[Caption] = []
     for frame, text in sorted(sentences.items()):
         start, end = frame / fps, (frame + 1) / fps
-        if made and made[-1].text == text and made[-1].end == start:
-            made[-1] = made[-1].model_copy(update={"end": end})
+        if captions and captions[-1].text == text and captions[-1].end == start:
+            captions[-1] = captions[-1].model_copy(update={"end": end})
         else:
-            made.append(Caption(text=text, start=start, end=end, source=source))
-    return made
+            captions.append(Caption(text=text, start=start, end=end, source=source))
+    return captions
 
 
 Kind = Literal["motion", "face motion", "captions", "face texts", "body texts", "hand texts"]
@@ -96,7 +96,7 @@ _PATTERNS = {kind: re.compile(names, re.IGNORECASE) for kind, (names, _) in _KIN
 _SMPLX = re.compile(r"smplx_?322", re.IGNORECASE)
 """The inner folder of motion and, although its files have 153 columns, of face motion."""
 _SCRIPTS = re.compile(r"(humanml|grab|egobody)_(motion|texts?|txt)", re.IGNORECASE)
-"""What the authors' scripts call a subset until it is moved in its place."""
+"""Names that the authors' scripts give a subset until it is moved in its place."""
 _CASE = {name.lower(): name for name in _SUBSETS}
 _DEEP = 5
 """Levels below the source at which the folder of a kind may lie."""
@@ -225,9 +225,9 @@ def _place(parts: tuple[str, ...]) -> _Place | None:
         if kind is None:
             by_script = _SCRIPTS.fullmatch(part)
             if by_script:
-                made: Kind = "motion" if by_script[2].lower() == "motion" else "captions"
+                kind = "motion" if by_script[2].lower() == "motion" else "captions"
                 rest = _subset_first(parts[depth:])
-                return _Place(made, "/".join(parts[: depth + 1]), rest, smplx=made == "motion")
+                return _Place(kind, "/".join(parts[: depth + 1]), rest, smplx=kind == "motion")
             continue
         end, smplx = depth + 1, bool(_SMPLX.fullmatch(part))
         while end < len(parts) and (_PATTERNS[kind].fullmatch(parts[end]) or _SMPLX.fullmatch(parts[end])):

@@ -41,7 +41,7 @@ def value_limits() -> NDArray[np.float64]:
 
 
 def aist_scale(values: NDArray[np.floating]) -> AistScale:
-    """Which state the translations of an `aist/` clip are in."""
+    """Return the state that the translations of an `aist/` clip are in."""
     most = float(np.abs(values[:, TRANS]).max())
     return "raw" if most > _AIST_RAW else "twice" if most < _AIST_TWICE else "scaled"
 

@@ -43,7 +43,7 @@ class Beat2Config(BodyConfig):
     fps: float = 30.0
     """Frame rate of the shards; clips are resampled by time."""
     additional: Literal["train", "drop"] = "train"
-    """What becomes of the takes that the list calls `additional`."""
+    """Train on the takes that the list calls `additional`, or leave them out."""
     pause: float = 0.5
     """Seconds of silence that end a phrase; what is said becomes a caption a phrase, with source `speech`."""
 
@@ -102,14 +102,14 @@ class Beat2(BodyRelease[Beat2Config]):
         elif kind == "additional" and self.config.additional == "drop":
             problem = "additional (--set additional=train keeps it)"
         split: Split | None = "train" if kind == "additional" else _SPLITS.get(kind or "")
-        sound, said = f"{below}{SPEECH}/{name}.wav", tuple(self._words(below, name, draft))
+        sound, texts = f"{below}{SPEECH}/{name}.wav", tuple(self._words(below, name, draft))
         return Entry(
-            f"{below}{name}", f"{below}{MOTION}/{name}.npz", said, split, name, facts,
+            f"{below}{name}", f"{below}{MOTION}/{name}.npz", texts, split, name, facts,
             sound if (self.config.source / sound).is_file() else None, problem=problem,
         )  # fmt: skip
 
     def _words(self, below: str, name: str, draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:
-        """What is said, a caption for each phrase between two pauses."""
+        """Yield the transcript, a caption for each phrase between two pauses."""
         file = f"{below}{WORDS}/{name}.TextGrid"
         path = self.config.source / file
         if not path.is_file():
@@ -121,15 +121,15 @@ class Beat2(BodyRelease[Beat2Config]):
         except UserError as error:
             note_broken(draft, file, error)
             return
-        said: list[str] = []
+        phrase: list[str] = []
         start = end = 0.0
         words = [(float(a), float(b), text.strip()) for a, b, text in _WORD.findall(tier[0]) if text.strip()]
         for begin, stop, word in words:
-            if said and begin - end > self.config.pause:
-                yield from captions_of(" ".join(said), "speech", start, end)
-                said = []
-            start, end, said = (start if said else begin), stop, [*said, word]
-        yield from captions_of(" ".join(said), "speech", start, end)
+            if phrase and begin - end > self.config.pause:
+                yield from captions_of(" ".join(phrase), "speech", start, end)
+                phrase = []
+            start, end, phrase = (start if phrase else begin), stop, [*phrase, word]
+        yield from captions_of(" ".join(phrase), "speech", start, end)
 
     def figure(self, clip: ReleaseClip) -> Figure:
         figure, label = super().figure(clip), clip.entry.file

@@ -74,7 +74,7 @@ class HumanMl3dConfig(ReleaseConfig):
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton (published vectors are then made again)."""
     uncaptioned: Literal["drop", "keep"] = "drop"
-    """What to do with clips that have no usable caption."""
+    """Leave out or keep clips that have no usable caption."""
 
     @property
     def keeps_vectors(self) -> bool:
@@ -181,8 +181,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
             folder = file.split("/", 1)[0]
             lengths[file] = check_array_header(self.path_of(file), width=WIDTHS[folder], name=file)
         if len(set(lengths.values())) > 1:
-            told = ", ".join(f"{file} {frames}" for file, frames in lengths.items())
-            raise UserError(f"frames differ ({told}); choose one with --set use=vecs or --set use=joints")
+            listed = ", ".join(f"{file} {frames}" for file, frames in lengths.items())
+            raise UserError(f"frames differ ({listed}); choose one with --set use=vecs or --set use=joints")
         return lengths[label], FPS
 
     def frames(self, clip: ReleaseClip) -> int:

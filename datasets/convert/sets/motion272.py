@@ -110,7 +110,7 @@ class Motion272(Release[Motion272Config]):
         unlisted: bool = False,
     ) -> Entry:
         original = original_of(name)
-        said = tuple(self._texts(f"{texts}/{name}.txt", draft))
+        captions = tuple(self._texts(f"{texts}/{name}.txt", draft))
         problem = "in no split list" if unlisted and split is None else ""
         facts: dict[str, Fact] = {
             "subset": name.split("/")[0] if "/" in name else "",
@@ -118,7 +118,7 @@ class Motion272(Release[Motion272Config]):
         }
         stem = f"{motion}/{name}" if motion.endswith("_stream") else name
         return Entry(
-            stem, f"{motion}/{name}.npy", said, split, original or name, facts,
+            stem, f"{motion}/{name}.npy", captions, split, original or name, facts,
             mirror_of=original, problem=problem,
         )  # fmt: skip
 

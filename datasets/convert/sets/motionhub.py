@@ -30,7 +30,7 @@ _SUBSETS = {
     "finedance": 4194, "beat_v2.0.0": 21603, "ted_db": 22548, "chi3d": 912, "hi4d": 300, "interx": 34161,
 }  # fmt: skip
 _MIRRORED = re.compile(r"(?<![^/])M(?=\d+(?:/|$))")
-"""What a mirrored clip's folder and file begin with: `M000/M000001` mirrors `000/000001`."""
+"""First letter of a mirrored clip's folder and file: `M000/M000001` mirrors `000/000001`."""
 _FACTS = ("genre", "speaker_id", "language", "has_hand", "interactor_key")
 """Fields of a row that are kept as facts."""
 
@@ -45,7 +45,7 @@ class MotionHubConfig(BodyConfig):
     fps: float = 30.0
     """Frame rate of the shards; clips are resampled by time."""
     tasks: tuple[str, ...] = TASKS
-    """Of which lists clips are taken."""
+    """Lists that clips are taken from."""
     subsets: tuple[str, ...] = ()
     """Convert only these subsets (`aist`, `interx`, ...), and read only their captions; empty means all."""
     levels: tuple[str, ...] = ("macro", "meso", "micro")
@@ -83,6 +83,7 @@ class MotionHub(BodyRelease[MotionHubConfig]):
                 if before is None:
                     found[file] = self._entry(file, task, split, key, row, draft)
                     continue
+                # A motion of several lists is one clip; testing in any list keeps it from all trainings.
                 tasks = before.facts["task"]
                 assert isinstance(tasks, tuple)
                 moved += split != before.split

@@ -20,9 +20,9 @@ from motionloom.pipeline.store.data import SHARDS
 def _stage_config(kind: type[AnyConverter]) -> type[StageConfig]:
     """A class that stands in this module, so that worker processes of a conversion can unpickle it."""
     name, bases = f"{kind.__name__}StageConfig", (kind.config_class, StageConfig)
-    made = type(name, bases, {"__doc__": kind.summary, "__module__": __name__})
-    globals()[name] = made
-    return made
+    stage_config = type(name, bases, {"__doc__": kind.summary, "__module__": __name__})
+    globals()[name] = stage_config
+    return stage_config
 
 
 class ConvertStage(DataStage):

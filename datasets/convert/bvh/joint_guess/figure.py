@@ -32,7 +32,7 @@ class FingerWords:
     """Words of a hand: a finger's name followed by a joint's, outwards from the knuckle."""
 
     names: tuple[str, ...]
-    """Of `FINGERS`."""
+    """Names of `FINGERS`, in that order."""
     joints: tuple[str, ...]
     thumb: tuple[str, ...]
 

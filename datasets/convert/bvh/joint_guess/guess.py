@@ -59,7 +59,7 @@ class JointGuess:
     unmapped: tuple[str, ...]
     """Source joints that stand for nothing."""
     problems: tuple[str, ...]
-    """What contradicts the rows, each a clause."""
+    """Contradictions to the rows, each a clause."""
     ends: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     """Estimated End Sites, as in a joint map."""
 
@@ -80,7 +80,7 @@ class JointGuess:
         return JointMap(where, self.target, rows, self.unmapped, ends=self.ends)
 
     def summary(self) -> str:
-        """How the joints were found, in one line."""
+        """Return one line that counts how the joints were found."""
         counts: Counter[str] = Counter(row.how for row in self.rows)
         kinds = {
             "name": "by name", "hierarchy": "by hierarchy", "mean": "as means", "end": "at End Sites",
@@ -90,7 +90,7 @@ class JointGuess:
         return f"{found}; {len(self.unmapped)} of the source's joints stand for nothing"
 
     def doubts(self) -> str:
-        """What is not certain, in one sentence without its full stop; empty when all is."""
+        """Return what is not certain as a sentence without its full stop; empty when all is."""
         rows = [
             f"{row.joint} ({' or '.join(row.candidates[:4])}?)" if row.candidates else row.joint
             for row in self.open_rows
@@ -148,7 +148,7 @@ def _fill_limbs(limbs: Iterable[Limb] | None, rows: Rows) -> None:
 
 
 def _fill_by_words(figure: Figure, rows: Rows) -> None:
-    """What single names say where a figure makes no whole: for the one who completes the map."""
+    """Add candidates by single names, for whoever completes the map of a figure without whole limbs."""
     slots: list[tuple[str, str, set[str]]] = [
         *(("", joint, {known.neck[i] for known in CONVENTIONS}) for i, joint in enumerate(("neck", "head"))),
         ("", "pelvis", {known.trunk[0] for known in CONVENTIONS}),
@@ -184,18 +184,18 @@ def _guess(figure: Figure, source: str, target: Skeleton, rows: Rows, problems: 
     def named(joints: tuple[int, ...]) -> tuple[str, ...]:
         return tuple(figure.joints[joint] for joint in joints)
 
-    made = []
+    guessed = []
     for joint in target.joints:
         how = rows.how[joint] if joint in rows.sources else "missing"
         candidates = named(rows.candidates.get(joint, ()))
         sources = named(rows.sources.get(joint, ()))
         sources = tuple(map(END.format, sources)) if how == "estimate" else sources
-        made.append(GuessedJoint(joint, sources, how, candidates))
-    used = {name for row in made for name in row.sources}
+        guessed.append(GuessedJoint(joint, sources, how, candidates))
+    used = {name for row in guessed for name in row.sources}
     counts = Counter(figure.joints)
     twice = sorted(name for name in used if counts[name] > 1)
     if twice:
         problems.append(f"{', '.join(twice)}: two joints of one name")
     unmapped = tuple(name for name in dict.fromkeys(figure.motion.joints) if name not in used)
     ends = {figure.joints[joint]: offset for joint, offset in rows.ends.items()}
-    return JointGuess(source, target, tuple(made), unmapped, tuple(problems), ends)
+    return JointGuess(source, target, tuple(guessed), unmapped, tuple(problems), ends)

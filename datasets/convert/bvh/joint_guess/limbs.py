@@ -51,6 +51,8 @@ def named_limb(figure: Figure, kind: Kind, side: str) -> Limb | None:
         for slot in range(4):
             if name.side == side and not name.spare and name.word in words[slot]:
                 fits[slot].append(joint)
+    # Every choice of joints along one chain is tried: one word may mean two joints, and only the other words
+    # of its chain tell which. Complete limbs win, then those that most agree with one tool's naming.
     best: list[tuple[int | None, ...]] = []
     top = (0, 0)
     for choice in product(*fits):
@@ -104,7 +106,7 @@ _NEAR_HIPS = 0.4
 
 @dataclass
 class Rows:
-    """Source joints of target joints, how they were found, and where several could be meant."""
+    """Source joints of target joints, how they were found, and the candidates where it is not certain."""
 
     sources: dict[str, tuple[int, ...]] = field(default_factory=dict)
     how: dict[str, How] = field(default_factory=dict)
@@ -136,7 +138,7 @@ def fill_trunk(figure: Figure, legs: Limbs, arms: Limbs, rows: Rows) -> None:
 
 
 def _pelvis(figure: Figure, legs: Limbs, arms: Limbs, rows: Rows) -> int:
-    """Where legs and spine branch, if it lies between the hips; else the joint of that name that does."""
+    """Return the joint where legs and spine branch if it lies between the hips, else a joint of that name."""
     branch = figure.common_ancestor(roots([*legs, *arms]))
     hips = figure.poses[:, [leg.essential()[0] for leg in legs]].mean(axis=1)
     hip, knee, ankle = legs[0].essential()
@@ -256,14 +258,14 @@ _SHIN = float(np.linalg.norm(_NAMED.offsets[_NAMED.index("left_ankle")]))
 _FORWARD, _DOWN = float(_BALL[2]) / _SHIN, -float(_BALL[1]) / _SHIN
 """From the ankle to the ball of the foot, in lengths of the shin."""
 _FOOT = (0.12, 0.75)
-"""How far a foot's End Site is from the ankle, in lengths of the shin: a ball to a long shoe [ours]."""
+"""Distance of a foot's End Site from the ankle in lengths of the shin: a ball to a long shoe [ours]."""
 _AHEAD = 0.5
 """Cosine between the way to it and forward that it has at least: others point down, or back to a heel."""
 
 
 def with_feet(figure: Figure, legs: Limbs, rows: Rows) -> Limbs:
     """The legs with their fourth slot, where it is certain; a row for every foot or a doubt."""
-    made, open_legs = [], 0
+    completed, open_legs = [], 0
     for leg in legs:
         ankle, toe = leg.slots[2], leg.slots[3]
         assert ankle is not None
@@ -276,14 +278,15 @@ def with_feet(figure: Figure, legs: Limbs, rows: Rows) -> Limbs:
         elif toe is None and below:
             rows.doubt(f"{leg.side}_foot", below)
         open_legs += toe is None and not below
-        made.append(replace(leg, slots=(*leg.slots[:3], toe)))
-    if open_legs == len(made):
+        completed.append(replace(leg, slots=(*leg.slots[:3], toe)))
+    # An estimate is for figures without any foot joint: of two feet, one open is rather a wrong name.
+    if open_legs == len(completed):
         _end_feet(figure, legs, rows)
     else:
-        for leg in made:
+        for leg in completed:
             if leg.slots[3] is None and f"{leg.side}_foot" not in rows.candidates:
                 rows.doubt(f"{leg.side}_foot", ())
-    return made[0], made[1]
+    return completed[0], completed[1]
 
 
 def _end_feet(figure: Figure, legs: Limbs, rows: Rows) -> None:

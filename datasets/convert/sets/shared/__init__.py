@@ -1,1 +1,1 @@
-"""What the converters of published sets share."""
+"""Base converters of published sets, and readers of their lists and vectors."""

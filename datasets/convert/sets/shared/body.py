@@ -40,7 +40,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 
 SOURCE_FPS = 30.0
-"""Of all these sets, where a file states none."""
+"""Frame rate of all these sets, where a file states none."""
 
 
 class BodyConfig(ReleaseConfig, SoundConfig):
@@ -119,12 +119,12 @@ class BodyRelease(Release[Cfg]):
                 except UserError as error:
                     note_broken(draft, label, error)
         for entry in entries:
-            heard = entry.sound if entry.sound in lengths else None
-            silent += heard is None and self.config.sound != "none"
+            sound = entry.sound if entry.sound in lengths else None
+            silent += sound is None and self.config.sound != "none"
             missing = f"no readable sound ({entry.sound or 'none is listed'})"
             yield (
-                replace(entry, sound=heard, facts={**entry.facts, "sound": float(heard is not None)}),
-                missing if heard is None and self.config.sound == "require" else "",
+                replace(entry, sound=sound, facts={**entry.facts, "sound": float(sound is not None)}),
+                missing if sound is None and self.config.sound == "require" else "",
             )
         if silent:
             draft.notes.append(f"{silent} of {len(entries)} clips have no sound")

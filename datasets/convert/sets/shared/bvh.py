@@ -17,7 +17,7 @@ from motionloom.datasets.schema import Caption
 
 
 class Row(NamedTuple):
-    """What a set's tables say of a file."""
+    """A file's row in a set's tables."""
 
     texts: tuple[Caption, ...]
     group: str
@@ -37,7 +37,7 @@ class BvhSetConfig(BvhConfig):
 
     @abstractmethod
     def rows(self) -> Mapping[str, Row]:
-        """What the tables say, by the names of files without folder and suffix; made once."""
+        """Return the rows of the tables by the names of files without folder and suffix; read once."""
 
     @property
     def has_captions(self) -> bool:

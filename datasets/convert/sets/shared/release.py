@@ -43,7 +43,7 @@ class ReleaseConfig(ConvertConfig):
     splits: Path | None = None
     """Folder of train.txt, val.txt, test.txt with clip ids; else the set's own lists."""
     uncaptioned: Literal["drop", "keep"] = "keep"
-    """What to do with clips that have no usable caption."""
+    """Leave out or keep clips that have no usable caption."""
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton (the h3d layouts always do)."""
 
@@ -66,9 +66,9 @@ class Entry:
     """Frames [first, last) of the file; None: to its end."""
     mirror_of: str | None = None
     licence: str | None = None
-    """Where it is not the set's."""
+    """Its licence, if not the set's."""
     problem: str = ""
-    """Why it is left out."""
+    """Reason to leave it out."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class ReleaseClip:
     fps: float
     licence: str
     size: int
-    """Of the motion file, in bytes."""
+    """Bytes of the motion file."""
 
     @property
     def id(self) -> str:
@@ -132,12 +132,12 @@ Cfg = TypeVar("Cfg", bound=ReleaseConfig)
 
 
 class Release(Converter[Cfg, ReleaseClip]):
-    """What a set's own file completes with its name, numbers, lists and reader."""
+    """A published set; its own file adds its name, numbers, lists and reader."""
 
     terms: ClassVar[str]
     """The licence of clips that state none of their own."""
     settings = PlanSettings()
-    """How the source is looked through."""
+    """Workers and files that a plan uses; no effect on its result."""
 
     @abstractmethod
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
@@ -161,6 +161,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         entries = list(self.entries(draft))
         if not entries:
             raise UserError(f"{config.source}: the lists of {self.title} name no clip in it")
+        # Several clips may lie in one file: its header is read once.
         files = list(dict.fromkeys(entry.file for entry in entries))
         found = read_in_threads(self._scan, files, workers=settings.workers, progress=settings.progress)
         scanned = dict(zip(files, found, strict=True))
@@ -188,7 +189,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         )
 
     def path_of(self, file: str) -> Path:
-        """Where a motion file is; `UserError` for one outside of the source."""
+        """Return the path of a motion file; `UserError` for one outside of the source."""
         return inside(self.config.source, file)
 
     def frames(self, clip: ReleaseClip) -> int:
@@ -231,6 +232,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         last, mute = self.cut_to_sound(entry, min(frames if entry.last is None else entry.last, frames), fps)
         seconds = max(last - entry.first, 0) / fps
         texts = []
+        # Which frames a caption beyond the clip describes is unknown; a little beyond is rounding.
         for text in entry.texts:
             if text.start < seconds and (text.end is None or text.end <= seconds + _END_TOLERANCE):
                 end = None if text.end is None else min(text.end, seconds)
