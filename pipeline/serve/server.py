@@ -43,7 +43,8 @@ def serve(folder: Path, config: ServeConfig, *, device: str = "auto", console: C
         if not is_loopback(config.host):
             console.print(
                 f"[yellow]others can reach this server: it listens at {address}, without a password and in "
-                f"plain text, and knows the names of --set allow_hosts; put a proxy in front, or leave --host out[/]",
+                f"plain text, and knows the names of --set allow_hosts; put a proxy before it, or leave "
+                f"--host out[/]",
                 soft_wrap=True,
             )
         console.print(f"{name}: http://{address}:{port}/ (Ctrl-C stops)", soft_wrap=True)
