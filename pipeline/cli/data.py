@@ -336,7 +336,7 @@ def _check_dataset(root: Path, console: Console) -> tuple[int, int, dict[str, ob
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
         say(console, f"{root}: warnings: {counts}")
     errors, warnings = sum(report.error_kinds.values()), sum(report.warning_kinds.values())
-    return errors, warnings, cast(dict[str, object], plain(report))
+    return errors, warnings, plain(report)
 
 
 def _check_files(path: Path, rules: FileRules, console: Console) -> tuple[int, int, dict[str, object]]:
@@ -349,7 +349,7 @@ def _check_files(path: Path, rules: FileRules, console: Console) -> tuple[int, i
             say(console, f"{verdict.path}: note: {note}")
         bad += not verdict.ok
         warned += bool(verdict.ok and verdict.notes)
-        found.append({**cast(dict[str, object], plain(verdict)), "ok": verdict.ok})
+        found.append({**plain(verdict), "ok": verdict.ok})
     return bad, warned, {"files": found}
 
 

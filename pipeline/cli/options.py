@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pydantic import BaseModel, JsonValue
+from pydantic_core import to_jsonable_python
 
 from motionloom.datasets.schema import UserError
 
@@ -84,22 +82,6 @@ def print_json(result: object) -> None:
     typer.echo(json.dumps(plain(result), indent=1, ensure_ascii=False, allow_nan=False))
 
 
-def plain(value: object) -> JsonValue:
-    """`value` as JSON knows it. Paths become text, sets and tuples lists; JSON has no NaN: null."""
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, BaseModel):
-        return plain(value.model_dump(mode="json"))
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): plain(entry) for key, entry in value.items()}
-    if isinstance(value, Set):
-        return sorted((plain(entry) for entry in value), key=str)
-    if isinstance(value, Sequence):
-        return [plain(entry) for entry in value]
-    if isinstance(value, Path):
-        return str(value)
-    raise TypeError(f"{type(value).__name__} has no form in JSON")
+def plain(value: object) -> Any:
+    """`value` as JSON knows it: paths become text, sets and tuples lists; JSON has no NaN: null."""
+    return to_jsonable_python(value, inf_nan_mode="null")

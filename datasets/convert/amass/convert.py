@@ -69,12 +69,6 @@ class Amass(Converter[AmassConfig, AmassClip]):
             "bodies": {gender: body.statement for gender, body in self.bodies.items()}
         }
 
-    def licence(self, plan: ConversionPlan[AmassClip]) -> str:
-        return self.config.licence or LICENCE
-
-    def subset(self, clip: AmassClip) -> str:
-        return clip.file.subset
-
     def joints(self, clip: AmassClip) -> SourceJoints:
         return SourceJoints(self._joints(clip, self._read(clip), 1), clip.fps)
 

@@ -74,9 +74,6 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def licence(self, plan: ConversionPlan[BvhClip]) -> str:
         return self.config.licence or ""
 
-    def subset(self, clip: BvhClip) -> str:
-        return clip.subset
-
     def in_order(self, clip: BvhClip) -> bool:
         return clip.batch.archive is not None
 

@@ -20,7 +20,7 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.look import SourceJoints
-from motionloom.datasets.convert.common.plan import C, ConversionPlan
+from motionloom.datasets.convert.common.plan import C, ConversionPlan, facts_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import ClipMeta
 from motionloom.datasets.shards.sample import Sample
@@ -102,8 +102,8 @@ class Converter(ABC, Generic[Cfg, C]):
         return None
 
     def subset(self, clip: C) -> str:
-        """The part of the source that a clip is in: some clips of each are looked at."""
-        return ""
+        """Return the part of the source that a clip is in: some clips of each are looked at."""
+        return str(facts_of(clip).get("subset", ""))
 
     def in_order(self, clip: C) -> bool:
         """Whether the first clips of a clip's subset are the cheapest to read, as in an archive."""

@@ -265,9 +265,6 @@ class Release(Converter[Cfg, ReleaseClip]):
         alone = next(iter(plan.licences), self.terms) if len(plan.licences) <= 1 else self.terms
         return self.config.licence or alone
 
-    def subset(self, clip: ReleaseClip) -> str:
-        return str(clip.entry.facts.get("subset", ""))
-
     def read(self, clip: ReleaseClip) -> Figure:
         """The frames of a clip."""
         figure = self.figure(clip)
