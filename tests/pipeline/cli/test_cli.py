@@ -7,7 +7,10 @@ import json
 import re
 import shlex
 import shutil
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,7 @@ from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.schema import Manifest
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.main import app
+from motionloom.pipeline.cli.options import plain
 from motionloom.pipeline.serve.requests import ServeConfig
 
 Call = Callable[..., Any]
@@ -318,3 +322,101 @@ def test_joints_of_a_skeleton_and_of_a_file(tmp_path: Path, call: Call) -> None:
 def write_figure_of(tool: str, path: Path) -> Path:
     write_figure(path, build(next(spec for spec in FOREIGN if spec.tool == tool)), frames=70)
     return path
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "says"),
+    [
+        (ZeroDivisionError("a bug"), 1, "ZeroDivisionError: a bug"),
+        (KeyboardInterrupt(), 130, "the same command goes on from here"),
+    ],
+    ids=repr,
+)
+def test_bugs_and_ctrl_c(
+    error: BaseException, code: int, says: str, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("motionloom.pipeline.cli.info.show_info", fail)
+    done = call("info")
+    assert done.code == code and says in done.err
+
+
+DRY = """
+name: dry
+stages:
+  data: {kind: synth, clips: 3}
+  stats: {kind: stats}
+"""
+
+
+def loaded(text: str) -> Any:
+    """Strict JSON: Python's NaN is none."""
+
+    def refuse(name: str) -> None:
+        raise ValueError(name)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_every_kind_of_value_has_its_form() -> None:
+    @dataclass
+    class Inner:
+        place: Path
+        figures: tuple[float, ...]
+
+    value = {"a": Inner(Path("x/y"), (1.5, float("nan"), float("inf"))), 2: {"a"}, "c": Counter(z=3)}
+    assert plain(value) == {"a": {"place": "x/y", "figures": [1.5, None, None]}, "2": ["a"], "c": {"z": 3}}
+    assert plain(SynthConfig(clips=3))["clips"] == 3
+    with pytest.raises(ValueError, match="object"):
+        plain({"a": object()})
+
+
+def test_a_plan(call: Call, tmp_path: Path) -> None:
+    recipe = tmp_path / "dry.yaml"
+    recipe.write_text(DRY)
+    shown = call("run", recipe, "--out", tmp_path / "run", "--dry-run", "--json")
+    plan = loaded(shown.out)
+    assert [(row["stage"], row["action"], row["reason"]) for row in plan["stages"]] == [
+        ("data", "run", "never run"),
+        ("stats", "run", "never run"),
+    ]
+    assert plan["stages"][1]["inputs"] == {"data": "data"}
+    assert plan["replaces"] == {"finished": [], "started": []}
+    assert not (tmp_path / "run").exists()
+    refused = call("run", recipe, "--out", tmp_path / "run", "--json")
+    assert refused.code == 2 and "give --dry-run too" in refused.err and not refused.out
+
+
+def test_a_check_of_shards_and_of_files(call: Call, shards: Path, tmp_path: Path) -> None:
+    shown = call("data", "check", shards, "--json")
+    found = loaded(shown.out)
+    assert shown.code == 0 and found["problems"] == 0 and found["clips"] == 24 and "no problems" in shown.err
+    (tmp_path / "bad.bvh").write_text("no BVH")
+    shown = call("data", "check", tmp_path / "bad.bvh", "--json")
+    found = loaded(shown.out)
+    assert shown.code == 1 and found["problems"] == 1
+    assert found["files"][0]["ok"] is False and found["files"][0]["problems"]
+
+
+def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "mocap").mkdir()
+    write_clip(tmp_path / "mocap" / "a.bvh", 1)
+    words = ("data", "convert", "bvh", tmp_path / "mocap", tmp_path / "out", "--licence", "x")
+    words += ("--set", f"joint_map={write_map(tmp_path / 'map.json')}", "--workers", "1")
+    plan = loaded(call(*words, "--plan", "--json").out)
+    assert plan["found"] == 1 and sum(plan["clips"].values()) == 1 and not plan["unreadable"]
+    refused = call(*words, "--json")
+    assert refused.code == 2 and "give --plan too" in refused.err and not (tmp_path / "out").exists()
+
+
+def test_info_the_version_and_a_table(call: Call) -> None:
+    shown, facts = call("--version"), loaded(call("info", "--json").out)
+    assert shown.code == 0 and shown.out == f"motionloom {facts['motionloom']}\n"
+    assert facts["libraries"]["torch"] == metadata.version("torch") and "humantomato-tiny" in facts["recipes"]
+    said = call("info").out
+    for word in ("motionloom 0.", "torch 2.", "runs on:", "encoder: minilm", "humantomato-tiny", "bvh-body"):
+        assert word in said
+    refused = call("evaluate", "--table", "list", "--json")
+    assert refused.code == 2 and "leave it out" in refused.err
