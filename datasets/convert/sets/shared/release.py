@@ -159,6 +159,7 @@ class Release(Converter[Cfg, ReleaseClip]):
             raise UserError(f"{config.source}: no such folder")
         draft = ConversionPlan[ReleaseClip](config, audit=Audit(self.stated()))
         entries = list(self.entries(draft))
+        repeated = len(draft.dropped)
         if not entries:
             raise UserError(f"{config.source}: the lists of {self.title} name no clip in it")
         # Several clips may lie in one file: its header is read once.
@@ -183,7 +184,7 @@ class Release(Converter[Cfg, ReleaseClip]):
                 draft.settle(clip, entry.problem or reason or again or problem)
         draft.limit(lambda clip: clip.id)
         return draft.finish(
-            found=sum(state is not None for state in scanned.values()),
+            found=repeated + sum(state is not None for state in scanned.values()),
             frames=self.frames,
             licence=lambda clip: clip.licence,
         )
