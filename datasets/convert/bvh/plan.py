@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -200,7 +200,7 @@ class BvhConfig(CaptionConfig):
     """Options of the BVH converter."""
 
     layouts = ("body133", "wholebody313", "wholebody363", "h3d263", "tomato623")
-    everyday = ("captions", "licence")
+    everyday: ClassVar[tuple[str, ...]] = ("captions", "licence")
 
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
