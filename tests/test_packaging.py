@@ -25,7 +25,7 @@ PROJECT = CONFIG["project"]
 # Imported by Lightning's loggers, which are what we import.
 THROUGH_LIGHTNING = {"tensorboard", "wandb", "mlflow"}
 
-BROUGHT = {"tokenizers": "transformers", "soxr": "librosa"}
+BROUGHT = {"tokenizers": "transformers", "soxr": "librosa", "pydantic-core": "pydantic"}
 """Imported by us too, and required by a package that we require."""
 
 

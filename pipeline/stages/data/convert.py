@@ -55,7 +55,7 @@ def run_convert(context: StageContext) -> None:
 def source_facts(config: ConvertConfig) -> dict[str, Any]:
     """Names and sizes of the source's files; checksums of the files, and folders of text files, that options
     name."""
-    source = Path(config.source).expanduser()
+    source = config.source
     if not source.exists():
         raise UserError(f"{source}: no such folder (the source; set it with --set data.source=FOLDER)")
     listed = sorted(source.rglob("*")) if source.is_dir() else [source]
@@ -65,7 +65,6 @@ def source_facts(config: ConvertConfig) -> dict[str, Any]:
         path = getattr(config, name)
         if name == "source" or not isinstance(path, Path):
             continue
-        path = path.expanduser()
         if path.is_file():
             steering[name] = sha256_of(path)
         elif path.is_dir() and any(p.suffix in (".txt", ".json") for p in path.rglob("*")):  # texts, maps

@@ -7,9 +7,7 @@ import json
 import re
 import shlex
 import shutil
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -357,17 +355,9 @@ def loaded(text: str) -> Any:
     return json.loads(text, parse_constant=refuse)
 
 
-def test_every_kind_of_value_has_its_form() -> None:
-    @dataclass
-    class Inner:
-        place: Path
-        figures: tuple[float, ...]
-
-    value = {"a": Inner(Path("x/y"), (1.5, float("nan"), float("inf"))), 2: {"a"}, "c": Counter(z=3)}
-    assert plain(value) == {"a": {"place": "x/y", "figures": [1.5, None, None]}, "2": ["a"], "c": {"z": 3}}
+def test_json_has_no_nan() -> None:
+    assert plain({"a": (1.5, float("nan"), Path("x"))}) == {"a": [1.5, None, "x"]}
     assert plain(SynthConfig(clips=3))["clips"] == 3
-    with pytest.raises(ValueError, match="object"):
-        plain({"a": object()})
 
 
 def test_a_plan(call: Call, tmp_path: Path) -> None:
