@@ -168,7 +168,7 @@ def _rss_mib() -> float:
     return most / 2**20 if sys.platform == "darwin" else most / 2**10
 
 
-# A profile by torch's profiler (`--profile`, `hardware.profile`).
+# A profile by torch's profiler (`hardware.profile`).
 
 WARM_UP = 10
 """Steps of a training before those that are profiled: kernels are chosen and caches filled in them."""
