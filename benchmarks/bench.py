@@ -27,8 +27,8 @@ import torch
 from numpy.typing import NDArray
 from rich.console import Console
 
+from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.base.files import write_json
-from motionloom.datasets.synth.measure import agrees
 from motionloom.pipeline.evaluation.estimate import estimate
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.runs.api import run_recipe

@@ -33,7 +33,6 @@ COLUMNS = (
     Column("CIDEr-D, %", "captions.cider-d", 0, 100),
     Column("BERTScore F1, %", "captions.bert", 1, 100),
     Column("TMA finds its clip among 32, %", "captions.R-precision-1", 0, 100),
-    Column("claims that hold, %", "captions.claims_hold", 0, 100),
 )
 ROWS = {
     "generated": MODEL,

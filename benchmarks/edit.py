@@ -26,13 +26,13 @@ from numpy.typing import NDArray
 from results import read_records
 from rich.console import Console
 
+from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.motion.body.landing import eased, landed
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.canonical import ground, heading, resample
 from motionloom.datasets.motion.features.joints import local_joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
-from motionloom.datasets.synth.measure import agrees
 from motionloom.models.metrics.dance import foot_skating
 from motionloom.models.metrics.editing import accelerations, seam_acceleration
 from motionloom.pipeline.contract.editing import EditTask

@@ -33,18 +33,19 @@ from results import read_records
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.actions.hands import HANDS
+from motionloom.datasets.motion.body.expressions import FACES
 from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.synth.actions.truth import FACES, HANDS, takes_part
-from motionloom.datasets.synth.captions import body_captions
-from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of, truth_of
+from motionloom.datasets.synth.actions.truth import takes_part
+from motionloom.datasets.synth.generate import SynthConfig, captions_of, make_sample, split_of, truth_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
 from motionloom.pipeline.evaluation.reference_baselines import most_similar, nearest_texts
 from motionloom.pipeline.evaluation.truth import Truth
-from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 
@@ -55,7 +56,7 @@ WORDS = Path(__file__).with_name("synthetic_wordings.json")
 FAMILIAR, OTHER, GUESS = "as in training", "other words", "another clip's motion"
 
 ASKED = 60
-"""Clips whose captions are asked about: each is read beside dozens of known ones."""
+"""Clips whose captions are asked about."""
 
 CARD = Path(__file__).with_suffix(".md")
 
@@ -115,14 +116,19 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
 
 
-def test_clips(recipe: Recipe, most: int) -> tuple[list[Truth], SynthConfig]:
-    """Test clips of a recipe's synthetic data in a fixed order, at most so many, as its shards hold them; and
-    the data's settings."""
+def synthetic_data(recipe: Recipe) -> SynthConfig:
+    """The settings of a recipe's synthetic data."""
     stage = next((stage for stage in recipe.stages if stage.kind.name == "synth"), None)
     if stage is None:
         raise UserError(f"{recipe.name}: has no stage of synthetic clips to be measured on")
     seed = recipe.seed_of(stage) if stage.config.seed is None else stage.config.seed  # type: ignore[attr-defined]
-    config = SynthConfig.parse({**stage.config.dump(), "seed": seed}, recipe.name)
+    return SynthConfig.parse({**stage.config.dump(), "seed": seed}, recipe.name)
+
+
+def test_clips(recipe: Recipe, most: int) -> tuple[list[Truth], SynthConfig]:
+    """Test clips of a recipe's synthetic data in a fixed order, at most so many, as its shards hold them; and
+    the data's settings."""
+    config = synthetic_data(recipe)
     numbers = [index for index in range(config.clips) if split_of(index, config) == "test"]
     chosen = [numbers[k] for k in np.random.default_rng(0).permutation(len(numbers))[:most]]
     return [truth_from(make_sample(index, config), config) for index in chosen], config
@@ -149,9 +155,7 @@ def lookups(truths: Sequence[Truth], config: SynthConfig) -> dict[str, list[Trut
     """The training clips that know the labels best, and those whose first caption is nearest: no model."""
     train = [index for index in range(config.clips) if split_of(index, config) == "train"]
     plans = {index: truth_of(index, config) for index in train}
-    # As make_clip draws them.
-    words = {index: np.random.default_rng([config.seed, index, 3]) for index in train}
-    texts = [body_captions(plans[k], words[k], config.captions, True, config.wordings)[0] for k in train]
+    texts = [captions_of(k, config)[0][0] for k in train]
     found = {
         NEAREST_LABELS: most_similar(
             [plans[k].record(hands=True, face=True) for k in train], [t.truth or {} for t in truths]
@@ -239,8 +243,7 @@ def main() -> None:
         "single draws": single,
         "unknown": {
             **{
-                title: len(unknown_captions(bundle, captions[:ASKED]))
-                for title, (captions, _) in said.items()
+                title: len(bundle.unknown_captions(captions[:ASKED])) for title, (captions, _) in said.items()
             },
             "captions": min(ASKED, len(truths)),
         },

@@ -137,7 +137,7 @@ FLOORS = {
     "pipeline": "cli serve runs stages results evaluation training inference contract store render launch",
     "models": "baselines utt diffusion gpt tokenizer pretrained tma evaluator quantize discriminator "
     "condition metrics training layers",
-    "datasets": "check synth loading convert shards modalities text motion audio base",
+    "datasets": "check synth actions loading convert shards modalities text motion audio base",
 }
 """The rooms of each folder, from the top floor to the ground: a room imports from those after it."""
 
@@ -156,6 +156,25 @@ def test_arrows_go_down_the_floors() -> None:
 def top_of(room: str) -> str:
     """`datasets/convert` of `datasets/convert/bvh`."""
     return "/".join(room.split("/")[:2])
+
+
+READERS = {
+    "synth": "pipeline/cli/data pipeline/stages/data pipeline/stages/networks/beats pipeline/evaluation "
+    "pipeline/inference/checks",
+    "actions": "datasets/synth pipeline/stages/data pipeline/evaluation pipeline/inference/checks",
+}
+"""Who may import the synthetic source, and the rules on joints that know its actions."""
+
+
+@pytest.mark.parametrize("room", READERS)
+def test_the_synthetic_source_stays_apart(room: str) -> None:
+    """Streams, the server, captions of clips and checks of data sets know nothing of its actions."""
+    own = f"motionloom.datasets.{room}"
+    for module, targets in file_arrows().items():
+        if not module.startswith(own) and any(target.startswith(f"{own}.") for target in targets):
+            assert (
+                module.removeprefix("motionloom.").replace(".", "/").startswith(tuple(READERS[room].split()))
+            )
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

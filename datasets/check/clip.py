@@ -64,7 +64,7 @@ def human_limits(layout: MotionLayout) -> NDArray[np.float64]:
 def beyond(
     motion: NDArray[np.floating], layout: MotionLayout, limits: NDArray[np.float64], factor: float = 1.0
 ) -> str:
-    """What in motion [T, D] is beyond `factor` times the limits [D]: the worst value and its place, or ""."""
+    """Return the worst value of motion [T, D] beyond `factor` times the limits [D] and its place, or ""."""
     if motion.size == 0:
         return ""
     ratio = np.abs(motion).max(axis=0) / limits

@@ -200,7 +200,7 @@ def _against_manifest(
 
 
 def _indexed_present(path: Path) -> list[int]:
-    """What a shard's index says its clips hold; an unreadable index is reported with the indices."""
+    """Return what a shard's index states of its clips; an unreadable index is reported with the indices."""
     try:
         return [clip.held for clip in ShardIndex.load_json(index_path(path)).clips]
     except (UserError, OSError):

@@ -1,4 +1,4 @@
-"""What people decided about suspect clips: which are left out, and which are good after all.
+"""People's decisions about suspect clips: which are left out, and which are good after all.
 
 `cleaned.json` beside the shards holds the decisions, so that they last when the set is converted again. The
 manifest lists what is left out; readers skip it. Since the manifest's checksum is what a run knows a data set

@@ -188,7 +188,7 @@ class ClipTable:
 
 
 def likeness(here: NDArray[np.float64], there: NDArray[np.float64], skeleton: Skeleton) -> str:
-    """What joints `there` [T, N, 3] are to those `here`, as the beginning of a phrase; empty for others."""
+    """Return how joints `there` [T, N, 3] repeat those `here`, as the beginning of a phrase, or ""."""
     if _distance(here, there) < SAME_METRES:
         return "the same recording as"
     return "the mirror image of" if _distance(mirror(here, skeleton), there) < SAME_METRES else ""

@@ -1,4 +1,4 @@
-"""What is wrong with the motion of one clip: feet off the floor, jumps, jitter, swapped sides, nobody at all.
+"""Faults in the motion of one clip: feet off the floor, jumps, jitter, swapped sides, nobody at all.
 
 Every bound is far from what people do: each stands beside the most that was measured on recorded clips
 (docs/data.md has the shares of false alarms and of planted faults that are found). What is said of feet is
@@ -53,11 +53,11 @@ class Fault:
 
     kind: str
     text: str
-    """What was measured and its bound, in one phrase."""
+    """The measured value and its bound, in one phrase."""
     weight: float
     """The measure over its bound: above 1."""
     frame: int = 0
-    """Where it is to be seen."""
+    """The frame that shows it best."""
 
 
 def motion_faults(joints: NDArray[np.floating], fps: float) -> Iterator[Fault]:

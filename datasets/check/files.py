@@ -42,7 +42,7 @@ from motionloom.datasets.shards.tar import npy_from_bytes, scan_tar
 from motionloom.datasets.text.clean import usable_caption
 
 TEXTS = ("auto", "humanml", "plain", "ids")
-"""How `.txt` files are read. `auto`: ids by the name of the file or its folder, else HumanML3D's grammar."""
+"""Ways to read `.txt` files. `auto`: ids by the name of the file or its folder, else HumanML3D's grammar."""
 
 JOINTS = {"joints22": (22, 3), "joints52": (52, 3)}
 """Further names for `layout`: joint positions [T, N, 3] in metres."""
@@ -52,7 +52,7 @@ _SPLIT_FOLDERS = frozenset(("splits", "split"))
 
 
 class FileRules(Config):
-    """What single files are expected to hold."""
+    """Expectations of single files."""
 
     layout: str | None = None
     """Layout of arrays. None: `.npy` files are Motion-X's `smplx322`, shards may hold any width."""
@@ -76,7 +76,7 @@ class FileRules(Config):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What one file is. `problems` is empty when it may be used; `notes` are worth knowing."""
+    """The outcome for one file. `problems` is empty when it may be used; `notes` are worth knowing."""
 
     path: Path
     what: str = ""
@@ -144,7 +144,7 @@ def _check_tar(path: Path, rules: FileRules) -> Verdict:
 
 
 def _member_problem(where: str, name: str, raw: bytes, rules: FileRules) -> str:
-    """What is wrong with a member of a stranger's shard; empty when nothing is."""
+    """Return the fault of a member of a stranger's shard; empty where there is none."""
     try:
         if name.endswith("json"):
             json.loads(raw)

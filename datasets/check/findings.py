@@ -1,4 +1,4 @@
-"""What a check found: errors (do not train on this) and warnings (look at this), in bounded memory."""
+"""Findings of a check: errors (do not train on this) and warnings (look at this), in bounded memory."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Findings:
     errors: list[Problem] = field(default_factory=list)
     warnings: list[Problem] = field(default_factory=list)
     error_kinds: Counter[str] = field(default_factory=Counter)
-    """How many errors of each kind, the unlisted ones too."""
+    """Number of errors of each kind, the unlisted ones too."""
     warning_kinds: Counter[str] = field(default_factory=Counter)
 
     def error(self, kind: str, where: str, message: str) -> None:

@@ -1,8 +1,8 @@
 """The clips of a data set that look wrong, for a person to decide about: what `motionloom data clean` shows.
 
-Motions by `faults.py`, captions by `claims.py`, and clips that are another one again, as they are or
-mirrored: by a signature that a mirror image shares, heights at eight moments, whose near neighbours are
-compared joint by joint. Mirror images that say so (`mirror_of`) in the split of their original are meant.
+Motions by `faults.py`, and clips that are another one again, as they are or mirrored: by a signature that a
+mirror image shares, heights at eight moments, whose near neighbours are compared joint by joint. Mirror
+images that are declared (`mirror_of`) in the split of their original are meant.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.check.claims import caption_faults
 from motionloom.datasets.check.duplicates import SAME_METRES, likeness
 from motionloom.datasets.check.faults import Fault, motion_faults
 from motionloom.datasets.motion.canonical import canonicalize
@@ -39,7 +38,7 @@ _PAIRS = [
 
 
 class Place(NamedTuple):
-    """Where a clip is in its data set."""
+    """The split and number of a clip in its data set."""
 
     split: Split
     clip: int
@@ -76,11 +75,11 @@ def find_suspects(
     faults: dict[Place, list[Fault]] = {}
     with Meter("looking at clips", sum(map(len, splits.values())), shown=progress) as meter:
         for split, dataset in splits.items():
-            for clip in in_order(dataset, "motion.npy", "texts.json", "meta.json"):
+            for clip in in_order(dataset, "motion.npy", "meta.json"):
                 joints, fps = floored_joints(dataset, clip), dataset.layout.fps
                 places.append(Place(split, clip))
                 signatures.append(signature(joints))
-                found = [*motion_faults(joints, fps), *caption_faults(dataset.texts(clip), joints, fps)]
+                found = [*motion_faults(joints, fps)]
                 if found:
                     faults[places[-1]] = found
                 meter.advance()
@@ -112,8 +111,8 @@ def floored_joints(dataset: ShardDataset, clip: int) -> NDArray[np.float64]:
 
 
 def signature(joints: NDArray[np.floating]) -> NDArray[np.float32]:
-    """What a clip of joints [T, N, 3] shares with its mirror image and no other: its length in frames, and
-    heights of the pelvis and of the higher and the lower of pairs of joints at some moments [S].
+    """Return what a clip of joints [T, N, 3] shares with its mirror image and no other: its length in frames,
+    and heights of the pelvis and of the higher and the lower of pairs of joints at some moments [S].
     """
     heights = joints[np.linspace(0, len(joints) - 1, MOMENTS).round().astype(int), :, 1]
     pairs = np.sort(heights[:, _PAIRS], axis=-1)
@@ -132,9 +131,7 @@ def _near(signatures: NDArray[np.float32]) -> Iterator[tuple[int, int]]:
 
 
 def _again(splits: Splits, one: Place, other: Place) -> Fault | None:
-    """What there is to say of the clip `other` that is the clip `one` again; None of those that are not, or
-    are meant to be.
-    """
+    """Return the fault of a clip `other` that repeats `one`; None where it does not, or is meant to."""
     first, second = splits[one.split], splits[other.split]
     original, copy = first.meta(one.clip), second.meta(other.clip)
     said = (original.mirror_of or original.id) == (copy.mirror_of or copy.id)

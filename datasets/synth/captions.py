@@ -214,7 +214,7 @@ def _varied_limb(truth: Truth, rng: np.random.Generator) -> str:
 def _hand_phrases(
     truth: Truth, rng: np.random.Generator, doing: Phrases, plural_forms: int, both: tuple[str, ...]
 ) -> list[str]:
-    """What the hands do, unless the action itself already implies it.
+    """Return phrases about the hands, unless the action itself already implies them.
 
     The first `plural_forms` phrases of each shape can be put into the plural, for one of the words `both`.
     """

@@ -20,13 +20,14 @@ from typing import TypeVar
 
 import numpy as np
 
+from motionloom.datasets.actions.dances import Style
 from motionloom.datasets.synth.actions.arms import Hold, play
 from motionloom.datasets.synth.actions.maths import Array, ease, keys
 from motionloom.datasets.synth.actions.pose import Track
 from motionloom.datasets.synth.face import express_with
 from motionloom.datasets.synth.hands import grip_hand
 from motionloom.datasets.synth.moves import ACCENTS, ARM_WAYS, FREEZES, LEGS, LEGS_OF, MORE_ARMS, QUIET_LEGS
-from motionloom.datasets.synth.music.genres import ArmPair, ArmPose, Style
+from motionloom.datasets.synth.music.genres import ArmPair, ArmPose
 from motionloom.datasets.synth.music.song import Song
 
 _T = TypeVar("_T")
@@ -68,7 +69,7 @@ class _Phrase:
     arms: ArmPair
     """On the even and the odd beats; of a break what the left and the right arm hold."""
     way: str
-    """How the arms share the poses."""
+    """A name of `ARM_WAYS`, or freeze."""
     lean: float
     """Radians the spine leans forward."""
     pop: float
@@ -236,8 +237,8 @@ def _move_feet(track: Track, plan: _Plan) -> Array:
 
 
 def _places(plan: _Plan) -> tuple[Array, Array]:
-    """Where each foot is on each beat, off where it stands at first: x, z, height, heading [2, N, 4], and how
-    high it is lifted on its way there [2, N]."""
+    """Return the place of each foot on each beat, off its first: x, z, height, heading [2, N, 4], and its
+    lift on the way there [2, N]."""
     style = plan.song.style.style
     places, lifts = np.zeros((2, len(plan.numbers), 4)), np.zeros((2, len(plan.numbers)))
     base, first = 0.0, 0

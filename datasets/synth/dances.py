@@ -12,9 +12,10 @@ from typing import Literal, TypeVar
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from motionloom.datasets.actions.dances import Record
 from motionloom.datasets.schema import Config, Split
 from motionloom.datasets.synth.actions.pose import Track
-from motionloom.datasets.synth.actions.truth import Record, Span, Truth, require_known
+from motionloom.datasets.synth.actions.truth import Span, Truth, require_known
 from motionloom.datasets.synth.choreography import choreograph
 from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.song import BEATS, Song, draw_song
@@ -25,7 +26,7 @@ _GOLDEN = 0.6180339887498949
 
 
 class DanceConditions(Config):
-    """What dances come with, as weights: captions alone, music alone, both, or the motion alone."""
+    """Weights of dances with captions alone, music alone, both, or neither."""
 
     text: float = Field(0.0, ge=0)
     audio: float = Field(0.0, ge=0)
@@ -39,7 +40,7 @@ class DanceConditions(Config):
         return self
 
     def of(self, number: int) -> Comes:
-        """What dance `number` comes with: exact shares, spread evenly (a low-discrepancy sequence)."""
+        """Return the conditions of dance `number`: exact shares, by a low-discrepancy sequence."""
         weights = np.array([self.text, self.audio, self.both, self.none])
         ends = np.cumsum(weights / weights.sum())
         names: tuple[Comes, ...] = ("text", "audio", "both", "none")
@@ -93,7 +94,7 @@ class DanceConfig(Config):
 
     @property
     def width(self) -> int:
-        """How many columns those are."""
+        """Number of those columns."""
         from motionloom.datasets.audio.features import DIM
         from motionloom.datasets.audio.rhythm_features import RHYTHM_DIM
 
@@ -126,13 +127,13 @@ class DanceTruth(Truth):
     key: int = 0
     """Semitones of the song's key note above A."""
     song_start: float = 0.0
-    """Where in the song the clip begins, seconds."""
+    """Seconds from the start of the song to that of the clip."""
     first_beat: float = 0.0
     """Seconds from the start of the clip to its first beat; the others follow each 60 / bpm seconds."""
     bar_beat: int = 0
-    """Which beat of the bar that is, from 0."""
+    """Number of that beat in its bar, from 0."""
     beats: tuple[float, ...] = ()
-    """Of a played song: seconds of all its beats from the start of the clip; `first_beat` begins them."""
+    """Seconds from the start of the clip of all beats of a played song; `first_beat` begins them."""
 
     def record(self, *, hands: bool, face: bool) -> Record:
         data = super().record(hands=hands, face=face)
@@ -153,7 +154,7 @@ class Dance:
     comes: Comes
 
     def seconds(self, fps: float) -> float:
-        """Where in the song the dance begins."""
+        """Seconds from the start of the song to that of the dance."""
         return self.start / fps
 
 
@@ -191,15 +192,6 @@ def plan_dance(number: int, index: int, dances: DanceConfig, seed: int, span: Sp
         beats=tuple(song.beats_within(start / fps, frames / fps)) if song.played else (),
     )
     return Dance(truth, song, start, frames, dances.conditions.of(number))
-
-
-def beats_of(truth: Record, seconds: float) -> list[float]:
-    """Times of the beats inside a clip of `seconds` by its truth record (`ClipMeta.truth`)."""
-    if truth.get("beats"):
-        return [at for at in truth["beats"] if at < seconds]
-    beat = 60.0 / truth["bpm"]
-    count = max(0, int(np.ceil((seconds - truth["first_beat"]) / beat - 1e-9)))
-    return [truth["first_beat"] + k * beat for k in range(count)]
 
 
 def dance(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:

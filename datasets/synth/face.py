@@ -1,37 +1,14 @@
-"""Face expressions as trajectories of 50 FLAME-like values, and the classifier that reads them back.
-
-FLAME's own expression basis is licensed, so the generator fixes its own: column k of `BASIS` is a damped
-cosine (most of it in the first components, as in a PCA basis), made orthonormal by QR. Columns 0-3 are happy,
-sad, angry and surprised, column 4 is the blink, columns 5-7 small talk-like movement. An emotion at its apex
-has length about `APEX`, so single values are of the order of a standard normal.
-"""
+"""Face expressions as trajectories of 50 values in the basis of `datasets/motion/body/expressions.py`."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from motionloom.datasets.motion.body.expressions import APEX, BASIS, FACES
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.synth.actions.maths import Array, ease, wander
-from motionloom.datasets.synth.actions.truth import FACES
 
-APEX = 6.0
-THRESHOLD = 0.35 * APEX
-"""Below this length along every emotion a face is neutral."""
 _BLINK, _TALK = 4, slice(5, 8)
-
-
-def _basis(count: int) -> Array:
-    index = np.arange(FACE_DIMS)
-    waves = [np.cos(np.pi * (index + 0.5) * (k + 1) / 24) * np.exp(-index / 18) for k in range(count)]
-    q, r = np.linalg.qr(np.stack(waves).T)
-    return np.asarray(q * np.sign(np.diag(r)))
-
-
-BASIS = _basis(8)
-"""Orthonormal columns [50, 8]; see the module's description."""
-DETAIL = _basis(22)[:, 8:]
-"""Orthonormal columns [50, 14] across those of `BASIS`, for what recorded faces do beside them."""
 
 
 def express(emotion: str, t: Array, rng: np.random.Generator) -> Array:
@@ -66,10 +43,3 @@ def _idle(t: Array, rng: np.random.Generator) -> Array:
         weights[:, _BLINK] += 1.6 * np.exp(-(((t - at) / 0.06) ** 2))
         at += rng.uniform(1.2, 3.5)
     return weights
-
-
-def read(face: NDArray[np.floating]) -> str:
-    """The emotion of expression values [T, 50]: the direction with the longest apex, or neutral."""
-    along = np.percentile(np.asarray(face) @ BASIS[:, :4], 75, axis=0)
-    best = int(np.argmax(along))
-    return FACES[1 + best] if along[best] > THRESHOLD else "neutral"

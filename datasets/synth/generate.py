@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator, model_validator
 
+from motionloom.datasets.actions.dances import Record
+from motionloom.datasets.actions.hands import HANDS
 from motionloom.datasets.audio.align_features import settings_at
 from motionloom.datasets.audio.features import VERSION as AUDIO_VERSION
 from motionloom.datasets.motion.canonical import canonicalize
@@ -30,16 +32,7 @@ from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.actions import arms, floor, legs, locomotion
 from motionloom.datasets.synth.actions.maths import Array
 from motionloom.datasets.synth.actions.pose import Track
-from motionloom.datasets.synth.actions.truth import (
-    ACTIONS,
-    BASIC,
-    HANDS,
-    Record,
-    Span,
-    Truth,
-    draw,
-    require_known,
-)
+from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, Span, Truth, draw, require_known
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
 from motionloom.datasets.synth.chain import animate_in_turn
 from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
@@ -78,7 +71,7 @@ ANIMATORS: dict[str, Animator] = {
 
 
 class SynthConfig(Config):
-    """What to generate."""
+    """Settings of synthetic clips."""
 
     clips: int = Field(512, ge=1)
     seed: int = Field(0, ge=0)
@@ -89,7 +82,7 @@ class SynthConfig(Config):
     """Names of `truth.ACTIONS`, or all of them, or the basic ones: all but pointing, hopping, lying down,
     crawling, stretching and two actions in turn."""
     hand_shapes: list[str] | None = None
-    """What hands that are free do besides being relaxed. None = all; otherwise names of `truth.HANDS`."""
+    """Shapes of free hands besides relaxed ones. None = all; otherwise names of `actions.hands.HANDS`."""
     min_seconds: float = Field(2.0, ge=1.0)
     max_seconds: float = Field(6.0, le=60.0)
     val_fraction: float = Field(0.05, ge=0, lt=1)
@@ -190,7 +183,7 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
     planned = dance_of(index, config)
     truth = planned.truth if planned else truth_of(index, config)
     hands, has_face = layout.num_joints > BODY_JOINTS, layout.has("face")
-    motion, shape, words = (np.random.default_rng([config.seed, index, k]) for k in range(1, 4))
+    motion, shape = (np.random.default_rng([config.seed, index, k]) for k in (1, 2))
     if planned:
         begin = planned.seconds(layout.fps)
         track = choreograph(planned.song, begin, planned.frames, layout.fps, motion)
@@ -210,19 +203,35 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         dancing_face(planned.song, begin, track.t, shape) if planned else express(truth.face, track.t, shape)
     )
     audio, wav = _music_of(planned, layout.fps, config) if planned else (None, None)
-    texts = body_captions(truth, words, config.captions, hands, config.wordings)
-    face_texts = face_captions(truth, words, body=texts, wordings=config.wordings)
-    captioned = planned is None or planned.comes in ("text", "both")
+    texts, face_texts = _captions(index, config, truth, planned)
     return Clip(
         joints=canonicalize(solved[:, : layout.num_joints] * size),
         face=face,
-        texts=texts if captioned else [],
-        face_texts=face_texts if has_face and captioned else [],
+        texts=texts,
+        face_texts=face_texts,
         truth=truth.record(hands=hands, face=has_face),
         wav=wav,
         audio=audio,
         smpl=smpl,
     )
+
+
+def captions_of(index: int, config: SynthConfig) -> tuple[list[str], list[str]]:
+    """Return the body and face captions of clip `index` without making its motion."""
+    planned = dance_of(index, config)
+    return _captions(index, config, planned.truth if planned else truth_of(index, config), planned)
+
+
+def _captions(
+    index: int, config: SynthConfig, truth: Truth, planned: Dance | None
+) -> tuple[list[str], list[str]]:
+    if planned is not None and planned.comes not in ("text", "both"):
+        return [], []
+    layout, words = config.motion_layout, np.random.default_rng([config.seed, index, 3])
+    hands = layout.num_joints > BODY_JOINTS
+    texts = body_captions(truth, words, config.captions, hands, config.wordings)
+    face_texts = face_captions(truth, words, body=texts, wordings=config.wordings)
+    return texts, face_texts if layout.has("face") else []
 
 
 def animate(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
@@ -259,7 +268,7 @@ def dance_of(index: int, config: SynthConfig) -> Dance | None:
 
 
 def truth_of(index: int, config: SynthConfig) -> Truth:
-    """What clip `index` does. Actions come in shuffled rounds, so any number of clips is balanced."""
+    """Return the truth of clip `index`. Actions come in shuffled rounds, so any number is balanced."""
     planned = dance_of(index, config)
     if planned:
         return planned.truth

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from motionloom.datasets.synth.music.genres import ArmPair, ArmPose, Style
+from motionloom.datasets.actions.dances import Style
+from motionloom.datasets.synth.music.genres import ArmPair, ArmPose
 
 POSES: dict[str, ArmPose] = {
     "down": ((0.3, -0.95, 0.25), 0.86, (-0.1, 0.4, 1.0)),
@@ -52,13 +53,13 @@ def _pairs(words: str) -> tuple[ArmPair, ...]:
 
 
 MORE_ARMS: dict[str, tuple[ArmPair, ...]] = {genre: _pairs(words) for genre, words in _MORE.items()}
-"""By genre: pairs of poses, on the even and the odd beats, that come beside the genre's own."""
+"""Pairs of poses by genre, on the even and the odd beats, beside the genre's own."""
 FREEZES: dict[str, tuple[ArmPair, ...]] = {genre: _pairs(words) for genre, words in _FREEZES.items()}
-"""By genre: what the left and the right arm hold in a break."""
+"""Poses of the left and the right arm in a break, by genre."""
 ACCENTS: dict[str, ArmPose] = {
     genre: POSES["wide_up" if genre in ("disco", "rock", "ballad") else "side"] for genre in _MORE
 }
-"""By genre: where both arms are thrown on the first beat after a break."""
+"""Pose of both arms on the first beat after a break, by genre."""
 
 ARM_WAYS = ("together", "opposite", "in turn")
 """Both arms alike; one where the other was; or two beats of one arm, then two of the other."""
@@ -66,7 +67,7 @@ ARM_WAYS = ("together", "opposite", "in turn")
 
 @dataclass(frozen=True)
 class LegMove:
-    """What the feet do on four beats, in shares of the dancer's steps; the mirror image follows.
+    """Places of the feet on four beats, in shares of the dancer's steps; the mirror image follows.
 
     Each beat has (aside, forward, up, turn) of the left and of the right foot. A foot that is elsewhere on
     the next beat is lifted in between; at most one goes at a time, so that the other bears the weight.
@@ -100,7 +101,7 @@ LEGS_OF: dict[Style, dict[str, float]] = {
     "bounce": {"stand": 4.0, "touch": 1.5, "rock": 1.0, "forward": 0.8, "turn": 1.2},
     "sway": {"stand": 4.0, "touch": 1.5, "forward": 1.2, "rock": 0.8, "turn": 1.0},
 }
-"""By style: how often each move of the legs comes. Only those who step lift their feet high."""
+"""Weights of the moves of the legs, by style. Only those who step lift their feet high."""
 
 QUIET_LEGS: dict[Style, dict[str, float]] = {
     "step": {"touch": 2.0, "side": 1.0, "rock": 1.0},

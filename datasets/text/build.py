@@ -33,7 +33,7 @@ from motionloom.datasets.text.cache import SIMILARITY, CacheInfo, TextCache, key
 from motionloom.datasets.text.encoder import EncodedText, TextEncoder, load_text_encoder
 
 PART = 512
-"""Captions a part, about."""
+"""Number of captions in a part, about."""
 
 PARTS_A_WORKER = 4
 """Fewer are encoded here before another process has loaded the encoder."""
@@ -265,6 +265,6 @@ def _load(part: _Part, name: str) -> NDArray:
 
 
 def _header(file: BinaryIO, shape: tuple[int, ...], dtype: type) -> None:
-    """What `np.save` writes before the values."""
+    """Write what `np.save` does before the values."""
     description = {"descr": np.dtype(dtype).str, "fortran_order": False, "shape": shape}
     np.lib.format.write_array_header_1_0(file, description)

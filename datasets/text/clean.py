@@ -18,7 +18,7 @@ _INVISIBLE = re.compile("[\u200b\ufeff]")
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")
 _WORD = re.compile(r"[^\W\d_]{2,}")
 _CODE = re.compile(r"[a-z][A-Z]")
-"""How AIST++ spells the fields of its names: gBR, sBM, cAll."""
+"""Fields in names of AIST++: gBR, sBM, cAll."""
 _FILE = re.compile(r"\S+\.(?:npy|npz|pkl|txt|json|csv|bvh|fbx|mp4|avi|mov|wav|mp3|zip|tar)", re.IGNORECASE)
 _PATH = re.compile(r"\S*[\\/]\S*")
 _FILING = frozenset({

@@ -42,7 +42,7 @@ class EncodedText:
 
 
 class TextEncoder(Protocol):
-    """What the text cache needs of an encoder."""
+    """Interface of encoders for the text cache."""
 
     @property
     def name(self) -> str:

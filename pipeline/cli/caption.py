@@ -28,7 +28,7 @@ def caption(
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
-    """The likeliest sentences about clips, by a model with a captioner, each checked on the joints.
+    """The likeliest sentences about clips, by a model with a captioner.
 
     Example: `motionloom caption runs/mine walk.bvh --k 5`
 
@@ -50,7 +50,7 @@ def caption(
         found.append(one)
         say(console, f"{one.file} ({one.seconds:.1f} s)")
         for sentence in one.sentences:
-            say(console, f"  {sentence.probability:6.1%}  {sentence.text}{sentence.checks}")
+            say(console, f"  {sentence.probability:6.1%}  {sentence.text}")
     if not found:
         raise UserError(
             f"{left_out[0].source}: {left_out[0].reason}" if left_out else f"{clips[0]}: no clip in it"

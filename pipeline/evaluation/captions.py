@@ -1,8 +1,7 @@
-"""Captions of motions, measured: against what people said, by TMA, and on the joints.
+"""Captions of motions, measured: against people's captions, by TMA, and on the joints.
 
-Beside the model stand answers that need none: the caption of the training clip whose TMA latent is nearest,
-which is a hard rival, the most frequent training caption, and another caption of the clip itself, judged by
-the rest.
+Reference rows need no captioner: the caption of the training clip whose TMA latent is nearest, which is a
+hard rival, the most frequent training caption, and another caption of the clip itself, judged by the rest.
 """
 
 from __future__ import annotations
@@ -17,8 +16,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from motionloom.datasets.check.claims import verdicts
+from motionloom.datasets.actions.mismatch import find_mismatch
 from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.synth.requests import parse_requests
 from motionloom.models.metrics.captions import bert_score, bleu, cider_d, rouge_l, words_of
 from motionloom.models.metrics.retrieval import r_precision
 from motionloom.pipeline.evaluation.estimate import row_estimates, weighted
@@ -57,7 +57,7 @@ class CaptionedClips:
 
     truths: Sequence[Truth]
     references: Sequence[Sequence[str]]
-    """What people said of each."""
+    """Captions of each clip by people."""
     fps: float
     text: TokensOfCaptions
     """Its token states are BERTScore's."""
@@ -69,7 +69,7 @@ class CaptionedClips:
     def measured(
         self, captions: Sequence[str], references: Sequence[Sequence[str]] | None = None
     ) -> dict[str, Estimate]:
-        """The figures of one caption for each clip, by the clips' captions unless `references` are others."""
+        """Return the figures of one caption for each clip, against the clips' own or `references`."""
         known = self.references if references is None else references
         states = _states(self.text, [*captions, *(text for own in known for text in own)])
         said = [words_of(caption) for caption in captions]
@@ -82,10 +82,13 @@ class CaptionedClips:
                 "captions.cider-d": rarities[row],
                 "captions.bert": max(bert_score(states[captions[row]], states[one])[2] for one in known[row]),
             }
-            checks = verdicts(captions[row], truth.joints, self.fps)
-            decided = [one.holds for one in checks if one.holds is not None]
-            found["captions.claims_decided"] = float(bool(decided))
-            rows.append(found | weighted("captions.claims_hold", sum(decided), len(decided)))
+            if truth.truth is not None:
+                # Rules on joints know the actions of clips that state their truth, and no others.
+                claims = parse_requests(captions[row]).candidates
+                holds = bool(claims) and find_mismatch(claims, truth.joints, self.fps) is None
+                found["captions.claims_decided"] = float(bool(claims))
+                found |= weighted("captions.claims_hold", float(holds), float(bool(claims)))
+            rows.append(found)
         out = row_estimates([rows])
         out |= {f"captions.bleu-{n}": Estimate(value) for n, value in enumerate(bleu(said, by), start=1)}
         if self.tma is not None:
@@ -97,13 +100,13 @@ class CaptionedClips:
 
     @cached_property
     def motions(self) -> Tensor:
-        """TMA's latents of the clips, of length 1 [n, Z]."""
+        """TMA's unit-length latents of the clips [n, Z]."""
         assert self.tma is not None
         return _latents(self.tma, self.truths)
 
 
 def caption_figures(rows: Mapping[str, Mapping[str, Estimate]], protocol: Protocol) -> list[Figure]:
-    """Row -> what was measured of its captions, as one table."""
+    """Return one table of the estimates of each row."""
     title = "Captions of the clips: words shared with people's, found again by TMA, checked on the joints"
     return group_figures(title, METRICS, rows, protocol)
 
@@ -127,7 +130,7 @@ def _latents(tma: LoadedTma, truths: Sequence[Truth]) -> Tensor:
 
 
 def trivial_captions(train: ClipDataset, clips: CaptionedClips) -> dict[str, list[str]]:
-    """Row -> a caption of the training set for each clip."""
+    """Return for each reference row a caption of the training set for each clip."""
     usable = np.flatnonzero(has_caption(train)).tolist()
     truths = [truth_of(train, clip) for clip in usable]
     counts = Counter(caption.text for clip in usable for caption in train.texts(clip))

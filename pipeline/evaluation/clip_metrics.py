@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.actions.dances import measure_dance
+from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.synth.measure import agrees, measure_dance
 from motionloom.models.metrics.dance import SHORTEST, foot_contact_score, foot_skating, physics
 from motionloom.models.metrics.dance_beats import DEFINITIONS, beat_align
 from motionloom.models.metrics.position import KINDS, position_errors

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.actions.dances import beats_of
 from motionloom.datasets.audio.features import beats as track_beats
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.synth.dances import beats_of
 from motionloom.pipeline.contract.generation import SeededGenerator
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion

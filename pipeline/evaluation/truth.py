@@ -39,7 +39,7 @@ class Truth:
 
 
 def recorded_seconds(truths: Sequence[Truth], generator: MotionGenerator) -> list[float]:
-    """How long each clip was recorded, as far as the generator reaches."""
+    """Return the recorded length of each clip, as far as the generator reaches."""
     frames = [len(truth.features) for truth in truths]
     if generator.max_frames is not None:
         frames = [min(count, generator.max_frames) for count in frames]
@@ -59,7 +59,7 @@ def truth_of(
 
 
 def truth_in(dataset: ClipDataset, index: int, span: CaptionSpan, max_frames: int | None = None) -> Truth:
-    """What one caption of a clip is about, cut to whole groups of four frames."""
+    """Return the stretch of a clip that one caption is about, cut to whole groups of four frames."""
     motion = np.asarray(dataset.motion(index))
     whole, motion = span.frames == len(motion), motion[span.first : span.end]
     frames = min(len(motion), max_frames or len(motion)) // 4 * 4
@@ -107,7 +107,7 @@ def _overlap(one: CaptionSpan, other: CaptionSpan) -> int:
 
 
 def digest_of(truths: Sequence[Truth]) -> str:
-    """What tells these clips from others, whatever their data set is called: sha256 of words and motions."""
+    """Return the sha256 of captions and motions, which does not depend on the name of their data set."""
     found = hashlib.sha256()
     for truth in truths:
         found.update(f"{truth.caption}\n{truth.face_caption}\n{truth.features.shape}".encode())

@@ -7,7 +7,7 @@ itself (`contract/stage.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -34,6 +34,7 @@ from motionloom.pipeline.contract.generation import (
 from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CAPTIONER, CPU, Finished, StageCache
+from motionloom.pipeline.inference.checks import find_mismatches, unknown_captions
 from motionloom.pipeline.inference.generators.standing import stood
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
@@ -57,7 +58,6 @@ from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, owner_of
-from motionloom.pipeline.store.text import TextSource
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -259,6 +259,22 @@ class Bundle:
             out.update((row, replace(one, seed=seed)) for row, one in zip(rows, made, strict=True))
         return [out[row] for row in range(len(prompts))]
 
+    def unknown_captions(
+        self, captions: Sequence[str], face: Sequence[str] = (), face_model: str | None = None
+    ) -> list[Unknown]:
+        """Return captions unlike all that were trained on; none where a model does not say what it knows."""
+        out: list[Unknown] = []
+        for stage, texts in ((self.main, captions), (self.choose_face(face_model), face)):
+            source = None if stage is None else self.of(stage).prepared.get("text")
+            out += unknown_captions(source, texts, face=texts is face)
+        return out
+
+    def find_mismatches(self, motions: Iterable[GeneratedMotion]) -> list[str]:
+        """Return a sentence for each caption, scripts apart, of which its motions show something else."""
+        source = self.generator.prepared.get("text")
+        single = ((motion.caption, motion.joints) for motion in motions if not motion.segments)
+        return find_mismatches(source, single, self.layout.fps)
+
     def perform(
         self,
         segments: Sequence[DrivenSegment],
@@ -381,20 +397,3 @@ class Bundle:
             replace(one, beats=() if one.prompt.stands else tuple(t for t in own if t < one.seconds))
             for one, own in zip(made, ticks, strict=True)
         ]
-
-
-def unknown_captions(
-    bundle: Bundle, captions: Sequence[str], face: Sequence[str] = (), face_model: str | None = None
-) -> list[Unknown]:
-    """Captions that are far from all that the model was trained on, and what it knows nearest to each.
-
-    Empty for models without text, and for those whose run or export does not say what it knows.
-    """
-    out: list[Unknown] = []
-    for stage, given in ((bundle.main, captions), (bundle.choose_face(face_model), face)):
-        part = None if stage is None else bundle.of(stage)
-        source = None if part is None else part.prepared.get("text")
-        if isinstance(source, TextSource):
-            said, read = [caption for caption in given if caption.strip()], getattr(part, "read", None)
-            out += source.unknown(said, face=given is face, read=read)
-    return out

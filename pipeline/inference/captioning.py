@@ -1,9 +1,9 @@
-"""Captions of clips in files: what a captioner says, and what its words claim, checked on the joints."""
+"""Captions of clips in files, by a model's captioner."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -11,10 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.check.claims import Verdict, verdicts
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.registry import prepare
-from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import HANDS, PRESENT_ALL, Dropped, UserError
 from motionloom.pipeline.contract.captioning import MotionCaptioner, Sentence
@@ -28,48 +26,22 @@ MACHINE = "captioner"
 
 
 @dataclass(frozen=True)
-class CheckedSentence(Sentence):
-    """A sentence, and which of its claims the joints bear out."""
-
-    verdicts: tuple[Verdict, ...] = ()
-
-    @property
-    def checks(self) -> str:
-        """What its claims are worth, for people; empty where the rules can tell nothing."""
-        marks = {True: "yes", False: "no"}
-        told = [
-            f"{one.what} {marks[one.holds]}" + (f" ({one.seen})" if one.holds is False and one.seen else "")
-            for one in self.verdicts
-            if one.holds is not None
-        ]
-        return f"  [{', '.join(told)}]" if told else ""
-
-    def record(self) -> dict[str, object]:
-        """As plain data."""
-        return {
-            "text": self.text,
-            "probability": self.probability,
-            "claims": list(map(asdict, self.verdicts)),
-        }
-
-
-@dataclass(frozen=True)
 class CaptionedClip:
-    """What is said of one clip, likeliest first."""
+    """Sentences about one clip, likeliest first."""
 
     id: str
-    """Its name, as a conversion of the same source has it."""
+    """Name of the clip, as a conversion of the same source has it."""
     file: str
-    """Its place in the source."""
+    """Place of the clip in the source."""
     seconds: float
-    """Of it that were read."""
-    sentences: tuple[CheckedSentence, ...]
+    """Length of the part that was read."""
+    sentences: tuple[Sentence, ...]
 
     def record(self) -> dict[str, object]:
-        """A line for `data convert --captions`, which reads the captions; the rest informs people."""
+        """A line for `data convert --captions`, which reads the captions; probabilities inform people."""
         texts = [{"text": one.text, "source": MACHINE} for one in self.sentences]
-        said = [one.record() for one in self.sentences]
-        return {"id": self.id, "file": self.file, "captions": texts, "said": said}
+        likely = [one.probability for one in self.sentences]
+        return {"id": self.id, "file": self.file, "captions": texts, "probabilities": likely}
 
 
 class ReadClip(NamedTuple):
@@ -80,14 +52,13 @@ class ReadClip(NamedTuple):
     features: NDArray[np.float32]
     """[T, D]."""
     present: int
-    """What it holds, by the bits of `ClipMeta.present`."""
+    """Parts that it holds, by the bits of `ClipMeta.present`."""
 
 
 def captions(
     model: MotionModel, clips: Iterable[Path | str | GeneratedMotion], count: int = 3
 ) -> Iterator[CaptionedClip | Dropped]:
-    """What each clip shows, in up to `count` sentences, likeliest first, checked on the joints; or why it
-    cannot be read.
+    """Yield up to `count` sentences about each clip, likeliest first, or why it cannot be read.
 
     A clip is a motion, a file, or an archive or folder of files (`read_clips`). `UserError` where the model
     has no captioner.
@@ -155,7 +126,7 @@ def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped
 def caption_clips(
     captioner: MotionCaptioner, clips: Iterable[ReadClip | Dropped], count: int
 ) -> Iterator[CaptionedClip | Dropped]:
-    """What the captioner says of each clip that it can read, in order; `count` sentences at most."""
+    """Yield at most `count` sentences about each clip that the captioner can read, in order."""
     layout, columns = captioner.layout, captioner.layout.part(captioner.part)
     for clip in clips:
         if isinstance(clip, Dropped):
@@ -172,14 +143,5 @@ def caption_clips(
         # Without a part that the tokens cannot do without, it is read at rest.
         present = clip.present if captioner.reads(clip.present) else PRESENT_ALL
         (found,) = captioner.caption([clip.features[:, columns]], count, [present])
-        joints = joints_of(clip.features[:, layout.part("bodyhand")], layout)
-        joints = joints[: captioner.max_frames, : None if clip.present & HANDS else BODY_JOINTS]
-        yield CaptionedClip(
-            clip.id,
-            clip.file,
-            len(joints) / layout.fps,
-            tuple(
-                CheckedSentence(one.text, one.log_probability, tuple(verdicts(one.text, joints, layout.fps)))
-                for one in found
-            ),
-        )
+        seconds = min(frames, captioner.max_frames) / layout.fps
+        yield CaptionedClip(clip.id, clip.file, seconds, tuple(found))

@@ -29,14 +29,13 @@ from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
-from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.edits.clips import read_clip, read_seed_motion, require_clip
 from motionloom.pipeline.inference.edits.edit import edited, require_editor
 from motionloom.pipeline.inference.edits.frames import EditFrames
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
-from motionloom.pipeline.inference.notes import doubts
 from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
@@ -131,7 +130,8 @@ class MotionModel(
                 sampling=SamplingConfig.of(sampling), strict=True,
                 seed_motions=None if seed_motion is None else [seed_motion],
             )  # fmt: skip
-        for remark in (*remarks_of(motion.prompt for motion in motions), *doubts(self.bundle, motions)):
+        remarks = remarks_of(motion.prompt for motion in motions)
+        for remark in (*remarks, *self.bundle.find_mismatches(motions)):
             warnings.warn(remark, stacklevel=2)
         return motions
 
@@ -143,7 +143,7 @@ class MotionModel(
 
     def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
         """Captions that are far from all that it was trained on, and what it knows nearest to each."""
-        return unknown_captions(self.bundle, captions, face)
+        return self.bundle.unknown_captions(captions, face)
 
     def perform(
         self,

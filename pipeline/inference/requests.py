@@ -227,7 +227,7 @@ class PromptEncoder:
         """
         source = self._prepared.get("text")
         if isinstance(source, TextSource):
-            words = [source.spelt(text) for text in words]
+            words = [source.spelled(text) for text in words]
         rows = [prompt.with_words(text).given for prompt, text in zip(prompts, words, strict=True)]
         out: dict[str, Condition] = {}
         for name, record in MODALITIES.items():

@@ -27,7 +27,7 @@ from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.generation import Prompt, StreamingGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
-from motionloom.pipeline.inference.bundle import Bundle, unknown_captions
+from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.standing import Standing
 from motionloom.pipeline.inference.motion import MotionChunk
 from motionloom.pipeline.inference.requests import (
@@ -181,7 +181,7 @@ class MotionStream(Iterator[MotionChunk]):
         if prompt.remark and prompt.remark not in self._noticed:
             self._noticed.add(prompt.remark)
             self._notice(prompt.remark)
-        for unknown in unknown_captions(self._bundle, [prompt.text], [prompt.face_text], self._face_model):
+        for unknown in self._bundle.unknown_captions([prompt.text], [prompt.face_text], self._face_model):
             if unknown.caption not in self._noticed:
                 self._noticed.add(unknown.caption)
                 self._notice(unknown)

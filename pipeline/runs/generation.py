@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -109,8 +108,6 @@ def generate_motions(
     """
     from motionloom.datasets.audio.sound import Excerpt
     from motionloom.pipeline.contract.generation import SeededGenerator
-    from motionloom.pipeline.inference.bundle import unknown_captions
-    from motionloom.pipeline.inference.notes import doubts
     from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
@@ -161,7 +158,10 @@ def generate_motions(
                     f"the first {start:.2g} s are of a training dance; --seed-motion takes a clip of yours",
                 )
         said = captions if segments is None else [segment.prompt.text for segment in segments]
-        notes = [*unknown_captions(bundle, said, face or (), sampling.face_model), *doubts(bundle, motions)]
+        notes = [
+            *bundle.unknown_captions(said, face or (), sampling.face_model),
+            *bundle.find_mismatches(motions),
+        ]
         for note in notes:
             _print_note(aside, note)
         driven = motions if segments is None else segments
@@ -213,7 +213,6 @@ def stream_motion(
     and frames come no faster than they are watched.
     `out` is a file, None is standard output. What is said to people goes to `console`.
     """
-    from motionloom.pipeline.inference.notes import doubted, understood
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.stream import MotionStream, stream_of
     from motionloom.pipeline.inference.writers import frame_lines, heading
@@ -265,7 +264,7 @@ def stream_motion(
         file.flush()
         started, first, frames = time.perf_counter(), math.nan, 0
         try:
-            for chunk in doubted(stream, notice, partial(understood, bundle)):
+            for chunk in stream:
                 for line in frame_lines(chunk):
                     file.write(line)
                 file.flush()

@@ -9,7 +9,6 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Generic, TypeVar
 
@@ -23,7 +22,6 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.notes import doubted, doubts, understood
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
 from motionloom.pipeline.inference.requests import remarks_of
 from motionloom.pipeline.inference.stream import MotionStream, stream_of
@@ -150,7 +148,7 @@ def notes_of(
     unknown = model.unknown(asked.captions, asked.faces)
     nearest = [text for one in unknown if one.caption in asked.captions for text in one.nearest]
     remarks = remarks_of([Prompt(asked.caption, sound=sound)])
-    seen = doubts(model.bundle, [] if motion is None else [motion])
+    seen = model.bundle.find_mismatches([] if motion is None else [motion])
     return {"notes": [*(one.what for one in unknown), *remarks, *seen], "nearest": nearest}
 
 
@@ -160,7 +158,7 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
     if asked.format in WRITERS:
         note = ""
         if asked.format == "html":
-            seen = doubts(model.bundle, [motion])
+            seen = model.bundle.find_mismatches([motion])
             note = "\n".join(map(str, [*model.unknown(asked.captions, asked.faces), *seen]))
         return file_answer(motion, asked.format, asked.seed, note)
     facts = {
@@ -216,17 +214,12 @@ def stream(
 def lines(
     model: MotionModel, name: str, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
 ) -> Iterator[str]:
-    """JSON lines of a stream of the model of this name, whose first one names the request and says what there
-    is to note, and whose last what the joints do not show, if that is anything.
-    """
+    """JSON lines of a stream of the model of this name; the first names the request and has its notes."""
     made, notes = stream(model, asked, sound, limits), notes_of(model, asked, sound)
     facts = json.loads(heading(made.layout, asked.seed, name))
     yield json.dumps({"request": asked.request, **facts, **notes}) + "\n"
-    seen: list[str] = []
-    for chunk in doubted(made, lambda doubt: seen.append(str(doubt)), partial(understood, model.bundle)):
+    for chunk in made:
         yield "".join(frame_lines(chunk))
-    if seen:
-        yield json.dumps({"notes": seen}) + "\n"
 
 
 def facts_of(motion: GeneratedMotion, request: str, seed: int) -> dict[str, object]:

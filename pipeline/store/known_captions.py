@@ -1,21 +1,18 @@
-"""Captions that a model was trained on, so that it can say which of a user's it does not know [ours].
+"""Representative training captions, used to flag captions that are unlike all of the training [ours].
 
-A generator makes a motion of any caption. One that is far from all it was trained on, it makes of what it
-happens to find near, and nothing in the motion says so. Some training captions that stand for all of them lie
-beside the encoder, with their sentence embeddings: no caption of the training set is far from one of these.
-Embeddings are MiniLM's, which comes with the installation, whatever encoder the networks read.
+A generator makes a motion of any caption, and nothing in the motion says that the caption was unlike all it
+was trained on. So the text stage keeps some training captions that represent all, with their sentence
+embeddings (MiniLM's, which comes with the installation, whatever encoder the networks read), and how far
+validation captions are from the nearest of these. A new caption is unknown where it is farther than all but
+`FALSE_ALARMS` of them.
 
-A caption is known if it has no word that training had nothing like, and if a caption of the training is near
-it, both as a sentence and as the model itself reads the two, and has the words that decide by themselves.
-Where it is very near, other words that training had nothing like change nothing.
-
-Where it is known what the motions of these captions do, as of synthetic clips, the nearest say what a new one
-asks for, and its motion can be compared with that.
+TMA's text latents were tried in place of sentence embeddings: they put everyday captions of other actions as
+near as those of the training (docs/results.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import shorten
@@ -28,54 +25,38 @@ from safetensors.numpy import load_file, save_file
 from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.synth.actions.truth import ACTIONS
-from motionloom.datasets.text.said import Acts, acts_said, meant_by
-from motionloom.datasets.text.words import (
-    Encode,
-    HeardWords,
-    decides,
-    deciding,
-    in_turn,
-    taken_back,
-    words_of,
-)
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 
+FALSE_ALARMS = 0.01
+"""Share of validation captions that are flagged."""
+
 COUNT = 1024
 """Number of representative captions of each kind, of bodies and of faces. 384 of 48,834 captions lay too far
-apart: of 100 motions that did as was said 21 had a note, with these 13; of 100 that did not, 75 with both."""
+apart: of 100 motions that did as was said 21 had a note, with these 13 (`benchmarks/known_words.py`)."""
 
-FAR = 0.5
-"""Cosine of sentence embeddings below which a caption is far from another, where nothing else is known; like
-`NEAR` chosen on the development part of `benchmarks/known_words.yaml`."""
-
-NEAR = 1.2
-"""Sum of that cosine and of the cosine of the model's own readings from which a caption is near another."""
-BESIDE = 1.05
-"""The same for a caption that has a word that decides: it may have other hands."""
-
-NEAREST, AT_ONCE = 128, 32
-"""Known captions that the model reads beside a new one at most, and how many at a time."""
-
-SURE = 1.4
-"""The same from which words that were never heard change nothing, unless they decide."""
-OTHERWISE = 0.1
-"""By how much a caption may be nearer, as a sentence, to an action that is none of the training's
-(`OTHER_ACTIONS`)."""
-LIKE_IT, AS_NEAR = 3, 0.05
-"""Known captions whose motions say what a new one may ask for, at most, and by how much less near than the
-nearest; chosen on the same sentences."""
+_QUANTILES = 101
+_NEAREST = 3
+"""Captions of the training that are named beside an unknown one."""
 
 
-class _Texts(Config):
+class KnownText(Config):
+    """Captions of one kind, in `known.json`."""
+
+    captions: tuple[str, ...] = ()
+    distances: tuple[float, ...] = ()
+    """Quantiles, from 0 to 1 in even steps, of the cosine distance of a validation caption to the nearest."""
+
+
+class KnownTexts(Config):
     """`known.json`."""
 
-    body: tuple[str, ...]
-    face: tuple[str, ...]
+    body: KnownText
+    face: KnownText
     words: tuple[str, ...] = ()
-    acts: tuple[Acts, ...] = ()
-    """What the motions of the body's captions do, in their order."""
+    """All words of the training's captions."""
+    actions: tuple[str, ...] = ()
+    """The actions of the training's clips, where these state their truth."""
 
 
 @dataclass(frozen=True)
@@ -83,19 +64,19 @@ class Unknown:
     """A caption that is far from all captions of the training, or that is read as another."""
 
     caption: str
-    nearest: tuple[str, ...]
+    nearest: tuple[str, ...] = ()
     """Captions of the training, nearest first."""
     read_as: str = ""
-    """Where only its spelling is unknown: what it is taken for; `nearest` is empty."""
+    """The corrected caption, where only its spelling is unknown."""
 
     @property
     def what(self) -> str:
-        """What there is to say of the caption, without the nearest ones."""
+        """The note for people, without the nearest captions."""
         if self.read_as:
             return f"'{printable(self.caption)}' is read as '{printable(self.read_as)}'"
-        said = shorten(printable(self.caption), 100, placeholder=" …")
+        shown = shorten(printable(self.caption), 100, placeholder=" …")
         return (
-            f"'{said}' is unlike all captions that this model was trained on, so the motion may show "
+            f"'{shown}' is unlike all captions that this model was trained on, so the motion may show "
             f"something else"
         )
 
@@ -106,149 +87,37 @@ class Unknown:
 
 @dataclass(frozen=True)
 class KnownCaptions:
-    """Captions of one kind and their unit-length embeddings [n, E]."""
+    """Captions of one kind, their unit-length embeddings [n, E] and the distances of validation captions."""
 
     captions: tuple[str, ...]
     embeddings: NDArray[np.float32]
-    words: frozenset[str] = frozenset()
-    """All words of the training's captions; empty where they were not kept."""
-    acts: tuple[Acts, ...] = ()
-    """What the motion of each caption does; empty where that is not known."""
+    distances: tuple[float, ...] = ()
 
-    def asked(self, caption: str, encode: Encode, read: Encode | None = None) -> list[Acts]:
-        """What a caption may ask for, likeliest first: what the motions of those captions do that are about
-        as near to it as the nearest. One that puts an action after another is looked at part by part.
-        """
-        if not self.acts:
-            return []
-        said = self.said(caption)
-        if said:
-            return meant_by(caption, said) if _known(said) else []
-        parts = in_turn(caption)
-        if len(parts) != 2:
-            return self._asked(caption, range(len(self.acts)), encode, read)
-        alone = [k for k, acts in enumerate(self.acts) if len(acts) == 1]
-        if not alone:
-            return []
-        first, second = (self._asked(part, alone, encode, read) for part in parts)
-        return [one + other for one in first for other in second]
-
-    def said(self, caption: str) -> Acts:
-        """What a caption asks for by its words, if the training has that; else empty."""
-        done = {act for acts in self.acts for act in acts}
-        parts = [acts_said(part) for part in in_turn(caption)]
-        acts = tuple(act for part in parts for act in part)
-        plain = len(parts) == 1 or all(len(part) == 1 for part in parts)
-        return acts if plain and done.issuperset(acts) else ()
-
-    def _asked(self, caption: str, among: Sequence[int], encode: Encode, read: Encode | None) -> list[Acts]:
-        nearest, near = self._nearest(caption, among, encode, read)
-        order = np.argsort(-near, kind="stable")[:LIKE_IT]
-        found = [self.acts[among[nearest[k]]] for k in order if near[k] >= near[order[0]] - AS_NEAR]
-        return list(dict.fromkeys(found)) if all(found) else []
-
-    def _nearest(
-        self, caption: str, among: Sequence[int], encode: Encode, read: Encode | None
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Of `among` those nearest as sentences, and how near they are, with the model's reading."""
-        near = self.embeddings[among] @ np.asarray(encode([caption]), np.float32)[0]
-        nearest = np.argsort(-near, kind="stable")[:AT_ONCE]
-        near = near[nearest]
-        if read is not None:
-            readings = read([caption, *(self.captions[among[k]] for k in nearest)])
-            near = near + readings[1:] @ readings[0]
-        return nearest, near
-
-    def _otherwise(self, caption: str, said: Acts, heard: HeardWords) -> bool:
-        """Whether a caption, even if it names actions of the training, asks for something else: it takes them
-        back, does too much, or is nearer to another action.
-        """
-        if not self.acts:
+    def is_far(self, embedding: NDArray[np.float32]) -> bool:
+        """Whether a caption of this unit-length embedding [E] is unknown; none is where nothing is known."""
+        if not self.captions or not self.distances:
             return False
-        if not _known(said) or (said and taken_back(caption)):
-            return True
-        same = [k for k, acts in enumerate(self.acts) if not said or set(acts) <= set(said)]
-        vector = np.asarray(heard.encode([caption]), np.float32)[0]
-        return bool((self.embeddings[same] @ vector).max() < (heard.others @ vector).max() - OTHERWISE)
+        steps = np.linspace(0, 1, len(self.distances))
+        limit = float(np.interp(1 - FALSE_ALARMS, steps, self.distances))
+        return 1 - float((self.embeddings @ embedding).max()) > limit
 
-    def unknown(
-        self, captions: Sequence[str], heard: HeardWords, read: Encode | None = None, count: int = 3
-    ) -> list[Unknown]:
-        """Those of `captions` that are not known, in order, each once.
-
-        Args:
-            captions: What was said.
-            heard: The words of the training, with the embeddings of these captions.
-            read: The model's own unit-length readings of captions; without, sentences alone decide.
-            count: How many of the nearest to name.
-        """
-        if not self.captions:
-            return []
-        found = dict[str, Unknown]()
-        meant = [heard.spelt(caption) for caption in captions]
-        cosines = np.asarray(heard.encode(meant), dtype=np.float32) @ self.embeddings.T
-        for said, caption, row in zip(captions, meant, cosines, strict=True):
-            order = np.argsort(-row, kind="stable")
-            named = self.said(caption)
-            known = not self._otherwise(caption, named, heard) and (
-                bool(named) or self._near(caption, order, row, heard, read)
-            )
-            if not known:
-                found.setdefault(said, Unknown(said, tuple(self.captions[k] for k in order[:count])))
-            elif caption != said:
-                found.setdefault(said, Unknown(said, (), caption))
-        return list(found.values())
-
-    def _near(
-        self,
-        caption: str,
-        order: NDArray[np.int64],
-        row: NDArray[np.float32],
-        heard: HeardWords,
-        read: Encode | None,
-    ) -> bool:
-        """Whether a caption of the training is near one, `row` [n] as sentences, and those together that do
-        what it asks for have its words that decide. Without a reading, from `FAR` on one is near.
-        """
-        strange = heard.unheard(caption)
-        if any(map(decides, strange)):
-            return False
-        enough = SURE if strange else NEAR
-        asked = {act for acts in self.asked(caption, heard.encode, read) for act in acts}
-        missing, found = set(deciding(caption)), False
-        for first in range(0, min(NEAREST, len(order)), AT_ONCE):
-            block = order[first : first + AT_ONCE]
-            texts = [self.captions[k] for k in block]
-            if read is None:
-                near = np.where(row[block] >= FAR, NEAR, 0.0)
-            else:
-                readings = read([caption, *texts])
-                near = row[block] + readings[1:] @ readings[0]
-            found = found or bool((near >= enough).any())
-            for k, text, nearness in zip(block, texts, near, strict=True):
-                if nearness >= BESIDE and (not asked or not asked.isdisjoint(self.acts[k])):
-                    missing.difference_update(deciding(text))
-            if found and not missing:
-                return True
-        return False
-
-
-def _known(acts: Acts) -> bool:
-    """Whether acts are nothing, an action, or two in turn."""
-    return len(acts) <= 2 and not set(acts) - set(ACTIONS)
+    def nearest(self, embedding: NDArray[np.float32]) -> tuple[str, ...]:
+        """Return the captions nearest to an embedding [E], the nearest first."""
+        order = np.argsort(-(self.embeddings @ embedding), kind="stable")
+        return tuple(self.captions[k] for k in order[:_NEAREST])
 
 
 def representatives(
     captions: Sequence[str],
     embeddings: NDArray[np.float32],
+    held_out: NDArray[np.float32],
     count: int = COUNT,
-    acts: Mapping[str, Acts] | None = None,
 ) -> KnownCaptions:
-    """At most `count` of `captions`, embeddings [n, E], chosen so that none is far from a chosen one; `acts`
-    is what the motions of all captions do, where it is known.
+    """Return at most `count` of `captions`, embeddings [n, E], chosen so that none is far from a chosen one.
 
     The first is the one nearest to the mean, each next one the farthest from all before (Gonzalez 1985: at
-    most twice as far as the best choice of as many).
+    most twice as far as the best choice of as many). `held_out` [m, E] are embeddings of validation captions;
+    where there are none, the training's own are measured.
     """
     order = sorted(range(len(captions)), key=lambda k: captions[k])
     texts = [captions[k] for k in order]
@@ -260,44 +129,57 @@ def representatives(
     while len(chosen) < min(count, len(texts)):
         chosen.append(int(nearest.argmin()))
         nearest = np.maximum(nearest, vectors @ vectors[chosen[-1]])
-        nearest[chosen[-1]] = np.inf
-    known = tuple(texts[k] for k in chosen)
-    done = tuple(acts.get(text, ()) for text in known) if acts else ()
-    return KnownCaptions(known, vectors[chosen], words_of(texts), done if any(done) else ())
+        nearest[chosen[-1]] = np.inf  # never chosen twice
+    known = vectors[chosen]
+    measured = held_out if len(held_out) else vectors
+    return KnownCaptions(tuple(texts[k] for k in chosen), known, distances_to(known, measured))
 
 
-def save_known(folder: Path, body: KnownCaptions, face: KnownCaptions) -> None:
+def distances_to(known: NDArray[np.float32], held_out: NDArray[np.float32]) -> tuple[float, ...]:
+    """Return quantiles of the distance from embeddings [m, E] to the nearest of [n, E]."""
+    nearest = 1 - (held_out @ known.T).max(axis=1)
+    return tuple(np.quantile(nearest, np.linspace(0, 1, _QUANTILES)).round(4).tolist())
+
+
+def save_known(
+    folder: Path,
+    body: KnownCaptions,
+    face: KnownCaptions,
+    words: Sequence[str] = (),
+    actions: Sequence[str] = (),
+) -> None:
     """Write both kinds into `folder`, embeddings in half precision."""
     kinds = {"body": body, "face": face}
     with atomic_path(folder / KNOWN_FILES[1]) as path:
         save_file({name: known.embeddings.astype(np.float16) for name, known in kinds.items()}, path)
-    words = tuple(sorted(body.words))
-    texts = _Texts(body=body.captions, face=face.captions, words=words, acts=body.acts)
-    write_json(folder / KNOWN_FILES[0], texts.dump())
+    texts = {
+        name: KnownText(captions=known.captions, distances=known.distances) for name, known in kinds.items()
+    }
+    made = KnownTexts(**texts, words=tuple(sorted(words)), actions=tuple(sorted(actions)))
+    write_json(folder / KNOWN_FILES[0], made.dump())
 
 
-def load_known(folder: Path) -> dict[str, KnownCaptions]:
-    """Both kinds by name, "body" and "face"; none where `folder` has no such files."""
+def load_known(folder: Path) -> tuple[KnownTexts, dict[str, KnownCaptions]]:
+    """Return what is known, and both kinds by name, "body" and "face"; empty where `folder` has no such
+    files.
+    """
     texts, embeddings = (folder / name for name in KNOWN_FILES)
     if not texts.is_file():
-        return {}
-    said = _Texts.load_json(texts)
+        return KnownTexts(body=KnownText(), face=KnownText()), {}
+    found = KnownTexts.load_json(texts)
     try:
-        found = load_file(embeddings)
+        arrays = load_file(embeddings)
     except (OSError, SafetensorError) as error:
         raise UserError(
             f"{embeddings}: cannot be read ({error}); delete it and {texts.name}, which only say what the "
             f"model knows, or copy the whole folder again"
         ) from None
     out = {}
-    for name, captions in (("body", said.body), ("face", said.face)):
-        vectors = found.get(name)
-        if vectors is None or vectors.ndim != 2 or len(vectors) != len(captions):
+    for name, own in (("body", found.body), ("face", found.face)):
+        vectors = arrays.get(name)
+        if vectors is None or vectors.ndim != 2 or len(vectors) != len(own.captions):
             raise UserError(
                 f"{embeddings}: '{name}' does not go with {texts.name}; delete both, or copy them again"
             )
-        words, acts = (frozenset(said.words), said.acts) if name == "body" else (frozenset(), ())
-        if acts and (len(acts) != len(captions) or not all(map(_known, acts))):
-            raise UserError(f"{texts}: acts does not go with body; delete it, or copy the file again")
-        out[name] = KnownCaptions(captions, vectors.astype(np.float32), words, acts)
-    return out
+        out[name] = KnownCaptions(own.captions, vectors.astype(np.float32), own.distances)
+    return found, out

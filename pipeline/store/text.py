@@ -1,4 +1,4 @@
-"""What a text stage gives: its cache of encoded captions, and the encoder that made it, for new words.
+"""The result of a text stage: its cache of encoded captions, and the encoder that made it, for new words.
 
 An export brings a copy of the encoder along.
 """
@@ -19,16 +19,22 @@ from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.datasets.text.words import MOODS, Encode, HeardWords, Understood, counted, words_of
+from motionloom.datasets.text.vocabulary import Vocabulary, word_counts
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
-from motionloom.pipeline.store.known_captions import KNOWN_FILES, KnownCaptions, Unknown, load_known
+from motionloom.pipeline.store.known_captions import (
+    KNOWN_FILES,
+    KnownCaptions,
+    KnownTexts,
+    Unknown,
+    load_known,
+)
 
 BUILT_IN = "minilm"
 """Comes with the installation, so it is never copied."""
 
 _PLACE = "encoder.json"
 _SUFFIXES = (".safetensors", ".json", ".txt", ".model", ".md")
-"""What a text encoder's folder may bring along; pickled weights and code stay behind."""
+"""Suffixes of a text encoder's files that are copied; pickled weights and code stay behind."""
 _EXPORTED = "text.json"
 _COPY = "encoder"
 _KNOWN_WIDTHS = {BUILT_IN: 384, "openai/clip-vit-base-patch32": 512}
@@ -46,7 +52,7 @@ class ExportedText(Config):
 
 @dataclass(frozen=True)
 class TextPreview:
-    """What is known of a text stage before it has run."""
+    """The width of a text stage's features before it has run."""
 
     dim: int
 
@@ -65,7 +71,7 @@ class TextSource:
     """The encoder as its config names it."""
     device: torch.device
     exported: bool = False
-    """In an export, where `text.json` says which encoder, and `named` is ignored."""
+    """Whether it is in an export, where `text.json` names the encoder, and `named` is ignored."""
 
     @cached_property
     def cache(self) -> TextCache:
@@ -107,48 +113,60 @@ class TextSource:
         encoded = self.encoder.encode(captions)
         return encoded.tokens, encoded.mask
 
-    @cached_property
+    @property
     def known(self) -> Mapping[str, KnownCaptions]:
         """Captions that represent those of the training, "body" and "face"; none where they were not kept."""
+        return self._known[1]
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """The actions of the training's clips, where these state their truth."""
+        return self._known[0].actions
+
+    @cached_property
+    def _known(self) -> tuple[KnownTexts, dict[str, KnownCaptions]]:
         return load_known(self.folder)
 
     def unknown(
-        self, captions: Sequence[str], *, face: bool = False, read: Encode | None = None
+        self,
+        captions: Sequence[str],
+        *,
+        face: bool = False,
+        judge: Callable[[str], bool | None] | None = None,
     ) -> list[Unknown]:
-        """Those of `captions` that are unlike all that were trained on; `read` is how the model reads."""
+        """Return those of `captions` that are unlike all that were trained on, or misspelt, each once.
+
+        `judge` says of some captions whether they are known; where it returns None, distance decides.
+        """
         known = self.known.get("face" if face else "body")
-        return known.unknown(captions, self._heard, read) if known and captions else []
+        read = {caption: self.spelled(caption) for caption in captions}
+        if known is None or not read:
+            return []
+        out = []
+        vectors = self._sentences.encode(list(read.values())).sentence
+        for (caption, spelled), vector in zip(read.items(), vectors, strict=True):
+            is_known = judge(spelled) if judge is not None else None
+            if is_known is None:
+                is_known = not known.is_far(vector)
+            if not is_known:
+                out.append(Unknown(caption, known.nearest(vector)))
+            elif spelled != caption:
+                out.append(Unknown(caption, read_as=spelled))
+        return out
 
-    def understood(self, caption: str, read: Encode | None = None) -> Understood:
-        """A caption of a body as it is read, and what it may ask for: of one that is not known nothing is."""
-        known = self.known.get("body")
-        if known is None or not known.acts:
-            return caption, ()
-        meant = self.spelt(caption)
-        strange = known.unknown([meant], self._heard, read)
-        return meant, () if strange else known.asked(meant, self._heard.encode, read)
-
-    def spelt(self, caption: str) -> str:
-        """A caption as it is read: misspelt words of the training set right."""
-        return self._heard.spelt(caption)
+    def spelled(self, caption: str) -> str:
+        """Return a caption as it is read: misspelt words of the training set right."""
+        return self._vocabulary.spelled(caption)
 
     @cached_property
-    def _heard(self) -> HeardWords:
-        known = self.known.get("body")
-
+    def _vocabulary(self) -> Vocabulary:
         def pieces(words: Sequence[str]) -> NDArray[np.int64]:
             mask = self._sentences.encode(words).mask
             counts: NDArray[np.int64] = mask.sum(axis=1, dtype=np.int64) - 2  # [CLS] and [SEP]
             return counts
 
-        return HeardWords(
-            known.words | (words_of(self.known["face"].captions) & MOODS)
-            if known and known.words
-            else frozenset(),
-            lambda texts: self._sentences.encode(texts).sentence,
-            pieces,
-            counted(known.captions if known else ()),
-        )
+        captions = [caption for known in self.known.values() for caption in known.captions]
+        return Vocabulary(frozenset(self._known[0].words), word_counts(captions), pieces)
 
     @cached_property
     def _sentences(self) -> TextEncoder:
@@ -157,7 +175,7 @@ class TextSource:
         return load_text_encoder(BUILT_IN, device=str(self.device))
 
     def export(self, target: Path) -> None:
-        """What encoding new words needs; an encoder that comes with the installation is not copied."""
+        """Copy what encoding new words needs; an encoder that comes with the installation is not copied."""
         target.mkdir(parents=True, exist_ok=True)
         copy_files(self.folder, target, [name for name in KNOWN_FILES if (self.folder / name).is_file()])
         name = self.encoder_name

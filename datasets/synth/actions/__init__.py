@@ -1,1 +1,1 @@
-"""What a clip does, and how a body does it: attributes, poses in animator's terms, actions."""
+"""Animators of the synthetic source: truths, poses in animator's terms, and the actions."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from motionloom.datasets.actions.signals import SHIN, STAND, THIGH
 from motionloom.datasets.synth.actions.arms import Vec, play
 from motionloom.datasets.synth.actions.maths import Array, ease, keys, unit
-from motionloom.datasets.synth.actions.pose import ARM, OFFSETS, SHIN, SHOULDER, STAND, THIGH, Track
+from motionloom.datasets.synth.actions.pose import ARM, OFFSETS, SHOULDER, Track
 from motionloom.datasets.synth.actions.truth import Span, Truth
 
 HIPS = float(-OFFSETS[1][1])
-"""How far the hips are below the root, or before it on the back."""
+"""Metres of the hips below the root, or before it on the back."""
 
 WRIST = 0.07
 """Height of the wrist of a hand on the floor, metres."""
@@ -95,7 +96,7 @@ def crawl(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
 
 
 def _planted(phase: Array) -> Array:
-    """Where a limb is, in strides before its hip: from 0.5 to -0.5 on the floor, and back through the air."""
+    """Return the place of a limb, strides before its hip: 0.5 to -0.5 on the floor, and back in the air."""
     p = phase % 1.0
     return np.where(p < 0.5, 0.5 - 2 * p, -0.5 + ease(2 * p - 1))
 

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from motionloom.datasets.actions.signals import STAND
 from motionloom.datasets.synth.actions.maths import Array, ease, keys, rot_y, smooth
-from motionloom.datasets.synth.actions.pose import BALL, STAND, Track
+from motionloom.datasets.synth.actions.pose import BALL, Track
 from motionloom.datasets.synth.actions.truth import Span, Truth
 
 WALK_SPEED = {"slowly": (0.5, 0.68), None: (0.95, 1.25), "quickly": (1.6, 1.85)}
@@ -180,7 +181,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Stride:
-    """How somebody walks or runs."""
+    """Parameters of a gait."""
 
     step_seconds: float
     swing_share: float = 0.8

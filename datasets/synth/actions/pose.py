@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from motionloom.datasets.actions.signals import SHIN, STAND, THIGH
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.synth.actions.maths import (
@@ -28,13 +29,10 @@ from motionloom.datasets.synth.actions.maths import (
 
 SKELETON = Skeleton.named("smplx52")
 OFFSETS = SKELETON.offsets
-STAND = float(-SKELETON.rest_joints[10, 1])
-"""Root height of the rest pose above the balls of the feet, metres."""
 BALL = np.array([SKELETON.rest_joints[10, 0], SKELETON.rest_joints[10, 2]])
-"""Where the left ball rests on the floor, (x, z) from the root."""
+"""Place of the left ball on the floor, (x, z) from the root."""
 SHOULDER = SKELETON.rest_joints[16] - SKELETON.rest_joints[9]
 """Left shoulder seen from the chest joint (spine3) at rest."""
-THIGH, SHIN = (float(np.linalg.norm(OFFSETS[j])) for j in (4, 7))
 UPPER_ARM, FOREARM = (float(np.linalg.norm(OFFSETS[j])) for j in (18, 20))
 ARM = UPPER_ARM + FOREARM
 LEG_REACH = 0.988

@@ -1,39 +1,38 @@
-"""What a clip is going to do, drawn before it is animated: the source of both motion and captions."""
+"""The truth of a clip, drawn before it is animated: the source of both motion and captions."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-HANDS = ("relaxed", "fist", "point", "spread", "pinch", "wave_fingers")
-FACES = ("neutral", "happy", "sad", "angry", "surprised")
+from motionloom.datasets.actions.dances import Record
+from motionloom.datasets.actions.hands import HANDS, SIDES
+from motionloom.datasets.motion.body.expressions import FACES
+
 TEMPI = tuple(range(80, 141, 5))
 
 T = TypeVar("T")
-Record = dict[str, Any]
-"""Truth of a clip as plain JSON (`ClipMeta.truth`)."""
 
 
 @dataclass(frozen=True)
 class Action:
-    """What clips of one action draw from; None stands for what is left unsaid."""
+    """Values that clips of one action draw from; None leaves an attribute unstated."""
 
     side: tuple[str, ...] = ()
     direction: tuple[str, ...] = ()
     speed: tuple[str | None, ...] = ()
     style: tuple[str, ...] = ()
     most: int = 0
-    """How often at most; 0 where it is not counted."""
+    """Largest count; 0 where the action is not counted."""
     hand: str | None = None
     """Shape of the hands that take part, which captions need not state."""
     chains: tuple[str, ...] | None = None
-    """Its directions as one of two actions in turn, for those that begin and end standing."""
+    """Directions as one of two actions in turn, for those that begin and end standing."""
 
 
-SIDES = ("left", "right")
 OWN = "own"
 """The direction that is the side's."""
 _PACES = ("slowly", None, "quickly")
@@ -84,7 +83,7 @@ class Truth:
     bpm: int | None = None
     style: str | None = None
     parts: tuple[Truth, Truth] | None = None
-    """Of "then": the two actions in turn."""
+    """The two actions in turn of a "then"."""
 
     def hand(self, side: int) -> str:
         return self.right_hand if side else self.left_hand

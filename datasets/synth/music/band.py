@@ -47,14 +47,14 @@ class Note(NamedTuple):
 
 @dataclass(frozen=True)
 class LineUp:
-    """Who plays, and how: drawn once for a song."""
+    """Players of a song and their manner, drawn once."""
 
     kit: str
     """full, sparse (beats are left out), hats, kick, hands (claps, shakers) or none."""
     feel: str
     """even, half, double or syncopated."""
     swing: float
-    """How late the second half of each half beat is, as a share of it."""
+    """Delay of the second half of each half beat, as a share of it."""
     programs: dict[int, int]
     with_bass: bool
     with_chords: bool

@@ -21,7 +21,7 @@ Wave = Literal["saw", "square", "organ", "string", "bell"]
 ArmPose = tuple[Vec, float, Vec]
 """Direction to the wrist (chest axes, +X outwards), reach, bend."""
 ArmPair = tuple[ArmPose, ArmPose]
-"""Where the arm is on the odd beats and on the even ones."""
+"""Poses of the arm on the odd beats and on the even ones."""
 
 _SCALES = {"major": (0, 2, 4, 5, 7, 9, 11), "minor": (0, 2, 3, 5, 7, 8, 10)}
 
@@ -34,13 +34,13 @@ class Genre(Config):
     arms: tuple[ArmPair, ArmPair]
     """The pair of arm poses of each kind of section."""
     hand: str
-    """Shape of both hands, strongest on the first beat of a bar; a name of `truth.HANDS`."""
+    """Shape of both hands, strongest on the first beat of a bar; a name of `actions.hands.HANDS`."""
     face: str
-    """Expression, strongest on the first beat of a bar; a name of `truth.FACES`."""
+    """Expression, strongest on the first beat of a bar; a name of `motion.body.expressions.FACES`."""
     words: tuple[str, ...]
-    """How captions name the music."""
+    """Names of the music in captions."""
     moves: tuple[str, ...]
-    """How captions name the arms."""
+    """Names of the arms' moves in captions."""
     kick: str
     snare: str
     hat: str
@@ -54,7 +54,7 @@ class Genre(Config):
     octave: float
     """Octaves of the chords above 110 Hz."""
     tone: tuple[float, float, float]
-    """How it is mixed: decibels below 250 Hz, from there to 2.5 kHz, and above."""
+    """Mix in decibels: below 250 Hz, from there to 2.5 kHz, and above."""
     drive: float
     """Overdrive of the mix; 1 leaves it nearly clean."""
     air: float

@@ -1,4 +1,4 @@
-"""What becomes of music between a band and a file: rooms, equalisers, compression, noise, gain and coding."""
+"""Recording of dry music: rooms, equalisers, compression, noise, gain and coding."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class Score:
     """A MIDI file in seconds."""
 
     messages: tuple[tuple[float, Any], ...]
-    """When, and mido's message."""
+    """Seconds, and mido's message."""
     beats: Array
     """[K] seconds."""
     downbeats: NDArray[np.bool_]

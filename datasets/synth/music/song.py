@@ -71,7 +71,7 @@ class Song:
 
     @cached_property
     def form(self) -> tuple[Section, ...]:
-        """Its sections, from beat 0 on, as many as fill the song; an even song's are all alike."""
+        """Sections from beat 0 on, as many as fill the song; an even song's are all alike."""
         if not self.played:
             return (Section(SECTION_BARS, 0, _EVEN_ENERGY), Section(SECTION_BARS, 1, _EVEN_ENERGY))
         rng = self._drawn(2)

@@ -106,7 +106,7 @@ _PARTIALS: dict[str, tuple[float, ...]] = {
     "bell": (1.0, 0.05, 0.5, 0.02, 0.3, 0.0, 0.15),
 }
 _DECAY: dict[str, float] = {"saw": 3.0, "square": 1.2, "organ": 0.4, "string": 0.8, "bell": 5.0}
-"""How fast a note fades, 1 / seconds."""
+"""Rate at which a note fades, 1 / seconds."""
 _ATTACK: dict[str, float] = {"saw": 0.005, "square": 0.003, "organ": 0.01, "string": 0.03, "bell": 0.002}
 """Seconds to the loudest."""
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,7 +14,6 @@ from torch.nn import functional as F
 
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.words import Encode
 from motionloom.models.gpt.drawing import Drawing, sample_seeds
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.streaming import TokenStream
@@ -32,14 +30,11 @@ from motionloom.pipeline.store.networks import (
     device_of,
     embed_motions,
 )
-from motionloom.pipeline.store.text import TextSource
 
 T = TypeVar("T")
 
 _CANDIDATES_AT_ONCE = 64
 """Motions sampled together where several are drawn for each text."""
-_READINGS = 4096
-"""Captions whose readings are kept at most."""
 
 
 @dataclass(frozen=True)
@@ -72,30 +67,6 @@ class GptGenerator(OfTokens):
         """TMA used to rank candidates: the one behind the text prior, if it models the same body part."""
         tma: LoadedTma | None = self.given.get("tma") if self.gpt.prior == "tma" else None
         return tma if tma is not None and tma.part == self.part else None
-
-    @cached_property
-    def read(self) -> Encode | None:
-        """How it reads captions, where they reach it by way of TMA: unit-length latents [n, Z]. What was read
-        is kept: notes compare every caption with the same known ones.
-        """
-        tma = self.reranker
-        text: TextSource | None = self.given.get("text")
-        if tma is None or text is None:
-            return None
-
-        kept = dict[str, NDArray[np.float32]]()
-
-        def read(captions: Sequence[str]) -> NDArray[np.float32]:
-            found = {caption: kept[caption] for caption in captions if caption in kept}
-            new = [caption for caption in dict.fromkeys(captions) if caption not in found]
-            if new:
-                latents = F.normalize(tma.embed_captions(new, text), dim=-1).numpy()
-                found.update(zip(new, latents, strict=True))
-                if len(kept) < _READINGS:
-                    kept.update(found)
-            return np.stack([found[caption] for caption in captions])
-
-        return read
 
     @property
     def max_frames(self) -> int:

@@ -1,8 +1,8 @@
 """The body's face: from expression values to weights of its shapes.
 
-Only the synthetic source's basis has a public meaning (happy, sad, angry, surprised, blink; see
-`datasets.synth.face`). FLAME coefficients of licensed data follow another basis: their faces stay neutral
-unless the caller brings controls.
+Only the basis of `datasets/motion/body/expressions.py` has a public meaning (happy, sad, angry, surprised,
+blink). FLAME coefficients of licensed data follow another basis: their faces stay neutral unless the caller
+brings controls.
 
 Pages and films move the face by five controls [T, 5]: smile, brow (-1 lowered, 1 raised), eye-open (0 closed,
 1 neutral), mouth-open and frown (mouth corners down, inner brows up). GLB files carry the synthetic basis'
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.body.arkit import ARKIT, ArkitBases, bounded_least_squares
+from motionloom.datasets.motion.body.expressions import APEX, BASIS, DETAIL
 from motionloom.datasets.motion.body.live_link import ANGLES, FaceTake, read_face, write_face
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.synth.face import APEX, BASIS, DETAIL
 from motionloom.pipeline.render.body.mesh import body_for
 
 Floats = NDArray[np.float64]

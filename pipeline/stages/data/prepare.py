@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from pathlib import Path
 
 import torch
 from pydantic import Field, model_validator
 
+from motionloom.datasets.actions.mismatch import actions_of
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.check.claims import acts_of
 from motionloom.datasets.loading.statistics import FeatureStats, compute
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import Split, UserError
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
-from motionloom.datasets.text.said import Acts
+from motionloom.datasets.text.vocabulary import word_counts
 from motionloom.pipeline.contract.stage import (
     CPU,
     RUNTIME,
@@ -38,12 +39,12 @@ class StatsConfig(StageConfig):
     group: bool = False
     """Average the deviation over each kind of feature, as HumanML3D does."""
     root_gain: float = Field(1.0, gt=0)
-    """How many times as large as other columns the root's are, once normalised [ours]: few as they are,
-    errors in them add up to the way."""
+    """Factor on the root's columns, once normalised [ours]: they are few, and errors in them add up along
+    the way."""
     mean: Path | None = Field(None, json_schema_extra=RUNTIME)
     """The `Mean.npy` of a release whose weights a stage loads (`published`), in place of the data's own."""
     std: Path | None = Field(None, json_schema_extra=RUNTIME)
-    """Its `Std.npy`. Their checksums count, not their places."""
+    """The release's `Std.npy`. Checksums of both count, not their places."""
 
     @model_validator(mode="after")
     def _both(self) -> StatsConfig:
@@ -90,7 +91,7 @@ class StatsStage(StageKind[StatsConfig]):
         return None if paths is None else [sha256_of(path) for path in paths]
 
     def exported_config(self, config: StatsConfig) -> StatsConfig:
-        """Without the folders in which a release's statistics lay."""
+        """Return the config without the folders in which a release's statistics lay."""
         places = {n: Path(p.name) for n, p in (("mean", config.mean), ("std", config.std)) if p is not None}
         return config.model_copy(update=places)
 
@@ -117,27 +118,26 @@ class StatsStage(StageKind[StatsConfig]):
 
 
 class TextStage(StageKind[TextConfig]):
-    """Embeddings of every caption."""
+    """Embeddings of every caption, and which captions represent those of the training."""
 
     name = "text"
     summary = "caption embeddings"
     config = TextConfig
     takes = ("data",)
+    version = 2  # distances of validation captions
 
     def run(self, context: StageContext) -> None:
         keep_place(context.config.encoder, context.folder)
-        data, captions, trained = context.given["data"], set[str](), {False: set[str](), True: set[str]()}
-        done = dict[str, Acts]()
+        data, actions = context.given["data"], set[str]()
+        said = defaultdict[tuple[Split, bool], set[str]](set)
         for split in data.splits:
             dataset = data.split(split)
             for index in in_order(dataset, "meta.json", "texts.json", "face_texts.json"):
                 for face in (False, True):
-                    said = {caption.text for caption in captions_of(dataset, index, face=face)}
-                    captions |= said
-                    trained[face] |= said if split == "train" else set()
-                    if split == "train" and not face:
-                        acts = acts_of(dataset.meta(index).truth)
-                        done |= {text: acts if done.get(text, acts) == acts else () for text in said}
+                    said[split, face] |= {caption.text for caption in captions_of(dataset, index, face=face)}
+                if split == "train":
+                    actions.update(actions_of(dataset.meta(index).truth))
+        captions = set[str]().union(*said.values())
         cache = build_text_cache(
             context.folder / "cache",
             captions,
@@ -151,12 +151,16 @@ class TextStage(StageKind[TextConfig]):
             f"    {len(captions)} different captions, {cache.dim}-d embeddings by {cache.encoder}"
         )
         if context.config.similarity == BUILT_IN:
-            body, face_captions = (sorted(trained[face]) for face in (False, True))
-            save_known(
-                context.folder,
-                representatives(body, cache.similarity(body), acts=done),
-                representatives(face_captions, cache.similarity(face_captions)),
+            body, face_captions = (
+                representatives(
+                    sorted(said["train", face]),
+                    cache.similarity(sorted(said["train", face])),
+                    cache.similarity(sorted(said["val", face])),
+                )
+                for face in (False, True)
             )
+            words = word_counts(said["train", False] | said["train", True])
+            save_known(context.folder, body, face_captions, tuple(words), tuple(actions))
 
     def preview(self, config: TextConfig, given: Inputs) -> TextPreview:
         return TextPreview.of(config.encoder)
@@ -165,7 +169,7 @@ class TextStage(StageKind[TextConfig]):
         return _source(stage, device)
 
     def exported_config(self, config: TextConfig) -> TextConfig:
-        """Without the places on this machine: an export brings its encoder along."""
+        """Return the config without places on this machine: an export brings its encoder along."""
         return TextConfig()
 
     def export(self, stage: Finished, target: Path) -> None:

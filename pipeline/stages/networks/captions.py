@@ -1,4 +1,4 @@
-"""What stages share that train on whole clips with their captions."""
+"""Base of stages that train on whole clips with their captions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CaptionStageConfig(TrainedStageConfig):
 
 
 class CaptionInputs(Inputs):
-    """What such a stage takes."""
+    """The data, statistics and captions of such a stage."""
 
     data: Data
     stats: FeatureStats

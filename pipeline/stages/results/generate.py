@@ -5,7 +5,6 @@ from __future__ import annotations
 from pydantic import Field
 
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.check.claims import doubts_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import (
@@ -52,26 +51,25 @@ class GenerateStage(StageKind):
     config = GenerateConfig
     offers = frozenset({"motions"})
     takes = ("data", Every("generators", GENERATOR))
-    version = 7  # notes of the joints
+    version = 8  # notes where the clips state their truth
 
     def run(self, context: StageContext) -> None:
         from motionloom.pipeline.inference.outputs import page_note, write_motions
 
         config: GenerateConfig = context.config
-        said, danced = _performed(context), _danced(context)
+        (said, mismatches), danced = _performed(context), _danced(context)
         if not said and not danced:
             raise UserError(
                 f"stage '{context.name}': nothing to generate from: no held-out clip has a caption or music "
                 f"that a generator of this run is conditioned on; give captions"
             )
         motions = [*said, *(motion for motion, _ in danced)]
-        doubts = doubts_of(said)
         write_motions(
             context.folder / "motions",
             motions,
             config.formats,
             title=f"Generated motions of {context.recipe}",
-            note=page_note(len(motions), context.recipe, context.seed, doubts),
+            note=page_note(len(motions), context.recipe, context.seed, mismatches),
             seed=context.seed,
             scores=[Score()] * len(said) + [clip.score() for _, clip in danced],
             figure=config.figure,
@@ -80,12 +78,13 @@ class GenerateStage(StageKind):
         for motion, title in zip(motions, titles, strict=True):
             line = f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {printable(title)}"
             context.console.print(line, markup=False)
-        for doubt in doubts:
-            context.console.print(f"    {printable(doubt)}", markup=False)
+        for mismatch in mismatches:
+            context.console.print(f"    {printable(mismatch)}", markup=False)
 
 
-def _performed(context: StageContext) -> list[GeneratedMotion]:
-    """The captions of the config, or of held-out clips, performed."""
+def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[str]]:
+    """Motions for the captions of the config, or of held-out clips, and what they do not show of these."""
+
     config: GenerateConfig = context.config
     bundle = bundle_driven_by("text", context.every("generators"), context.stage_cache)
     captions, faces = config.captions, config.captions
@@ -95,7 +94,7 @@ def _performed(context: StageContext) -> list[GeneratedMotion]:
             raise UserError(
                 f"stage '{context.name}': captions are given and no generator is conditioned on text"
             )
-        return []
+        return [], []
     if not captions:
         dataset = context.given["data"].held_out(prefer="test")
         chosen = spread(dataset, config.count) if config.count and has_caption(dataset).any() else []
@@ -104,8 +103,9 @@ def _performed(context: StageContext) -> list[GeneratedMotion]:
         if seconds is None and not bundle.generator.decides_length:
             seconds = recorded_seconds(truths, bundle.generator)
     if not captions:
-        return []
-    return bundle.generate(captions, face=faces, seconds=seconds, seed=context.seed, sampling=config.sampling)
+        return [], []
+    made = bundle.generate(captions, face=faces, seconds=seconds, seed=context.seed, sampling=config.sampling)
+    return made, bundle.find_mismatches(made)
 
 
 def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:

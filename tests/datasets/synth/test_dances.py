@@ -7,13 +7,14 @@ from collections import Counter, defaultdict
 import numpy as np
 import pytest
 
+from motionloom.datasets.actions.dances import beats_of, kinetic_beats, measure_dance
+from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.audio.align_features import settings_at
 from motionloom.datasets.audio.features import audio_features, beats
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, facing
-from motionloom.datasets.synth.dances import DanceConditions, DanceConfig, beats_of
+from motionloom.datasets.synth.dances import DanceConditions, DanceConfig
 from motionloom.datasets.synth.generate import Clip, SynthConfig, dance_of, make_clip, make_sample, split_of
-from motionloom.datasets.synth.measure import agrees, kinetic_beats, measure_dance
 from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.performance import render_song
 

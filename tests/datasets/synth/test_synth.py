@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from motionloom.datasets.actions.hands import HANDS
+from motionloom.datasets.actions.measure import agrees, measure
 from motionloom.datasets.motion.features.codec import decode, encode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, HANDS, draw
+from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, draw
 from motionloom.datasets.synth.generate import (
     Clip,
     SynthConfig,
@@ -24,7 +26,6 @@ from motionloom.datasets.synth.generate import (
     synthesize,
     truth_of,
 )
-from motionloom.datasets.synth.measure import agrees, measure
 
 FPS = 30.0
 CONFIG = SynthConfig(seed=2024, actions="all")

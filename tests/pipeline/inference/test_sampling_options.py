@@ -229,10 +229,12 @@ def test_the_commands_settings_reach_the_sampling(
 ) -> None:
     seen: dict[str, Any] = {}
     watching = SimpleNamespace(
-        generate=lambda captions, **options: seen.update(options) or [], generator=None
+        generate=lambda captions, **options: seen.update(options) or [],
+        generator=None,
+        unknown_captions=lambda *_: [],
+        find_mismatches=lambda _: [],
     )
     monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: watching)
-    monkeypatch.setattr("motionloom.pipeline.inference.bundle.unknown_captions", lambda *_: [])
     asked = {"sampler": "dpm++", "denoising_steps": 7, "cfg_scale": 3.0, "temperature": 0.0}
     words = [word for name, value in asked.items() for word in ("--sampling", f"{name}={value}")]
     words += ["--sampling", "guidance.audio=1.2"]

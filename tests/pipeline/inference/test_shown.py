@@ -15,13 +15,13 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.body.feet import FeetOptions
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.synth.face import APEX, BASIS
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import write_motions

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.body.arkit import ARKIT
+from motionloom.datasets.motion.body.expressions import APEX, BASIS, emotion_of
 from motionloom.datasets.motion.body.live_link import read_face
 from motionloom.datasets.motion.body.rigid import fit_rigid, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.synth.face import APEX, BASIS, read
 from motionloom.pipeline.render.body.embed import mesh_data, pack_turns, pose_data
 from motionloom.pipeline.render.body.face import (
     CONTROLS,
@@ -230,7 +230,7 @@ def test_recorded_faces_become_columns_and_come_back(shared: Path, tmp_path: Pat
         np.testing.assert_allclose(again.angles, take.angles, atol=1e-9)
     smile = np.zeros((1, 52))
     smile[0, [ARKIT.index("mouthSmileLeft"), ARKIT.index("mouthSmileRight")]] = 1
-    assert read(np.repeat(recorded_expression(smile), 3, axis=0)) == "happy"
+    assert emotion_of(np.repeat(recorded_expression(smile), 3, axis=0)) == "happy"
     for source, out, says in (
         ("a.csv", "b.csv", "a take"),
         ("a.npz", "b.npz", "a take"),

@@ -71,6 +71,8 @@ class QuickModel:
             encoder=lambda stage: SimpleNamespace(encode=lambda *_: {}),
             choose_face=lambda name: None,
             drawing=lambda sampling: sampling,
+            unknown_captions=lambda *_: [],
+            find_mismatches=lambda _: [],
             stages=(),
         )
 

@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from motionloom.datasets.actions.dances import beats_of
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.dances import DanceConditions, DanceConfig, beats_of
+from motionloom.datasets.synth.dances import DanceConditions, DanceConfig
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, synthesize
 from motionloom.models.metrics.dance import dance_fid
 from motionloom.pipeline.evaluation.clip_metrics import DANCE_METRICS, Performance, measure_clip

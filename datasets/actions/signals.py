@@ -13,16 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.actions.hands import Array
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.synth.actions.maths import Array
-from motionloom.datasets.synth.actions.pose import SHIN, STAND, THIGH
 
+_REST = Skeleton.named("smplx52")
+STAND = float(-_REST.rest_joints[10, 1])
+"""Root height of the rest pose above the balls of the feet, metres."""
+THIGH, SHIN = (float(np.linalg.norm(_REST.offsets[joint])) for joint in (4, 7))
+"""Metres from hip to knee and from knee to ankle."""
 _BALLS, _ANKLES, _SHOULDERS, _WRISTS = (10, 11), (7, 8), (16, 17), (20, 21)
 
 
 @dataclass(frozen=True)
 class Signals:
-    """What `measure` looks at; T frames, index 0 of a pair is left."""
+    """Signals of a motion of T frames; index 0 of a pair is left."""
 
     fps: float
     joints: Array

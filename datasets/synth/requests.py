@@ -1,0 +1,177 @@
+"""Parse captions for the actions of the synthetic source, by patterns of English [ours].
+
+`parse_requests` is all that others use. A linear probe on sentence embeddings was tried in its place; the
+figures of both are in docs/results.md.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from motionloom.datasets.actions.dances import Record
+
+_PATTERNS = {
+    "turn": r"(turn|pivot|spin|rotat)(e|s|es|ed|ing|ning)?|spun|about[- ]face|face the other way",
+    "walk": r"(walk|stroll|wander|trudg|strid|ambl|saunter)(e|s|es|ed|ing)?"
+    r"|(takes?|took|taking) (\w+ ){0,4}steps?|back away|back(s|ed|ing) (away|up|off)",
+    "run": r"(run|jog|dash|sprint)(s|es|ed|ged|ning|ging|ing)?|ran",
+    "wave": r"wav(e|es|ed|ing)",
+    "raise": r"(rais|lift)(e|es|s|ed|ing)?|(arms?|hands?) (up|in the air)",
+    "kick": r"kick(s|ed|ing)?",
+    "punch": r"punch(es|ed|ing)?|(jab|uppercut)(s|bed|bing)?|(hit|swing|swung)(s|ting|ing)? .{0,60}fist",
+    "hop": r"hop(s|ped|ping)?",
+    "jump": r"(jump|leap)(s|ed|ing|t)?|skip(s|ping)? (with a )?rope",
+    "squat": r"squat(s|ted|ting)?|crouch(es|ed|ing)?",
+    "clap": r"clap(s|ped|ping)?|applau(d|ds|ded|ding|se)",
+    "sit": r"sits?|sat|sitting|(take|took|has|have)s? a seat|taking a seat",
+    "bow": r"bow(s|ed|ing)?|(bend|bends|bent|bending) (over|forward)",
+    "lie": r"lies?|lying|lay(s|ing)? down",
+    "crawl": r"crawl(s|ed|ing)?",
+    "dance": r"(danc|groov)(e|es|ed|ing)|disco",
+    "reach": r"reach(es|ed|ing)?|extend(s|ed|ing)? (a|an|one|the|his|her|their|your) (hand|arm)"
+    r"|(pick|picks|picked|picking) (\w+ ){0,5}up",
+    "point": r"point(s|ed|ing)?",
+    "stretch": r"stretch(es|ed|ing)?",
+}
+"""Words for each action. Repeats are bounded, so that no caption takes long."""
+_TWO_WORDS = (("turn", "walk"), ("hop", "jump"), ("reach", "bow"), ("stretch", "raise"))
+"""Pairs of which a caption with both asks for the first alone: who turns may walk."""
+_RAISED = {"reach": "up", "stretch": "arms?"}
+"""Words beside which a raised arm may be meant."""
+_REVERSED = r"^before\b|\bafter (?!that|this|which)"
+"""Words that reverse the order of two actions."""
+_IN_TURN = r",?\s*(?:\b(?:and|but)\b)?\s*\b(?:then|afterwards|after (?:that|this|which)|finally)\b,?"
+_NEGATIONS = (
+    r"^nobody|\w+n't|no|not|never|none|nor|nothing|nowhere|without|instead|except|anything"
+    r"|dont|doesnt|didnt|isnt|arent|wasnt|wont|cant|(stop|refuse|avoid)(s|d|ed)?|stopped"
+)
+_HAND = r"(?:the |his |her |their )?(left|right|both) hands?"
+_FINGERS = (
+    rf"fists? (?:with|of) {_HAND}|{_HAND} in(?:to)? (?:a )?fists?",
+    rf"pointing (?:the index finger of|with) {_HAND}"
+    r"|pointing with (?:the |his |her )?(left|right) index finger",
+    rf"spread\w* the fingers of {_HAND}|the fingers of {_HAND} spread",
+    rf"pinch\w*(?: thumb and index finger)? (?:with|of) {_HAND}",
+    rf"(?:wiggling|waving) the fingers of {_HAND}",
+)
+"""Phrases about fingers, whose side is not the action's."""
+_DIRECTIONS = {
+    "turn": {"left": "left", "right": "right"},
+    "walk": {
+        "forward": "forwards?",
+        "backward": r"backwards?|back(s|ed|ing)? (away|up|off)|step(s|ped|ping)? back",
+        "clockwise": "clockwise",
+        "counterclockwise": "counterclockwise",
+    },
+    "run": {"forward": "forwards?", "backward": "backwards?"},
+    "jump": {"forward": r"(long|broad) jumps?|forwards?|ahead"},
+    "reach": {
+        "up": r"(reach(es|ed|ing)?|stretch\w*) up|top|high|overhead|above",
+        "down": r"down|floor|ground|toes",
+        "forward": r"forwards?|in front|ahead",
+    },
+    "point": {"up": r"up|sky|ceiling|above", "forward": r"forwards?|in front|ahead"},
+}
+_SPEEDS = {
+    "slowly": r"slow(ly)?|unhurried(ly)?|leisurely",
+    "quickly": r"quick(ly)?|fast|rapid(ly)?|brisk(ly)?|hurried(ly)?",
+}
+_COUNTED = ("kick", "punch", "hop", "jump", "squat", "clap")
+_ONES = "two three four five six seven eight nine ten eleven twelve"
+_TENS = "twenty thirty forty fifty sixty seventy eighty ninety"
+_NUMBERS = {"once": 1, "single": 1, "twice": 2, "thrice": 3, "pair": 2, "dozen": 12, "hundred": 100}
+_NUMBERS |= {word: n for n, word in enumerate(_ONES.split(), 2)}
+_NUMBERS |= {word: 10 * n for n, word in enumerate(_TENS.split(), 2)}
+_NOT_TIMES = r"(?! ?(?:hand|arm|fist|leg|knee|degree|step|second|minute|person)s?\b| ?(?:feet|people)\b)"
+"""A number before one of these is not how often."""
+
+
+@dataclass(frozen=True)
+class CaptionRequest:
+    """Truth records with what a caption asks for, the likelier first; none where it names no action.
+
+    `refused` is set where it takes an action back, or asks for more than two.
+    """
+
+    candidates: tuple[Record, ...] = ()
+    refused: bool = False
+
+
+def parse_requests(caption: str) -> CaptionRequest:
+    """Return what a caption asks for, as truth records that state no more than it does."""
+    text = caption.lower()
+    for pattern in _FINGERS:
+        text = re.sub(pattern, " ", text)
+    parts = [part for part in (part.strip(" ,.") for part in re.split(_IN_TURN, text)) if part]
+    named = [parse_actions(part) for part in parts]
+    actions = tuple(action for own in named for action in own)
+    if not actions or (len(parts) > 1 and any(len(own) != 1 for own in named)):
+        return CaptionRequest()
+    if len(actions) > 2 or _has(text, _NEGATIONS):
+        return CaptionRequest(refused=True)
+    if len(actions) == 2:
+        return CaptionRequest(({"action": "then", "parts": [{"action": action} for action in actions]},))
+    meant = (*actions, "raise") if _has(text, _RAISED.get(actions[0], "(?!)")) else actions
+    return CaptionRequest(tuple(attributes_of(text, action) for action in meant))
+
+
+def parse_actions(text: str) -> tuple[str, ...]:
+    """Return the actions that a text in small letters names, each once, in the order in which to do them."""
+    found = {
+        action: match.start()
+        for action, words in _PATTERNS.items()
+        if (match := re.search(rf"\b({words})\b", text))
+    }
+    actions = tuple(sorted(found, key=lambda action: found[action]))
+    for one, other in _TWO_WORDS:
+        if set(actions) == {one, other}:
+            return (one,)
+    return actions[::-1] if len(actions) == 2 and re.search(_REVERSED, text) else actions
+
+
+def attributes_of(text: str, action: str) -> Record:
+    """The record of an action with the direction, side, count and speed that a text states."""
+    out: Record = {"action": action}
+    sides = [side for side in ("left", "right", "both") if _has(text, side)]
+    if action in ("wave", "raise", "kick", "punch", "hop") and len(sides) == 1:
+        out["side"] = sides[0]
+    elif action in ("wave", "raise") and not sides and _has(text, "hands|arms"):
+        out["side"] = "both"
+    elif action in ("reach", "point"):
+        # Without a hand beside it, "left" is where to.
+        hand = re.search(r"\b(left|right) (?:hand|arm|index|finger)", text)
+        out |= {"side": hand[1]} if hand else {}
+    plain = text.replace("anti", "counter").replace("-", "")
+    directions = [name for name, words in _DIRECTIONS.get(action, {}).items() if _has(plain, words)]
+    if len(directions) == 1:
+        out["direction"] = directions[0]
+    count = _count(text, action)
+    if count is not None:
+        out["count"] = count
+    speeds = [name for name, words in _SPEEDS.items() if _has(text, words)]
+    if len(speeds) == 1 and (action, *speeds) != ("run", "quickly"):
+        out["speed"] = speeds[0]
+    return out
+
+
+def _count(text: str, action: str) -> int | None:
+    """Return how often a text asks for an action; of one that is not counted, only where it says "times"."""
+    following = _NOT_TIMES if action in _COUNTED else r"(?= ?times\b)"
+    if action == "walk":
+        following = r"(?= ?(?:times|steps)\b)"
+    elif action in _COUNTED:
+        words = _PATTERNS[action]
+        again = re.search(rf"\b({words})\b(\W+({words})\b)+", text)
+        if again:  # "jump jump jump"
+            return len(re.findall(rf"\b({words})\b", again[0]))
+        if _has(text, rf"one (\w+ )?({words})|one time"):
+            return 1
+    found = re.findall(rf"\bx?(\d+|{'|'.join(_NUMBERS)})x?\b{following}", text)
+    numbers = {int(one) if one.isdigit() else _NUMBERS[one] for one in found}
+    return numbers.pop() if len(numbers) == 1 else None
+
+
+def _has(text: str, pattern: str) -> bool:
+    """Whether a text has one of these words."""
+    return re.search(rf"\b({pattern})\b", text) is not None

@@ -1,0 +1,99 @@
+"""What captions ask for, by their words; and whether joints show it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from motionloom.datasets.actions.measure import described
+from motionloom.datasets.actions.mismatch import actions_of, find_mismatch
+from motionloom.datasets.motion.canonical import canonicalize
+from motionloom.datasets.synth.generate import Clip, SynthConfig, make_clip
+from motionloom.datasets.synth.requests import CaptionRequest, parse_actions, parse_requests
+
+CONFIG = SynthConfig(clips=400, seed=3, actions="all")
+FPS = CONFIG.motion_layout.fps
+
+
+def then(*actions: str) -> dict[str, Any]:
+    return {"action": "then", "parts": [{"action": action} for action in actions]}
+
+
+@pytest.mark.parametrize(
+    ("caption", "asked"),
+    [
+        ("a person waves with the left hand", [{"action": "wave", "side": "left"}]),
+        ("hands up", [{"action": "raise", "side": "both"}]),
+        ("two quick left jabs", [{"action": "punch", "side": "left", "count": 2, "speed": "quickly"}]),
+        ("jump jump jump", [{"action": "jump", "count": 3}]),
+        ("the boxer kicks one time", [{"action": "kick", "count": 1}]),
+        ("he gives it a kick with both hands in fists", [{"action": "kick"}]),
+        ("walk and turn right", [{"action": "turn", "direction": "right"}]),
+        ("she steps back, taking three steps", [{"action": "walk", "direction": "backward", "count": 3}]),
+        ("strolls anti-clockwise", [{"action": "walk", "direction": "counterclockwise"}]),
+        ("she walks slowly", [{"action": "walk", "speed": "slowly"}]),
+        ("point to the left with the right hand", [{"action": "point", "side": "right"}]),
+        ("reach up high", [{"action": "reach", "direction": "up"}, {"action": "raise"}]),
+        ("wave and then kick", [then("wave", "kick")]),
+        ("he claps after he bows", [then("bow", "clap")]),
+        ("a person plays the violin", []),
+        ("", []),
+    ],
+)
+def test_what_a_caption_asks_for(caption: str, asked: list[dict[str, Any]]) -> None:
+    assert parse_requests(caption) == CaptionRequest(tuple(asked))
+
+
+@pytest.mark.parametrize("caption", ["nobody kicks", "he doesn't wave", "stop walking", "kick, hop, wave"])
+def test_what_is_taken_back_or_too_much_is_refused(caption: str) -> None:
+    assert parse_requests(caption) == CaptionRequest(refused=True)
+
+
+def test_a_long_caption_takes_no_time() -> None:
+    assert parse_actions("takes " + "very " * 20_000 + "swung " * 2_000) == ()
+
+
+def clip(action: str, **wanted: object) -> Clip:
+    made = (make_clip(k, CONFIG) for k in range(CONFIG.clips))
+    return next(one for one in made if {"action": action, **wanted}.items() <= one.truth.items())
+
+
+def test_true_requests_are_shown_and_others_are_not() -> None:
+    wave = clip("wave").joints
+    for action in ("walk", "turn", "run", "jump", "squat", "kick", "clap", "hop", "punch", "bow", "crawl"):
+        assert find_mismatch([{"action": action}], clip(action).joints, FPS) is None
+        assert find_mismatch([{"action": action}], wave, FPS) == f"the motion shows no {action}"
+    assert find_mismatch([{"action": "sit"}, {"action": "wave"}], wave, FPS) is None
+
+
+@pytest.mark.parametrize(
+    ("action", "asked", "seen"),
+    [
+        ("walk", {"speed": "quickly"}, "the speed is another, not quickly"),
+        ("raise", {"side": "both"}, "the side is left, not both"),
+        ("raise", {"side": "left"}, None),
+    ],
+)
+def test_attributes_are_compared(action: str, asked: dict[str, str], seen: str | None) -> None:
+    truth: dict[str, object] = {"side": "left"} if action == "raise" else {"speed": None}
+    joints = clip(action, **truth).joints
+    assert find_mismatch([{"action": action, **asked}], joints, FPS) == seen
+
+
+def test_counts_are_compared() -> None:
+    squat = clip("squat").joints
+    twice = np.concatenate([squat, canonicalize(squat)])
+    count = described(twice, FPS, "squat")["count"]
+    assert find_mismatch([{"action": "squat", "count": count}], twice, FPS) is None
+    found = find_mismatch([{"action": "squat", "count": count + 1}], twice, FPS)
+    assert found == f"the count is {count}, not {count + 1}"
+
+
+def test_actions_of_a_truth() -> None:
+    chained = clip("then").truth
+    assert actions_of(chained) == tuple(part["action"] for part in chained["parts"])
+    assert find_mismatch([chained], clip("then").joints, FPS) is None
+    assert actions_of({"action": "wave", "side": "left"}) == ("wave",)
+    assert actions_of(None) == actions_of({"song": 3}) == ()
