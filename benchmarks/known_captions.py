@@ -61,7 +61,7 @@ def main() -> None:
         # Songs may have been drawn otherwise when the model was trained.
         print(f"{kind}: {len(set(kept) - captions['train', kind])} of {len(kept)} are not of the recipe now")
         captions["train", kind].update(kept)
-    words = word_counts(captions["train", "body"] | captions["train", "face"])
+    words = {*texts["words"], *word_counts(captions["train", "body"] | captions["train", "face"])}
     save_known(folder, known["body"], known["face"], tuple(words), tuple(actions))
     artifact = Artifact.find(folder)
     assert artifact is not None
