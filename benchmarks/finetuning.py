@@ -34,7 +34,7 @@ from bench import Column, arguments, command_line, kept, process_seconds, report
 from caption_check import BY_CONTENT
 from numpy.typing import NDArray
 from torch import Tensor
-from wordings import Label, read_labels
+from wordings_obeyed import Label, read_labels
 
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
