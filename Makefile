@@ -49,8 +49,7 @@ OLDER := NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBLAS_CORETY
   GLIBC_TUNABLES=glibc.cpu.hwcaps=-AVX512F,-AVX512VL,-AVX512BW,-AVX512DQ,-AVX512CD
 
 test-older: $(STAMP)
-	@$(OLDER) $(MAKE) --no-print-directory test FAST="not ($(FAST))"
-	@$(OLDER) $(MAKE) --no-print-directory test
+	@$(OLDER) $(MAKE) --no-print-directory test-all
 
 # mypy reads the folders as the namespace package `motionloom`, so it gets a folder of that name that links to them.
 lint: $(STAMP)

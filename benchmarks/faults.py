@@ -41,7 +41,6 @@ FAULTS = [Fault(**row) for row in yaml.safe_load(Path(__file__).with_suffix(".ya
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--only", default="", help="a word in the names of faults")
-    parser.add_argument("--slow", action="store_true", help="run the slow tests too")
     options = parser.parse_args()
     found = missed = 0
     with tempfile.TemporaryDirectory() as folder:
@@ -58,14 +57,14 @@ def main() -> None:
             if options.only not in fault.name:
                 continue
             began = time.monotonic()
-            result = inject(fault, place, options.slow)
+            result = inject(fault, place)
             found, missed = found + (result == "found"), missed + (result != "found")
             print(f"{result:9} {time.monotonic() - began:5.0f} s  {fault.name}", flush=True)
     print(f"{found} found, {missed} not")
     sys.exit(missed > 0)
 
 
-def inject(fault: Fault, place: Path, slow: bool) -> str:
+def inject(fault: Fault, place: Path) -> str:
     """`found`, `MISSED`, or why it could not be tried."""
     tree = place / "tree"
     homes = [
@@ -84,24 +83,12 @@ def inject(fault: Fault, place: Path, slow: bool) -> str:
     ]
     homes[0].write_text(text.replace(fault.old, fault.new), "utf-8")
     try:
-        marks = "not browser and not slurm" + (
-            "" if slow or fault.tests.startswith("slow:") else " and not slow"
-        )
-        words = [
-            sys.executable,
-            "-P",
-            "-m",
-            "pytest",
-            "-q",
-            "-x",
-            "-p",
-            "no:cacheprovider",
-            "-m",
-            marks,
-            *tests,
-        ]
+        marks = "not browser and not slurm" + ("" if fault.tests.startswith("slow:") else " and not slow")
+        pytest = [sys.executable, "-P", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-m", marks]
         given = {"PYTHONPATH": str(place / "path"), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
-        run = subprocess.run(words, cwd=tree, env={**os.environ, **given}, capture_output=True, text=True)
+        run = subprocess.run(
+            [*pytest, *tests], cwd=tree, env={**os.environ, **given}, capture_output=True, text=True
+        )
     finally:
         homes[0].write_text(text, "utf-8")
     return {0: "MISSED", 1: "found"}.get(run.returncode, f"exit {run.returncode}")
