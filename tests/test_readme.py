@@ -217,3 +217,24 @@ def test_the_readme_says_what_the_models_of_the_package_know() -> None:
     for name, model in shipped_models().items():
         _, _, known = model.description.partition("it knows ")
         assert known and known in text, f"{name} knows {known}"
+
+
+def test_volumes_are_mounted_and_gpus_are_asked_for_in_equal_numbers() -> None:
+    spec = yaml.safe_load((ROOT / "docs" / "trainjob.yaml").read_text())["spec"]
+    template = spec["runtimePatches"][0]["trainingRuntimeSpec"]["template"]["spec"]
+    pod = template["replicatedJobs"][0]["template"]["spec"]["template"]["spec"]
+    mounts = {mount["name"] for mount in pod["containers"][0]["volumeMounts"]}
+    assert mounts == {volume["name"] for volume in pod["volumes"]}
+    asked = spec["trainer"]["resourcesPerNode"]
+    gpus = {asked[kind]["nvidia.com/gpu"] for kind in ("requests", "limits")}
+    assert gpus == {str(spec["trainer"]["numProcPerNode"])}
+
+
+@pytest.mark.parametrize("name", ["trainjob", "skypilot"])
+def test_the_examples_of_engines_run_our_command_on_their_machines(name: str) -> None:
+    data = yaml.safe_load((ROOT / "docs" / f"{name}.yaml").read_text())
+    trainer = data["spec"]["trainer"] if name == "trainjob" else None
+    words = trainer["command"] if trainer else shlex.split(data["run"].replace("\\\n", ""))
+    given = parsed(words[words.index("motionloom") :])
+    hardware = load_recipe(given["recipe"], given["sets"]).hardware
+    assert (hardware.nodes, hardware.devices) == (trainer["numNodes"] if trainer else data["num_nodes"], 8)
