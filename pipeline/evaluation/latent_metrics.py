@@ -313,6 +313,7 @@ def reconstructed_figures(
     """
     prefix, facts = f"reconstruction.{role}", {**protocol, "training_clips": len(others)}
     base = LatentRow(real if text is None else text, real, rebuilt, seed, min(size, len(real)))
+    # FID of as many training clips says what a draw of clips alone gives.
     rows = _measured(prefix, SPREAD_METRICS, base, {MODEL: [rebuilt], TRAINING: [others]})
     if text is not None:
         facts["candidates"] = base.size

@@ -91,6 +91,7 @@ def clip_errors(
         "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
         "_nearest_train_clip": nearest.motion(truth.features, truth.present),
     }
+    # Hands that were never recorded are no truth to be compared with.
     joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
     out: Row = {}
     for suffix, motion in compared.items():
@@ -103,7 +104,7 @@ def clip_errors(
             ):
                 out |= weighted(f"{name}{part}{suffix}", getattr(errors, name).item(), frames.item())
         ours = pose_errors(pose, real[:, joints])
-        ours.setdefault("pose_body", ours["pose"])
+        ours.setdefault("pose_body", ours["pose"])  # a body without hands is all body
         ours["world"] = mpjpe(place, target[:, joints], root=None)
         out |= {f"{name}{suffix}": float(value.mean()) for name, value in ours.items()}
     return out

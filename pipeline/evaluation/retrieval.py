@@ -53,6 +53,7 @@ def retrieve(
     stage_cache = StageCache(choose_device(device))
     model, inputs = stage_cache.get(source), _sources(run, source)
     data = stage_cache.get(inputs["data"])
+    # Latents are compared as the judge's own training compared them.
     judge, distance = _judge(model, source, data)
     dataset = data.split(split) if split else data.held_out(prefer="test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
@@ -63,6 +64,7 @@ def retrieve(
         )
     text, motion = judge.texts(truths), judge.recorded(truths)
     found_by = {"A": ("whole split", recall(text, motion, distance=distance))}
+    # Only a sentence encoder can tell which captions say the same.
     if "text" in inputs:
         sentence = torch.as_tensor(
             stage_cache.get(inputs["text"]).cache.similarity([t.caption for t in truths])

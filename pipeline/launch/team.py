@@ -140,6 +140,7 @@ def _require_match(hardware: Hardware) -> None:
                 f"hardware.devices (processes on a node) and hardware.nodes to match it"
             )
         return
+    # Without srun one process starts the others on its own machine, and knows none elsewhere.
     devices, nodes, tasks = hardware.resolved_devices(), hardware.nodes, srun_tasks()
     if tasks == 1:
         if nodes > 1 and "SLURM_JOB_ID" in env and "NODE_RANK" not in env:
@@ -157,7 +158,7 @@ def _require_match(hardware: Hardware) -> None:
             f"hardware.nodes to match it, and give each process all GPUs of its node (--gpus-per-node, not "
             f"--gpus-per-task)"
         )
-    if each is None:
+    if each is None:  # Lightning needs it to number the processes of a node
         raise UserError(
             f"srun started {tasks} processes without saying how many on a node: start it with "
             f"srun --nodes {nodes} --ntasks-per-node {devices}"

@@ -101,6 +101,7 @@ def histogram(
     y_axis = _Axis(0.0, tallest, HEIGHT - BOTTOM, TOP)
     parts = _axes(x_axis, y_axis, x_label, y_label)
     step = (edges[1] - edges[0]) / bins
+    # Each name is stacked on the sum of those before it.
     below = np.zeros(bins)
     for index, (name, values) in enumerate(stacks.items()):
         for number, value in enumerate(values.tolist()):
@@ -109,7 +110,7 @@ def histogram(
             gap = min(0.5, 0.1 * (right - left))
             base, top = y_axis(below[number]), y_axis(below[number] + value)
             kind, tall = f"stack s{index % COLOURS}", base - top
-            if not value:
+            if not value:  # an unused code, which is worth seeing
                 if len(stacks) > 1:
                     continue
                 kind, top, tall = "dead", base, 5.0

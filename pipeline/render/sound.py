@@ -53,6 +53,7 @@ def embed_sounds(uses: Iterable[tuple[Sound | None, float]]) -> tuple[list[Sound
         if sound is None:
             chosen.append(None)
             continue
+        # By content, since clips cut from one piece bring equal copies of it.
         content = hashlib.sha256(np.ascontiguousarray(sound.samples).tobytes()).digest()
         number = order.setdefault((sound.rate, content), len(distinct))
         if number == len(distinct):

@@ -77,6 +77,7 @@ def write_data_report(root: Path, out: Path, *, clips: int = 12, progress: bool 
     filled = {shard.split for shard in manifest.shards}
     splits: dict[str, ShardDataset] = {s: ShardDataset.open(root, s) for s in SPLITS if s in filled}
     records = Records()
+    # One pass over the records: of large sets they are read from disk.
     with Progress(disable=not progress) as bar:
         for split, dataset in splits.items():
             shown = set(_spread(len(dataset), EXAMPLES))

@@ -192,6 +192,7 @@ def make_launch_plan(
     groups: list[Group] = []
     for need, stages in _cut(recipe, gpus_per_node):
         names = tuple(stage.name for stage in stages)
+        # `--until` takes all that its stages need, so the last ones name the whole group.
         read = {name for stage in stages for name in stage.inputs.values()}
         label = "train" if any(stage.kind.trains for stage in stages) else _word(names[0], 12)
         machines = _machines(options, need, nodes, gpus_per_node)

@@ -125,6 +125,7 @@ def changed_above(folder: Path, visited: dict[Path, Changed | None]) -> Changed 
         visited[key] = None  # a damaged folder may name itself
         artifact = None if in_export(folder) else Artifact.find(folder)
         sources = [] if artifact is None else list(artifact.inputs.values())
+        # Its own inputs first: the nearest change explains most.
         own_ones = ((folder, one) for one in sources if one.now(folder) not in (None, one.fingerprint))
         above = (changed_above(source.place(folder), visited) for source in sources)
         visited[key] = next(own_ones, None) or next(filter(None, above), None)

@@ -98,6 +98,7 @@ def execution(fabric: Fabric, module: StageModule, config: TrainConfig) -> Execu
     module.to(fabric.device)
     if isinstance(fabric.strategy, DDPStrategy) and not isinstance(module, PlayersModule):
         model = fabric.strategy.setup_module(module)
+    # bfloat16 has the range of float32, so only float16 comes with a scaler.
     scaler = getattr(fabric.strategy.precision, "scaler", None)
     half = None if config.precision == "32-true" else torch.bfloat16 if scaler is None else torch.float16
     return Execution(fabric, model, half, scaler)

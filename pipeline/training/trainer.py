@@ -121,6 +121,7 @@ class Training:
         self.folder = context.folder / "checkpoints"
         console, name, hardware = context.console, context.name, context.hardware
         self.every = min(config.checkpoint_every, config.steps)
+        # Validations fall on checkpoints, so that a resumed training makes the same ones.
         checkpoints = -(-config.validate_every // self.every)
         self.validate_every = checkpoints * self.every if data.validation is not None else 0
         prepare_module(module, config)
@@ -132,6 +133,7 @@ class Training:
         title = f"{context.recipe}/{name}"
         self.log = MetricLog(context.folder, hardware.loggers, context.recipe, title)
         self.validation_is_due = False
+        # Loaded before telemetry and writer begin: both go on from the module's step.
         if resume.checkpoint is not None:
             self._load(read_checkpoint(resume.checkpoint), longer=resume.longer)
         self.writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)

@@ -176,7 +176,7 @@ def notes_of(
     facts += [f"± is {measured.spread}"] if measured.spread else []
     out.append(f"The paper's numbers: {'; '.join(facts)}." + (f" {measured.note}" if measured.note else ""))
     out += [f"{row.method}: {row.note}." for row in table.rows if row.note]
-    if not with_runs:
+    if not with_runs:  # what follows is about figures of ours
         return tuple(out)
     out.append("The paper's numbers are never ranked with ours: they were measured otherwise, as listed.")
     if any(cell and cell.best for row in rows for cell in row.cells):

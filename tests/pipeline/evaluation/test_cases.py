@@ -72,7 +72,7 @@ def test_cases_come_back_and_are_drawn(truths: list[Truth], tmp_path: Path) -> N
     assert [m.label for m in made.motions[:2]] == ["recorded", "generated"]
     assert [m.group for m in kept.motions[::2]] == ["worst 1: 9 mm", "best 1: 1.24 mm"]
     assert len(kept.motions[0].parents) == LAYOUT.num_joints
-    with pytest.raises(UserError, match=r"does not fit metrics.json beside it .* evaluate again"):
+    with pytest.raises(UserError, match=r"cases\.safetensors.*metrics\.json"):
         read_cases(tmp_path, [*details["cases"], *details["cases"]])
     assert write_cases(tmp_path, [], LAYOUT) == {} and list(tmp_path.iterdir()) == []
     assert read_cases(tmp_path, details["cases"]) == [] == shown_cases(tmp_path, {})

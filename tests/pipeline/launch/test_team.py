@@ -85,7 +85,7 @@ def cpu(devices: int = 0, nodes: int = 1) -> Hardware:
 def test_tasks_of_srun_do_not_train_alone(srun: Srun, rank: int) -> None:
     srun(2, rank=rank)
     assert process_rank() == rank
-    with pytest.raises(UserError, match="srun started 2 processes on 1 node and the recipe asks for 1 on 1"):
+    with pytest.raises(UserError, match=r"srun started 2 .* 1 node .* asks for 1 on 1"):
         Team.start(cpu())
 
 
@@ -96,7 +96,7 @@ def test_other_numbers_are_refused_too(
     srun: Srun, per_node: int, nodes: int, devices: int, hosts: int
 ) -> None:
     srun(per_node, nodes)
-    with pytest.raises(UserError, match=r"set hardware.devices \(processes on a node\) and hardware.nodes"):
+    with pytest.raises(UserError, match=r"hardware\.devices .*hardware\.nodes"):
         Team.start(cpu(devices, hosts))
 
 
@@ -111,7 +111,7 @@ def test_torchrun_inside_a_job_goes_by_its_own_numbers(srun: Srun, monkeypatch: 
     srun(1, 2)
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setenv("WORLD_SIZE", "3")
-    with pytest.raises(UserError, match="the launcher started 3 processes and the recipe asks for 2"):
+    with pytest.raises(UserError, match=r"started 3 .* asks for 2"):
         Team.start(cpu(2))
     monkeypatch.setenv("WORLD_SIZE", "1")
     assert Team.start(cpu(1)).leads
@@ -122,7 +122,7 @@ def test_a_script_or_a_shell_inside_a_job_is_one_process(srun: Srun, monkeypatch
     monkeypatch.delenv("SLURM_STEP_NUM_TASKS")  # a batch script: rank 0, and the job's number of tasks
     assert srun_tasks() == 1
     assert Team.start(cpu()).world == 1
-    with pytest.raises(UserError, match="alone in its SLURM job: start it with srun --nodes 2"):
+    with pytest.raises(UserError, match="srun --nodes 2"):
         Team.start(cpu(1, nodes=2))
     monkeypatch.delenv("SLURM_PROCID")  # a shell of salloc
     assert Team.start(cpu()).world == 1

@@ -121,10 +121,8 @@ def test_saved_bytes_of_a_known_network() -> None:
 
 def test_a_layout_that_does_not_fit_is_told_with_the_stage() -> None:
     recipe = load_recipe("humantomato-tiny", ["data.layout=body133"])
-    with pytest.raises(UserError, match="stage tokenizer: layout body133 has no hand columns"):
+    with pytest.raises(UserError, match=r"stage tokenizer: layout body133 .* hand"):
         estimate(recipe)
     recipe = load_recipe("bvh-body", ["data.layout=body133", "tma.net.finger_gain=4"])
-    with pytest.raises(
-        UserError, match=r"stage tma: finger_gain needs body and hands together \(layout body133\)"
-    ):
+    with pytest.raises(UserError, match=r"stage tma: finger_gain .*body133"):
         estimate(recipe)

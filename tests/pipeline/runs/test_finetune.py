@@ -145,7 +145,7 @@ def test_shards_are_to_have_the_layout_of_the_model(mine: Mine) -> None:
     assert recipe.stage("data").config.layout == "wholebody363"
     layout = MotionLayout.named("wholebody363", fps=20.0)
     require_start_layout(layout, MotionLayout.named("wholebody363", fps=20.0))
-    with pytest.raises(UserError, match=r"holds layout wholebody363 \(exact, 30 fps\), .* 20 fps"):
+    with pytest.raises(UserError, match=r"wholebody363 .*30 fps.* 20 fps"):
         require_start_layout(MotionLayout.named("wholebody363"), layout)
 
 
@@ -173,7 +173,7 @@ def test_a_run_is_gone_on_from_and_exported_with_the_stages_of_the_other(
 
 
 def test_a_ude_is_refused(ude_run: Any, mine: Mine) -> None:
-    with pytest.raises(UserError, match="whose body is made by a stage of kind gpt; this one has ude"):
+    with pytest.raises(UserError, match=r"kind gpt; .* ude"):
         mine.load(f"start={ude_run.folder}")
 
 

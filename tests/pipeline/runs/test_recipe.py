@@ -187,9 +187,7 @@ stages:
 
 
 def test_a_tma_on_captions_of_another_encoder_is_refused(load: Any) -> None:
-    with pytest.raises(
-        UserError, match=r"'gpt' reads captions as 'clip' .* its TMA 'tma' .* those of 'text'"
-    ):
+    with pytest.raises(UserError, match=r"'gpt' .*'clip' .*'tma' .*'text'"):
         load(CAPTIONED)
     for change in (("inputs: {text: clip}", "inputs: {text: clip, tma: null}"), ("some-clip", "minilm")):
         load(CAPTIONED.replace(*change))
@@ -322,7 +320,7 @@ def test_wrong_defaults_are_refused_by_name(defaults: str, says: str, load: Any)
     text = BASE[: BASE.index("defaults:")] + f"defaults: {defaults}\n" + BASE[BASE.index("stages:") :]
     with pytest.raises(UserError, match=says):
         load(text)
-    with pytest.raises(UserError, match=r"defaults\.trained concerns no stage: there is none that trains"):
+    with pytest.raises(UserError, match=r"defaults\.trained concerns no stage"):
         load("name: x\ndefaults: {trained: {train: {steps: 3}}}\nstages: {data: {kind: synth}}")
 
 

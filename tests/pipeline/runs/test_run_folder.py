@@ -83,23 +83,23 @@ def test_a_folder_with_mixed_stages_is_not_used(go: Go, tmp_path: Path) -> None:
     go()
     go("tma.add=2", until="tma", replace=True)
     for use in (lambda: Bundle.from_run(run), lambda: evaluate_run(run, console=QUIET)):
-        with pytest.raises(UserError, match="stage 'gpt' was made from another 'tma'") as error:
+        with pytest.raises(UserError, match="'gpt' was made from another 'tma'") as error:
             use()
         assert f"motionloom run {run / 'recipe.yaml'} -o {run}" in str(error.value)
     run_recipe(run / "recipe.yaml", run, replace=True, console=QUIET)  # the fix
     evaluate_run(run, console=QUIET)
     require_consistent(run, finished_stages(run))
     go("tokenizer.add=2", until="tokenizer", replace=True)  # further up
-    with pytest.raises(UserError, match="stage 'tokens' was made from another 'tokenizer'"):
+    with pytest.raises(UserError, match="'tokens' was made from another 'tokenizer'"):
         evaluate_run(run, console=QUIET)
     go(replace=True)
     go("data.add=2", until="data")
-    with pytest.raises(UserError, match="was made from another 'data'"):
+    with pytest.raises(UserError, match="another 'data'"):
         retrieve(run)
     go(replace=True)
     with pytest.raises(KeyboardInterrupt):  # one that is being made anew is another one too
         go("tma.add=-1", until="tma", replace=True)
-    with pytest.raises(UserError, match="stage 'gpt' was made from another 'tma'"):
+    with pytest.raises(UserError, match="'gpt' was made from another 'tma'"):
         Bundle.from_run(run)
 
 
@@ -122,9 +122,9 @@ def took(run: Path, **seconds: float) -> None:
 def test_another_recipe_is_refused_in_the_folder(go: Go, tmp_path: Path) -> None:
     go()
     before = files(tmp_path / "run")
-    with pytest.raises(UserError, match=r"(?s)of recipe 'toy', not 'other'; to go on .*gpt.* --replace"):
+    with pytest.raises(UserError, match=r"(?s)'toy', not 'other'; .*gpt.* --replace"):
         go("gpt.add=2", recipe="other")
-    with pytest.raises(UserError, match=r"'toy', not 'other'; -o .*run-2 keeps both, --replace goes on here"):
+    with pytest.raises(UserError, match=r"'toy', not 'other'; -o .*run-2 .*--replace"):
         go("report.add=2", recipe="other")
     said = go("gpt.add=2", recipe="other", dry_run=True)
     assert "without --replace this is refused" in said and "holds a run of recipe 'toy', not 'other'" in said

