@@ -34,12 +34,16 @@ def song() -> Callable[..., Sound]:
 
 @pytest.fixture
 def visit(browser: Any, until: Callable[..., None]) -> Iterator[Callable[..., Any]]:
-    """Opens a file and fails the test if the page ever complains or asks for anything."""
+    """Opens a file and fails the test if the page ever complains or asks for anything.
+
+    Figures stand still until they are told to play, unless `plays`: pictures without a GPU are dear.
+    """
     trouble: list[str] = []
     pages = []
 
-    def go(path: Path, width: int = 900, height: int = 760, **options: Any) -> Any:
-        page = browser.new_page(viewport={"width": width, "height": height}, **options)
+    def go(path: Path, width: int = 900, height: int = 760, *, plays: bool = False, **options: Any) -> Any:
+        motion = "no-preference" if plays else "reduce"
+        page = browser.new_page(viewport={"width": width, "height": height}, reduced_motion=motion, **options)
         page.on("console", lambda m: trouble.append(m.text) if m.type in ("error", "warning") else None)
         page.on("pageerror", lambda e: trouble.append(str(e)))
         page.on(

@@ -92,7 +92,7 @@ def assert_in_step(seen: list[dict[str, float]], speed: float = 1.0) -> None:
 def test_frames_follow_the_sound_after_seek_pause_and_at_half_speed(
     visit: Make, until: Make, dance: Path
 ) -> None:
-    page = visit(dance)
+    page = visit(dance, plays=True)
     until(page, "__viewer.frame > 5")
     assert page.evaluate("[__viewer.sound, __viewer.audio.paused]") == [False, True]  # silent at first
     turn_on(page, until)
@@ -122,7 +122,7 @@ def test_frames_follow_the_sound_after_seek_pause_and_at_half_speed(
 
 def test_a_pause_stands_where_the_sound_stopped(visit: Make, until: Make, dance: Path) -> None:
     """Also where the page has drawn nothing for a while, and the sound went on."""
-    page = visit(dance)
+    page = visit(dance, plays=True)
     turn_on(page, until)
     until(page, "__viewer.audio.currentTime > 0.3")
     busy = "const end = performance.now() + 500; while (performance.now() < end);"
@@ -134,7 +134,7 @@ def test_a_pause_stands_where_the_sound_stopped(visit: Make, until: Make, dance:
 def test_scrubbing_silences_and_a_new_round_starts_the_sound_again(
     visit: Make, until: Make, dance: Path
 ) -> None:
-    page = visit(dance)
+    page = visit(dance, plays=True)
     turn_on(page, until)
     box = page.get_by_label("Time").bounding_box()
     page.mouse.click(box["x"] + box["width"] * 0.75, box["y"] + 12)
@@ -149,7 +149,7 @@ def test_scrubbing_silences_and_a_new_round_starts_the_sound_again(
 
 
 def test_mute_and_volume(visit: Make, until: Make, dance: Path) -> None:
-    page = visit(dance)
+    page = visit(dance, plays=True)
     turn_on(page, until)
     volume = page.get_by_label("Volume")
     volume.focus()
@@ -169,7 +169,7 @@ def test_mute_and_volume(visit: Make, until: Make, dance: Path) -> None:
 
 
 def test_another_motions_music_is_heard_in_its_place(visit: Make, until: Make, songs: Path) -> None:
-    page = visit(songs)
+    page = visit(songs, plays=True)
     assert page.locator(".mlv-hear:visible").count() == 2
     turn_on(page, until)
     length = page.evaluate("__viewer.audio.duration")
@@ -195,7 +195,7 @@ def test_one_viewer_of_a_page_sounds_at_a_time(
     motion = ViewerMotion(walk(100), FPS, PARENTS, "a", "b", sound=song(5.0))
     path = tmp_path / "page.html"
     Page("Report").add_viewer([motion]).add_viewer([motion]).write(path)
-    page = visit(path, width=1000, height=1500)
+    page = visit(path, width=1000, height=1500, plays=True)
     for k in (0, 1):
         # The first viewer's button reads 'Sound off' once it sounds.
         page.get_by_role("button", name="Sound on").first.click()
@@ -205,7 +205,7 @@ def test_one_viewer_of_a_page_sounds_at_a_time(
 
 
 def test_time_line_shows_beats_bands_and_the_band_that_plays(visit: Make, until: Make, dance: Path) -> None:
-    page = visit(dance)
+    page = visit(dance, plays=True)
     page.evaluate("() => { __viewer.play(false); __viewer.setFrame(60); }")
     until(page, "document.querySelector('.mlv-lit')?.textContent === '♪ song 04'")
     bands = page.locator(".mlv-band")

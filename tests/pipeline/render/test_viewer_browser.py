@@ -58,7 +58,7 @@ def still(page: Any, frame: int = 0) -> None:
 
 
 def test_plays_by_itself_and_pauses(visit: Any, until: Any, single: Path) -> None:
-    page = visit(single)
+    page = visit(single, plays=True)
     first = page.evaluate("__viewer.frame")
     until(page, f"Math.abs(__viewer.frame - {first}) >= 5")
     page.keyboard.press("Space")
@@ -185,7 +185,7 @@ def test_dark_and_light(visit: Any, single: Path, pixels: Any) -> None:
 
 
 def test_reduced_motion_starts_still_but_plays_on_request(visit: Any, until: Any, single: Path) -> None:
-    page = visit(single, reduced_motion="reduce")
+    page = visit(single)
     assert page.evaluate("[__viewer.playing, __viewer.frame]") == [False, 0]
     page.get_by_role("button", name="Play").click()
     until(page, "__viewer.frame > 1")
@@ -211,7 +211,7 @@ def test_report_page_with_two_viewers_and_charts(visit: Any, until: Any, tmp_pat
         motions, "two"
     ).add_viewer(motions[:1])
     page.add_table(["a", "b"], [["x", 1.0]]).write(tmp_path / "page.html")
-    sheet = visit(tmp_path / "page.html", width=1100, height=900)
+    sheet = visit(tmp_path / "page.html", width=1100, height=900, plays=True)
     assert sheet.evaluate("__viewers.length") == 2
     sheet.locator("svg.chart").first.hover()
     assert "train: 1.5" in sheet.locator("#tip").text_content()

@@ -116,13 +116,13 @@ def test_bones_are_those_of_numpy(visit: Any, page_file: Path, joints: np.ndarra
         ViewerMotion(figure.joints, 20, SMPLX.parents, figure=figure),
         ViewerMotion(small, 20, Skeleton.named("smpl22").parents),
     ], "two")  # fmt: skip
+    one, two = visit(page_file, **SIZE), visit(tmp_path / "two.html", **SIZE)
     cases = [
-        (page_file, 0, posing_of(joints, SMPLX)),
-        (tmp_path / "two.html", 0, posing_of(figure.joints, SMPLX, figure)),
-        (tmp_path / "two.html", 1, posing_of(small, Skeleton.named("smpl22"))),
+        (one, 0, posing_of(joints, SMPLX)),
+        (two, 0, posing_of(figure.joints, SMPLX, figure)),
+        (two, 1, posing_of(small, Skeleton.named("smpl22"))),
     ]
-    for path, cell, posing in cases:
-        page = visit(path, **SIZE)
+    for page, cell, posing in cases:
         still(page, 11)
         rows = np.array(page.evaluate(f"__viewer.bones({cell})")).reshape(52, 3, 4)
         count = len(posing.skeleton)

@@ -119,10 +119,17 @@ def test_saved_bytes_of_a_known_network() -> None:
     assert sizes[0] == pytest.approx(sizes[1], rel=0.1)
 
 
-def test_a_layout_that_does_not_fit_is_told_with_the_stage() -> None:
-    recipe = load_recipe("humantomato-tiny", ["data.layout=body133"])
-    with pytest.raises(UserError, match=r"stage tokenizer: layout body133 .* hand"):
-        estimate(recipe)
-    recipe = load_recipe("bvh-body", ["data.layout=body133", "tma.net.finger_gain=4"])
-    with pytest.raises(UserError, match=r"stage tma: finger_gain .*body133"):
-        estimate(recipe)
+@pytest.mark.parametrize(
+    ("recipe", "sets", "stage", "says"),
+    [
+        ("humantomato-tiny", ["data.layout=body133"], "tokenizer", "layout body133 .* hand"),
+        ("bvh-body", ["data.layout=body133", "tma.net.finger_gain=4"], "tma", "finger_gain .*body133"),
+        ("ude-tiny", ["utt.max_frames=800"], "utt", "block_size 48 holds 47 .* max_frames to 188"),
+        ("humantomato-tiny", ["gpt.net.block_size=4"], "gpt", "block_size 4 .* take 6"),
+    ],
+)
+def test_what_does_not_fit_is_told_with_the_stage(
+    recipe: str, sets: list[str], stage: str, says: str
+) -> None:
+    with pytest.raises(UserError, match=f"stage {stage}: .*{says}"):
+        estimate(load_recipe(recipe, sets), {stage})
