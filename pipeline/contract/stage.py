@@ -40,7 +40,7 @@ from motionloom.pipeline.contract.inputs import filled_by as filled_by
 from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
 from motionloom.pipeline.contract.units import WORK, Units
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.store.checksums import require_unchanged
+from motionloom.pipeline.store.artifact import require_unchanged
 
 CPU = torch.device("cpu")
 

@@ -14,8 +14,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.requests import require_used
-from motionloom.pipeline.store.artifact import Artifact, InputStage
-from motionloom.pipeline.store.checksums import require_unchanged
+from motionloom.pipeline.store.artifact import Artifact, InputStage, require_unchanged
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 from motionloom.pipeline.store.weights import LayoutFacts, halve_weights

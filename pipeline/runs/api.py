@@ -32,8 +32,7 @@ from motionloom.pipeline.runs.dry_run import (
 from motionloom.pipeline.runs.execute import context_of, execute, perform
 from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
-from motionloom.pipeline.store.artifact import require_consistent
-from motionloom.pipeline.store.checksums import require_unchanged
+from motionloom.pipeline.store.artifact import require_consistent, require_unchanged
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import owner_of, require_own, require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, run_state

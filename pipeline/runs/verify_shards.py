@@ -20,7 +20,7 @@ from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.hardware import usable_cores
 from motionloom.pipeline.launch.process import JointError
 from motionloom.pipeline.launch.team import Team
-from motionloom.pipeline.store.checksums import NOTE, Compared, ComparedFile, State
+from motionloom.pipeline.store.artifact import NOTE, Compared, ComparedFile, State
 from motionloom.pipeline.store.data import local_shards
 
 _THREADS = 4

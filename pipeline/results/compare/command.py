@@ -19,12 +19,14 @@ from motionloom.pipeline.render.page import Cell, Page, Value
 from motionloom.pipeline.results.compare.runs import (
     ABSENT,
     ComparedRun,
+    ComparedTable,
+    RunRow,
     StageDifferences,
+    compared_tables,
     open_runs,
     setting_differences,
     stage_names,
 )
-from motionloom.pipeline.results.compare.tables import ComparedTable, RunRow, compared_tables
 from motionloom.pipeline.store.files import require_file_place
 from motionloom.pipeline.store.yaml import setting_text
 

@@ -16,8 +16,7 @@ from motionloom.pipeline.evaluation import clip_metrics
 from motionloom.pipeline.evaluation.clip_metrics import ClipMetric, Performance, clip_figures, measure_clip
 from motionloom.pipeline.evaluation.estimate import RESAMPLES, estimate, row_estimates, weighted
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, Figure, FigureFile, Metric, figure_tables
-from motionloom.pipeline.results.compare.runs import open_runs
-from motionloom.pipeline.results.compare.tables import compared_tables
+from motionloom.pipeline.results.compare.runs import compared_tables, open_runs
 from motionloom.pipeline.results.paper.compare import compare_with_paper
 
 TRIALS = 1500

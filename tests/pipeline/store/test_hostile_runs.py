@@ -19,7 +19,7 @@ from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import FunctionStage, StageCache, StageConfig, StageContext
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe
 from motionloom.pipeline.runs.plan import Selection
-from motionloom.pipeline.store.checksums import require_unchanged
+from motionloom.pipeline.store.artifact import require_unchanged
 from motionloom.pipeline.store.files import open_own, write_json
 from motionloom.pipeline.store.weights import load_weights
 

@@ -18,8 +18,13 @@ from run_records import write_compared as write_run
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.evaluation.figures import STILL
 from motionloom.pipeline.results.compare.command import compare_runs, missing_lines
-from motionloom.pipeline.results.compare.runs import ABSENT, open_runs, setting_differences
-from motionloom.pipeline.results.compare.tables import ComparedTable, compared_tables
+from motionloom.pipeline.results.compare.runs import (
+    ABSENT,
+    ComparedTable,
+    compared_tables,
+    open_runs,
+    setting_differences,
+)
 
 QUIET = Console(quiet=True)
 NASTY = "<img src=x onerror='window.hacked=1'>"

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from motionloom.pipeline.evaluation.figures import FigureFile
-from motionloom.pipeline.results.compare.runs import open_runs, setting_differences
-from motionloom.pipeline.results.compare.tables import compared_tables
+from motionloom.pipeline.results.compare.runs import compared_tables, open_runs, setting_differences
 
 pytestmark = pytest.mark.slow
 
