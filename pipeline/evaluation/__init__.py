@@ -1,1 +1,1 @@
-"""Figures of a run, each beside its trivial answer."""
+"""Figures of a run, each beside reference baselines that need no model."""

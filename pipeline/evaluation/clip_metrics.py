@@ -1,6 +1,6 @@
 """Metrics of single motions: a metric is a function of one `Performance`, and a line in a list here.
 
-Each is taken of what was generated and of every answer that needs no model, and is a mean over clips. A
+Each is measured of generated motion and of every reference baseline, and is a mean over clips. A
 function returns values by the names of its columns, and leaves out what a motion does not show; a value may
 have a weight (`weighted`), such as its number of frames.
 """

@@ -35,7 +35,7 @@ Fact = str | int | float | bool | None
 Protocol = Mapping[str, Fact]
 
 MODEL = ""
-"""The row of what is evaluated; all other rows are answers that need no model, and are never ranked."""
+"""The row of what is evaluated; all other rows are reference baselines, and are never ranked."""
 RECORDED = "recorded motion"
 THROUGH = "recorded motion, through the tokenizer"
 """The best that a generator of its tokens can be."""

@@ -131,7 +131,7 @@ class Search:
     def clip(self, clip_id: str) -> Vectors:
         """The embedding [Z] of a clip of the set, by its id."""
         if clip_id not in self.ids:
-            raise UserError(f"no clip '{clip_id}' in this data set; its ids are in the answers of a search")
+            raise UserError(f"no clip '{clip_id}' in this data set; a search prints its ids")
         return np.asarray(self.vectors[self.ids.index(clip_id)])
 
     def motion(self, joints: NDArray[np.floating], fps: float) -> Vectors:

@@ -174,7 +174,7 @@ class RunRow:
     run: ComparedRun
     figures: Row
     best: Mapping[str, bool]
-    """Columns in which no run measured alike is better: whether the intervals leave no doubt of it."""
+    """Columns in which no run measured alike is better: whether the intervals are apart."""
     protocol: int
     """Runs of one number were measured alike."""
 
@@ -285,7 +285,7 @@ def _winner(figures: Mapping[str, Figure]) -> tuple[str, bool] | None:
 
 
 def _references(rows: Mapping[str, Mapping[str, Row]]) -> list[ReferenceRow]:
-    """One row for each answer without a model; where runs have other values of it, one for each value."""
+    """One row for each reference baseline; where runs have other values of it, one for each value."""
     out = []
     for title in dict.fromkeys(title for own in rows.values() for title in own if title != MODEL):
         values: list[tuple[Row, list[str]]] = []

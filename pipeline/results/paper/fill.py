@@ -22,7 +22,7 @@ from motionloom.pipeline.store.run_state import StageRecord
 
 _MISSING, _NO_MODEL = "missing in these runs", "missing: no model of ours"
 
-_ANSWERS = tuple(row for row in ROWS if row != MODEL)
+_BASELINES = tuple(row for row in ROWS if row != MODEL)
 
 
 def fill(name: str, table: PaperTable, runs: Sequence[Path] = ()) -> FilledTable:
@@ -48,11 +48,11 @@ class _Filling:
         """Evaluations whose models stand in the table."""
         self.shown: dict[tuple[Path, str], list[tuple[Column, Figure]]] = {}
         self.settings: dict[str, None] = {}
-        self.doubts: dict[str, dict[str, None]] = defaultdict(dict)
+        self.remarks: dict[str, dict[str, None]] = defaultdict(dict)
         self.seen: set[tuple[object, ...]] = set()
 
     def filled(self) -> FilledTable:
-        """The paper's rows, ours below each, and the answers that need no model."""
+        """The paper's rows, ours below each, and the reference baselines."""
         # Models first: baselines are shown of those evaluations whose models stand in the table.
         models = [self._models(row) for row in self.table.rows]
         self.compared = set(self.used)
@@ -62,9 +62,9 @@ class _Filling:
             if row.recorded:
                 rows += self._references({}, (RECORDED,))
             if row.values:
-                rows += self._references(row.values, _ANSWERS)
+                rows += self._references(row.values, _BASELINES)
         if not any(row.values for row in self.table.rows):
-            rows += self._references({}, _ANSWERS)
+            rows += self._references({}, _BASELINES)
         unlike = [
             difference
             for (run, name), evaluation in self.used.items()
@@ -73,7 +73,7 @@ class _Filling:
             )
         ]
         marked = mark_best(rows, self.table.columns)
-        remarks = [*self._unlike(), *(f"{', '.join(of)}: {note}" for note, of in self.doubts.items())]
+        remarks = [*self._unlike(), *(f"{', '.join(of)}: {note}" for note, of in self.remarks.items())]
         notes = notes_of(self.table, marked, list(self.settings), remarks, with_runs=bool(self.evaluations))
         return FilledTable(self.name, self.table, marked, tuple(unlike), notes)
 
@@ -195,14 +195,14 @@ class _Filling:
         column, digits = self.table.columns[at], self.decimals[at]
         self.shown.setdefault((evaluation.run, evaluation.name), []).append((column, figure))
         if figure.note:
-            self.doubts[figure.note][f"{column.title} of {self.labels[evaluation.run]}"] = None
+            self.remarks[figure.note][f"{column.title} of {self.labels[evaluation.run]}"] = None
         mean = figure.value * column.scale
         spread = None if figure.interval is None else figure.interval * column.scale
         text = f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
         return Cell(text, mean, spread, figure.protocol_key)
 
     def _references(self, values: Mapping[str, str], titles: Iterable[str]) -> list[FilledRow]:
-        """Answers that need no model, of the evaluations whose models stand in the table, or of all where no
+        """Reference baselines of the evaluations whose models stand in the table, or of all where no
         model does; equal ones once.
         """
         out = []
@@ -238,7 +238,7 @@ class _Filling:
 def mark_best(rows: Sequence[FilledRow], columns: Sequence[Column]) -> tuple[FilledRow, ...]:
     """The rows with the best figures marked: of models of ours, two or more of them measured alike.
 
-    The paper's rows, recorded motion and other answers that need no model are never ranked. Equal figures
+    The paper's rows, recorded motion and other reference baselines are never ranked. Equal figures
     are marked together; the figure as it is printed decides.
     """
     best: dict[int, set[int]] = defaultdict(set)

@@ -24,7 +24,7 @@ from motionloom.pipeline.store.run_state import StageRecord
 T = TypeVar("T")
 
 Source = Literal["paper", "ours", "missing", "reference"]
-"""The paper's row; a model of ours; no model of ours; an answer that needs none."""
+"""The paper's row; a model of ours; no model of ours; a reference baseline."""
 
 _WHO = {"paper": "paper", "ours": "ours", "missing": "ours", "reference": "no model"}
 _PAPERS = {"humantomato": "HumanTOMATO", "ude": "UDE"}
@@ -47,11 +47,11 @@ class Cell:
 
 @dataclass(frozen=True)
 class FilledRow:
-    """A row of the paper, of a model of ours, or of an answer that needs none."""
+    """A row of the paper, of a model of ours, or of a reference baseline."""
 
     source: Source
     method: str
-    """The paper's row that it belongs to; empty of an answer that belongs to all."""
+    """The paper's row that it belongs to; empty for a baseline that belongs to all."""
     label: str
     """The paper's method, the stage of a run, or a reference baseline."""
     cells: tuple[Cell | None, ...]

@@ -1,4 +1,4 @@
-"""Evaluation: reconstruction, retrieval, generation on the test split, each beside its trivial answer."""
+"""Evaluation: reconstruction, retrieval, generation on the test split, each beside reference baselines."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class _Evaluation(EvaluationUnits):
         self.cases: list[Case] = []
 
     def measured(self) -> FigureFile:
-        """All figures, each beside its trivial answers; `cases.safetensors` is written beside them."""
+        """All figures, each beside its reference baselines; `cases.safetensors` is written beside them."""
         context, split = self.context, self.dataset.split
         figures = self.reconstruction()
         if not self.truths and not figures:
@@ -201,14 +201,14 @@ class _Evaluation(EvaluationUnits):
         """Figures of single motions, beside recorded motion, as many training clips and the mean pose."""
         fps = self.dataset.layout.fps
         clips = {RECORDED: self.truths, **self._nearest_captions}
-        answers = {row: [(t.joints, t.face) for t in found] for row, found in clips.items()}
-        answers[STILL] = [(joints, None) for joints in self._still]
+        baselines = {row: [(t.joints, t.face) for t in found] for row, found in clips.items()}
+        baselines[STILL] = [(joints, None) for joints in self._still]
         if len(self.others) >= len(self.truths):
-            answers[TRAINING] = [(t.joints, None) for t in self.others[: len(self.truths)]]
+            baselines[TRAINING] = [(t.joints, None) for t in self.others[: len(self.truths)]]
         rows = {MODEL: [self._rows(some) for some in self._repeats(made)]}
         if self.shown is self.truths:
             rows[THROUGH] = [self._rows(list(self.context.units.read("reconstructed", len(self.slices))))]
-        for row, motions in answers.items():
+        for row, motions in baselines.items():
             performances = [
                 Performance(joints, t.joints, fps, face, t.truth)
                 for (joints, face), t in zip(motions, self.truths, strict=True)

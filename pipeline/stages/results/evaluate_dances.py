@@ -1,4 +1,4 @@
-"""Evaluation of dances: motion generated from held-out music, beside the ground truth and trivial answers."""
+"""Evaluation of dances: motion generated from held-out music, beside recorded dances and baselines."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class EvaluateDancesConfig(StageConfig):
     shuffles: int = Field(5, ge=1)
     """Other songs that each dance is compared with, for the beats of shuffled music."""
     pool: int = Field(400, ge=2)
-    """Training dances that the trivial answers choose from, at most."""
+    """Training dances that the reference baselines choose from, at most."""
     feature_fps: float = Field(60.0, gt=0)
     """Frame rate that motions are resampled to for FID, Diversity and MultiModality; published: 60."""
     sampling: SamplingConfig = SamplingConfig()
@@ -163,9 +163,9 @@ class _DanceEvaluation(Evaluation):
         }
 
     def measured(self) -> FigureFile:
-        """All figures, each beside its trivial answers."""
+        """All figures, each beside its reference baselines."""
         clips = self.clips
-        motions = {MODEL: self.generated()} | self.answers()
+        motions = {MODEL: self.generated()} | self.baselines()
         rows = {row: [self.each(one) for one in repeats] for row, repeats in motions.items()}
         apart = other_songs(clips, self.config.shuffles, self.context.seed)
         if any(apart):
@@ -182,7 +182,7 @@ class _DanceEvaluation(Evaluation):
         figures += movement_figures(self.reference(SOUND), real, features, self.protocol)
         return FigureFile("evaluate_dances", tuple(figures), self.about(self.bundle))
 
-    def answers(self) -> dict[str, list[list[Joints]]]:
+    def baselines(self) -> dict[str, list[list[Joints]]]:
         """Dances that need no model, once or several times."""
         clips, pool = self.clips, self._dances(self.train, self.config.pool, unit=1)
         real = [clip.joints for clip in clips]
