@@ -37,17 +37,18 @@ def main() -> None:
     args = arguments(parser)
     model = model_folder(args.model)
     card = noted(model)
-    config = synthetic_data(load_recipe(card["recipe"], card.get("settings", []), strict=False))
+    configs = synthetic_data(load_recipe(card["recipe"], card.get("settings", []), strict=False))
     captions: dict[tuple[str, str], set[str]] = {
         (split, kind): set() for split in ("train", "val", "test") for kind in KINDS
     }
     actions: set[str] = set()
-    for index in range(config.clips):
-        split = split_of(index, config)
-        for kind, texts in zip(KINDS, captions_of(index, config), strict=True):
-            captions[split, kind].update(texts)
-        if split == "train":
-            actions.update(actions_of(truth_of(index, config).record(hands=True, face=True)))
+    for config in configs:
+        for index in range(config.clips):
+            split = split_of(index, config)
+            for kind, texts in zip(KINDS, captions_of(index, config), strict=True):
+                captions[split, kind].update(texts)
+            if split == "train":
+                actions.update(actions_of(truth_of(index, config).record(hands=True, face=True)))
     encoder, folder = load_text_encoder("minilm"), model / "text"
     texts, arrays = json.loads((folder / KNOWN_FILES[0]).read_text()), load_file(folder / KNOWN_FILES[1])
     known = {}
@@ -58,15 +59,13 @@ def main() -> None:
         vectors = np.concatenate([encoder.encode(block).sentence for block in blocks])
         embeddings = arrays[kind].astype(np.float32)
         known[kind] = KnownCaptions(tuple(kept), embeddings, distances_to(embeddings, vectors))
-        # Songs may have been drawn otherwise when the model was trained.
-        print(f"{kind}: {len(set(kept) - captions['train', kind])} of {len(kept)} are not of the recipe now")
-        captions["train", kind].update(kept)
+        assert captions["train", kind].issuperset(kept), f"{model}: captions that its recipe does not make"
     words = {*texts["words"], *word_counts(captions["train", "body"] | captions["train", "face"])}
     save_known(folder, known["body"], known["face"], tuple(words), tuple(actions))
     artifact = Artifact.find(folder)
     assert artifact is not None
     artifact.model_copy(update={"version": stage_kind("text", "here").version}).finish(folder)
-    print(f"{folder}: {len(words)} words, {len(actions)} actions, {config.clips} clips")
+    print(f"{folder}: {len(words)} words, {len(actions)} actions")
 
 
 if __name__ == "__main__":

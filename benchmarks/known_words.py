@@ -88,7 +88,7 @@ def main() -> None:
 def others(bundle, model, captions, motions, right: Flags, alarms: int) -> dict[str, Flags]:
     """Return the flags of the probe and of distances, at their best limits with at most so many alarms."""
     card = noted(model)
-    config = synthetic_data(load_recipe(card["recipe"], card.get("settings", []), strict=False))
+    config = synthetic_data(load_recipe(card["recipe"], card.get("settings", []), strict=False))[0]
     train = [index for index in range(config.clips) if split_of(index, config) == "train"]
     chosen = {
         captions_of(index, config)[0][0]: actions_of(truth_of(index, config).record(hands=True, face=True))

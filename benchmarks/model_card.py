@@ -116,19 +116,23 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
 
 
-def synthetic_data(recipe: Recipe) -> SynthConfig:
-    """The settings of a recipe's synthetic data."""
-    stage = next((stage for stage in recipe.stages if stage.kind.name == "synth"), None)
-    if stage is None:
+def synthetic_data(recipe: Recipe) -> list[SynthConfig]:
+    """Return the settings of a recipe's stages of synthetic clips."""
+    out = []
+    for stage in recipe.stages:
+        if stage.kind.name == "synth":
+            given = stage.config.dump()
+            seed = recipe.seed_of(stage) if given["seed"] is None else given["seed"]
+            out.append(SynthConfig.parse({**given, "seed": seed}, recipe.name))
+    if not out:
         raise UserError(f"{recipe.name}: has no stage of synthetic clips to be measured on")
-    seed = recipe.seed_of(stage) if stage.config.seed is None else stage.config.seed  # type: ignore[attr-defined]
-    return SynthConfig.parse({**stage.config.dump(), "seed": seed}, recipe.name)
+    return out
 
 
 def test_clips(recipe: Recipe, most: int) -> tuple[list[Truth], SynthConfig]:
     """Test clips of a recipe's synthetic data in a fixed order, at most so many, as its shards hold them; and
     the data's settings."""
-    config = synthetic_data(recipe)
+    config = synthetic_data(recipe)[0]
     numbers = [index for index in range(config.clips) if split_of(index, config) == "test"]
     chosen = [numbers[k] for k in np.random.default_rng(0).permutation(len(numbers))[:most]]
     return [truth_from(make_sample(index, config), config) for index in chosen], config
