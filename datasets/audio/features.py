@@ -99,10 +99,10 @@ def audio_features(
     octaves = _octaves(settings)
     librosa = load_librosa()
     with _no_remarks():
-        found = separate(samples, settings.rate)
-        mfcc = librosa.feature.mfcc(S=librosa.power_to_db(found.mel, ref=np.max), n_mfcc=_MFCC)
-        notes = _constant_q(found.harmonic, settings.rate, octaves)
-        onsets = onset_strength(found.percussive_mel)
+        spectra = separate(samples, settings.rate)
+        mfcc = librosa.feature.mfcc(S=librosa.power_to_db(spectra.mel, ref=np.max), n_mfcc=_MFCC)
+        notes = _constant_q(spectra.harmonic, settings.rate, octaves)
+        onsets = onset_strength(spectra.percussive_mel)
         columns = [
             mfcc,
             librosa.feature.delta(mfcc, width=3),
@@ -163,7 +163,7 @@ def _octaves(settings: AudioSettings) -> int:
 
 def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArray[np.float32]:
     """Magnitudes [36 x octaves, T] from C1 up; frames of nothing but rounding are 0."""
-    found = load_librosa().cqt(
+    spectrum = load_librosa().cqt(
         samples,
         sr=rate,
         hop_length=HOP,
@@ -171,7 +171,7 @@ def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArra
         bins_per_octave=_BINS,
         tuning=tuning(samples, rate, _BINS),
     )
-    magnitude = np.abs(found)
+    magnitude = np.abs(spectrum)
     loudest = magnitude.max(axis=0)
     magnitude[:, loudest < _SILENCE * loudest.max()] = 0
     return np.asarray(magnitude)
@@ -204,10 +204,10 @@ def track_beats(
     mean = sum(block.sum(axis=1, keepdims=True) for block in _tempograms(onsets, width)) / len(onsets)
     tempo = librosa.feature.tempo(tg=mean, sr=rate, hop_length=HOP, start_bpm=start_bpm)
     with np.errstate(divide="ignore"):  # at 5 frames a second a beat can be a frame, and 0 a step it refuses
-        _, found = librosa.beat.beat_track(
+        _, frames = librosa.beat.beat_track(
             onset_envelope=onsets, sr=rate, hop_length=HOP, bpm=tempo, tightness=tightness
         )
-    return np.asarray(found)
+    return np.asarray(frames)
 
 
 def _flags(frames: NDArray[np.int64], count: int) -> NDArray[np.float32]:

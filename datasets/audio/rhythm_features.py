@@ -65,8 +65,8 @@ def beats_of_rows(rows: NDArray[np.floating], fps: float) -> NDArray[np.float64]
     phase = np.round(turns, 6) % 1.0
     step = np.diff(phase) % 1.0
     passes = np.flatnonzero(phase[:-1] + step >= 1.0 - 1e-9)
-    found = (passes + (1.0 - phase[passes]) / step[passes]) / fps
-    return np.concatenate([[0.0], found]) if phase[0] == 0.0 else found
+    seconds = (passes + (1.0 - phase[passes]) / step[passes]) / fps
+    return np.concatenate([[0.0], seconds]) if phase[0] == 0.0 else seconds
 
 
 def _phases(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:

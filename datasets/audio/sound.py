@@ -70,10 +70,10 @@ class Excerpt:
     @classmethod
     def named(cls, name: Path | str) -> Excerpt:
         """Parse a name; `UserError`, naming it, for times that are none."""
-        whole, found = Path(name), _PART.fullmatch(str(name))
-        if found is None or whole.exists():
+        whole, match = Path(name), _PART.fullmatch(str(name))
+        if match is None or whole.exists():
             return cls(whole)
-        file, start, dash, end = found.group("file", "start", "dash", "end")
+        file, start, dash, end = match.group("file", "start", "dash", "end")
         if not dash or not (start or end):
             raise UserError(f"{name}: no such file; a part of {file} is written {Path(file).name}@0:30-1:00")
         first, last = _seconds(start or "0", name), None if not end else _seconds(end, name)
@@ -94,9 +94,9 @@ class Excerpt:
 
 
 def _seconds(time: str, name: Path | str) -> float:
-    found = _TIME.fullmatch(time)
-    hours, minutes, seconds = (float(part or 0) for part in found.groups()) if found else (0.0, 0.0, 60.0)
-    if found is None or (":" in time and seconds >= 60) or (hours and minutes >= 60):
+    match = _TIME.fullmatch(time)
+    hours, minutes, seconds = (float(part or 0) for part in match.groups()) if match else (0.0, 0.0, 60.0)
+    if match is None or (":" in time and seconds >= 60) or (hours and minutes >= 60):
         raise UserError(f"{name}: {time} is no time; write seconds or m:ss, as song.mp3@0:30-1:00")
     return 3600 * hours + 60 * minutes + seconds
 
@@ -134,8 +134,8 @@ class Sound:
         or another one; `UserError` as of `read_sound`, and where the file is shorter.
         """
         part = Excerpt.named(path)
-        samples, found = read_sound(part.path, rate=rate)
-        sound = cls(np.clip(samples, -1.0, 1.0), found)
+        samples, own_rate = read_sound(part.path, rate=rate)
+        sound = cls(np.clip(samples, -1.0, 1.0), own_rate)
         return sound if part.whole else sound.slice(*part.within(sound.seconds, path))
 
     @property
@@ -176,16 +176,16 @@ def read_sound(
     path in errors.
     """
     name = str(path) if name is None else name
-    wanted, found = _length(path, name)
+    wanted, own_rate = _length(path, name)
     with _opened(path, name) as file:
         blocks = _mono(file, name, wanted)
-        rate = rate or min(found, MAX_RATE)
-        if rate == found:
-            made = list(blocks)
+        rate = rate or min(own_rate, MAX_RATE)
+        if rate == own_rate:
+            resampled = list(blocks)
         else:
-            wanted = resampled_length(wanted, found, rate)
-            made = list(_resampled(blocks, found, rate))
-    samples = np.concatenate(made)
+            wanted = resampled_length(wanted, own_rate, rate)
+            resampled = list(_resampled(blocks, own_rate, rate))
+    samples = np.concatenate(resampled)
     missing = wanted - len(samples)
     if missing > _LAST_BLOCK * rate:
         raise UserError(f"{name}: cut short: {len(samples)} samples of {wanted}")
@@ -211,10 +211,10 @@ def resample_sound(samples: NDArray[np.float32], rate_in: int, rate_out: int) ->
     length = resampled_length(len(samples), rate_in, rate_out)
     if rate_in == rate_out:
         return samples
-    made = soxr.resample(np.asarray(samples, dtype=np.float32), rate_in, rate_out, quality="HQ")
+    resampled = soxr.resample(np.asarray(samples, dtype=np.float32), rate_in, rate_out, quality="HQ")
     out = np.zeros(length, dtype=np.float32)
-    kept = min(len(out), len(made))
-    out[:kept] = made[:kept]
+    kept = min(len(out), len(resampled))
+    out[:kept] = resampled[:kept]
     return out
 
 

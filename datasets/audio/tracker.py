@@ -113,8 +113,8 @@ def beat_rows(activation: NDArray[np.float32]) -> NDArray[np.int64]:
         rows.append(row - periods[-1])
         now = came[row, now]
         row -= int(periods[now])
-    found = np.array(rows[::-1], dtype=np.int64)
-    return found[found < len(activation)]
+    beats = np.array(rows[::-1], dtype=np.int64)
+    return beats[beats < len(activation)]
 
 
 def bar_places(downbeats: NDArray[np.float32]) -> tuple[NDArray[np.int64], int]:

@@ -63,9 +63,9 @@ def sentence_of(error: BaseException) -> str | None:
     if isinstance(error, OSError) and _NUMPY_SHORT.search(text):
         return _named(error, f"could not be written to its end, most likely {_WORDS[errno.ENOSPC]}")
     if isinstance(error, RuntimeError) and any(name in text for name in _TORCH):
-        found = next((words for cause in _causes(error) if (words := sentence_of(cause))), None)
+        cause_words = next((words for cause in _causes(error) if (words := sentence_of(cause))), None)
         what = text.strip().splitlines()[0]
-        return found or f"torch could not read or write a file ({what}); is the disk full? {_AGAIN}"
+        return cause_words or f"torch could not read or write a file ({what}); is the disk full? {_AGAIN}"
     return None
 
 

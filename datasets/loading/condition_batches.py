@@ -122,8 +122,8 @@ class ConditionedClips:
             frames = int(self.dataset.frames[clip])
             choices = [CaptionSpan("", 0, frames)]
             if text:
-                found = self.dataset.face_texts(clip) if self.face else self.dataset.texts(clip)
-                choices = caption_spans(found, self.dataset.layout.fps, frames, self.min_frames)
+                captions = self.dataset.face_texts(clip) if self.face else self.dataset.texts(clip)
+                choices = caption_spans(captions, self.dataset.layout.fps, frames, self.min_frames)
             out.append(choices[int(draw * len(choices))])
         return out
 
@@ -154,8 +154,8 @@ class ConditionedClips:
             rows = Rows(clips, present[:, column], cut.begin, cut.length, frames, captions)
             batch["conditions"][name] = MODALITIES[name].batch(reader, self.dataset, rows)
         if self.captioned:
-            found = cast(TextCache, self.readers["text"]).similarity(captions)
-            batch["similarity"] = torch.from_numpy(found)
+            similarity = cast(TextCache, self.readers["text"]).similarity(captions)
+            batch["similarity"] = torch.from_numpy(similarity)
         return batch
 
 

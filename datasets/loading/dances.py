@@ -70,8 +70,8 @@ class BeatBatches(Dataset[BeatBatch]):
         batch = self.batches[k]
         features, mask, _ = batch["conditions"]["audio"]
         beats = torch.zeros_like(mask)
-        for row, heard in enumerate(mask):
-            rows = features[row][heard].numpy() * self.stats.std + self.stats.mean
+        for row, valid in enumerate(mask):
+            rows = features[row][valid].numpy() * self.stats.std + self.stats.mean
             times = MODALITIES["audio"].ticks(None, rows, self.fps) if len(rows) else []
             frames = np.round(np.array(times) * self.fps).astype(int)
             beats[row, frames[frames < len(rows)]] = True

@@ -49,22 +49,22 @@ def all_kinds(names: Sequence[str]) -> list[Kind]:
     return [*some, frozenset()]
 
 
-def _normal(given: dict[str, float]) -> dict[str, float]:
+def _normal(weights: dict[str, float]) -> dict[str, float]:
     """Keys as `key_of` writes them, in the order of `all_kinds`."""
-    found = {kind_of(key): value for key, value in given.items()}
-    return {key_of(kind): found[kind] for kind in all_kinds(list(MODALITIES)) if kind in found}
+    by_kind = {kind_of(key): value for key, value in weights.items()}
+    return {key_of(kind): by_kind[kind] for kind in all_kinds(list(MODALITIES)) if kind in by_kind}
 
 
-def _weights(given: dict[str, float]) -> dict[str, float]:
-    if not any(given.values()):
+def _weights(weights: dict[str, float]) -> dict[str, float]:
+    if not any(weights.values()):
         raise ValueError("at least one kind of clips, such as text or text+audio, needs a weight above 0")
-    return _normal(given)
+    return _normal(weights)
 
 
-def _rates(given: dict[str, float]) -> dict[str, float]:
-    if sum(given.values()) > 1:
+def _rates(rates: dict[str, float]) -> dict[str, float]:
+    if sum(rates.values()) > 1:
         raise ValueError("the rates together are above 1: a row never loses everything")
-    return _normal(given)
+    return _normal(rates)
 
 
 Balance = Annotated[dict[str, Annotated[float, Field(ge=0)]], AfterValidator(_weights)]

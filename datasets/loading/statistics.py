@@ -95,7 +95,7 @@ class FeatureStats:
     @staticmethod
     def of_arrays(mean: Path, std: Path, layout: MotionLayout) -> FeatureStats:
         """Read a release's `.npy` files [D] of a layout's columns; `UserError` where a file is not that."""
-        found = []
+        arrays = []
         for path in (mean, std):
             try:
                 values = np.load(path, allow_pickle=False)
@@ -106,12 +106,12 @@ class FeatureStats:
                     f"{path}: {values.dtype} {list(values.shape)} is not the {layout.dim} finite numbers of "
                     f"layout {layout.name}; take the statistics of this layout"
                 )
-            found.append(np.asarray(values, dtype=np.float32))
-        if not (found[1] > 0).all():
+            arrays.append(np.asarray(values, dtype=np.float32))
+        if not (arrays[1] > 0).all():
             raise UserError(
                 f"{std}: holds deviations that are not above 0; exchange `mean` and `std`, perhaps"
             )
-        return FeatureStats(found[0], found[1], layout)
+        return FeatureStats(arrays[0], arrays[1], layout)
 
     def _like(self, values: Values, columns: Columns | None) -> tuple[Values, Values]:
         """Mean and std of the columns, as numpy or torch."""
@@ -195,8 +195,8 @@ def _pooled(dataset: ClipDataset, moments_of: Callable[[ClipDataset], Iterator[M
     pooled: Moments | None = None
     for part, weight in parts:
         own: Moments | None = None
-        for found in moments_of(part):
-            own = found if own is None else own.merge(found)
+        for moments in moments_of(part):
+            own = moments if own is None else own.merge(moments)
         if own is not None:
             if len(parts) > 1:
                 own = own.counted(weight / total * len(dataset) / len(part))
@@ -233,9 +233,9 @@ def frame_statistics(dataset: ClipDataset, modality: Modality, progress: bool = 
     widths: set[int] = set()
 
     def moments_of(part: ClipDataset) -> Iterator[Moments]:
-        heard = np.flatnonzero(part.has(member)).tolist()
-        clips = in_order(part, member, clips=heard)
-        for i in track(clips, f"{modality.name} statistics", total=len(heard), disable=not progress):
+        present = np.flatnonzero(part.has(member)).tolist()
+        clips = in_order(part, member, clips=present)
+        for i in track(clips, f"{modality.name} statistics", total=len(present), disable=not progress):
             rows = part.array(i, member)
             if rows is None:
                 continue

@@ -20,7 +20,7 @@ class AudioModality(FrameModality):
     members = ("audio.npy", "audio.flac")
     width = 438
 
-    def features(self, given: object, fps: float, prepared: object = None) -> NDArray[np.float32]:
+    def features(self, value: object, fps: float, prepared: object = None) -> NDArray[np.float32]:
         """Analyse a `Sound`, by all of the piece that it is a slice of; arrays are taken as they are.
 
         The columns are those that the model was trained on: as many as the statistics `prepared` have.
@@ -28,18 +28,18 @@ class AudioModality(FrameModality):
         from motionloom.datasets.audio.align_features import features_of
         from motionloom.datasets.audio.sound import Sound
 
-        if not isinstance(given, Sound):
-            return super().features(given, fps)
+        if not isinstance(value, Sound):
+            return super().features(value, fps)
         if not isinstance(prepared, FrameStats):
-            return features_of(given, fps, self.width)
-        return features_of(given, fps, prepared.dim, prepared.rate)
+            return features_of(value, fps, self.width)
+        return features_of(value, fps, prepared.dim, prepared.rate)
 
-    def seconds(self, given: object) -> float | None:
+    def seconds(self, value: object) -> float | None:
         from motionloom.datasets.audio.sound import Sound
 
-        return given.seconds if isinstance(given, Sound) else None
+        return value.seconds if isinstance(value, Sound) else None
 
-    def ticks(self, given: object, features: NDArray[np.float32], fps: float) -> list[float]:
+    def ticks(self, value: object, features: NDArray[np.float32], fps: float) -> list[float]:
         from motionloom.datasets.audio.features import BEAT
 
         if features.shape[1] == self.width:

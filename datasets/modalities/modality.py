@@ -151,7 +151,7 @@ class Modality(ABC):
         """The condition of a training batch: [B, L, E], empty in rows that lack the modality."""
 
     @abstractmethod
-    def encode(self, prepared: object, given: Sequence[object | None], fps: float) -> Condition:
+    def encode(self, prepared: object, values: Sequence[object | None], fps: float) -> Condition:
         """The condition of what people give, one entry a row, None without; not normalised yet."""
 
     def normalise(self, prepared: object, condition: Condition) -> Condition:
@@ -162,11 +162,11 @@ class Modality(ABC):
     def example(self, batch: int, frames: int, width: int) -> Condition:
         """A condition of the largest usual size, to measure memory with."""
 
-    def seconds(self, given: object) -> float | None:
+    def seconds(self, value: object) -> float | None:
         """Length of what a person gives; None where it has none."""
         return None
 
-    def ticks(self, given: object, features: NDArray[np.float32], fps: float) -> list[float]:
+    def ticks(self, value: object, features: NDArray[np.float32], fps: float) -> list[float]:
         """Seconds of moments worth marking on a time line, such as beats, of encoded features [L, E]."""
         return []
 
@@ -185,29 +185,29 @@ class FrameModality(Modality):
         features = np.zeros((len(rows.clips), rows.frames, reader.dim), dtype=np.float32)
         mask = (np.arange(rows.frames)[None] < rows.length[:, None]) & rows.present[:, None]
         for row in np.flatnonzero(rows.present).tolist():
-            found = self._stored(dataset, int(rows.clips[row]), reader.dim)
+            stored = self._stored(dataset, int(rows.clips[row]), reader.dim)
             first, count = int(rows.begin[row]), int(rows.length[row])
-            features[row, :count] = reader.normalize(found[first : first + count])
+            features[row, :count] = reader.normalize(stored[first : first + count])
         return Condition(torch.from_numpy(features), torch.from_numpy(mask))
 
     def _stored(self, dataset: Clips, clip: int, width: int) -> NDArray[np.float32]:
         """A clip's features [T, E], which must be one row a frame."""
-        found, frames = dataset.array(clip, self.members[0]), int(dataset.frames[clip])
-        if found is None or found.shape != (frames, width):
-            shape = "none" if found is None else str(list(found.shape))
+        features, frames = dataset.array(clip, self.members[0]), int(dataset.frames[clip])
+        if features is None or features.shape != (frames, width):
+            shape = "none" if features is None else str(list(features.shape))
             raise UserError(
                 f"{dataset.where}: clip {dataset.ids[clip]} has {self.name} features {shape} for {frames} "
                 f"frames of motion, expected [{frames}, {width}]; convert it with one row a motion frame "
                 f"({self.name}_fps equal to fps)"
             )
-        return found
+        return features
 
-    def encode(self, prepared: object, given: Sequence[object | None], fps: float) -> Condition:
+    def encode(self, prepared: object, values: Sequence[object | None], fps: float) -> Condition:
         import torch
 
         from motionloom.datasets.conditions import Condition
 
-        found = [None if value is None else self.features(value, fps, prepared) for value in given]
+        found = [None if value is None else self.features(value, fps, prepared) for value in values]
         width = next(row.shape[1] for row in found if row is not None)
         longest = max(len(row) for row in found if row is not None)
         features = torch.zeros(len(found), longest, width)
@@ -220,11 +220,11 @@ class FrameModality(Modality):
                 )
         return Condition(features, mask)
 
-    def features(self, given: object, fps: float, prepared: object = None) -> NDArray[np.float32]:
+    def features(self, value: object, fps: float, prepared: object = None) -> NDArray[np.float32]:
         """Features [T, E] of what a person gives, a row for each frame; an array is taken as it is."""
-        if not isinstance(given, np.ndarray) or given.ndim != 2:
+        if not isinstance(value, np.ndarray) or value.ndim != 2:
             raise UserError(f"{self.name}: give its features, an array [frames, {self.width}]")
-        return np.asarray(given, np.float32)
+        return np.asarray(value, np.float32)
 
     def normalise(self, prepared: object, condition: Condition) -> Condition:
         """Return the condition normalised by the statistics; zero where the mask is false."""

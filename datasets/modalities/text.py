@@ -44,33 +44,33 @@ class TextModality(Modality):
         from motionloom.datasets.conditions import Condition
 
         cache, count = cast("TextCache", reader), len(rows.captions)
-        there = np.flatnonzero(rows.present)
-        chosen = [rows.captions[row] for row in there.tolist()]
+        with_text = np.flatnonzero(rows.present)
+        chosen = [rows.captions[row] for row in with_text.tolist()]
         tokens, known = cache.tokens(chosen)
         # A batch without any text keeps one position, so that attention has something to mask.
         places = max(1, tokens.shape[1])
         features = np.zeros((count, places, cache.dim), dtype=np.float32)
         mask = np.zeros((count, places), dtype=np.bool_)
         pooled = np.zeros((count, cache.dim), dtype=np.float32)
-        if len(there):
-            features[there], mask[there], pooled[there] = tokens, known, cache.sentence(chosen)
+        if len(with_text):
+            features[with_text], mask[with_text], pooled[with_text] = tokens, known, cache.sentence(chosen)
         return Condition(torch.from_numpy(features), torch.from_numpy(mask), torch.from_numpy(pooled))
 
-    def encode(self, prepared: object, given: Sequence[object | None], fps: float) -> Condition:
+    def encode(self, prepared: object, values: Sequence[object | None], fps: float) -> Condition:
         import torch
 
         from motionloom.datasets.conditions import Condition
 
         if prepared is None:
             raise UserError("this model has no text encoder; leave the text out")
-        words = ["" if text is None else str(text) for text in given]
+        words = ["" if text is None else str(text) for text in values]
         encoded = cast(_Prepared, prepared).encoder.encode(words)
         features, mask = torch.as_tensor(encoded.tokens), torch.as_tensor(encoded.mask)
         pooled = torch.as_tensor(encoded.sentence)
-        there = torch.tensor([bool(text.strip()) for text in words])
-        if not there.all():
-            mask = mask & there[:, None]
-            features, pooled = features * mask[..., None], pooled * there[:, None]
+        has_text = torch.tensor([bool(text.strip()) for text in words])
+        if not has_text.all():
+            mask = mask & has_text[:, None]
+            features, pooled = features * mask[..., None], pooled * has_text[:, None]
         return Condition(features, mask, pooled)
 
     def example(self, batch: int, frames: int, width: int) -> Condition:

@@ -35,8 +35,8 @@ _OF: dict[FigurePart, tuple[str, ...]] = {"all": PIECES, "upper": _UPPER, "hands
 def pieces_of(parts: Iterable[FigurePart], but: Iterable[FigurePart] = ()) -> NDArray[np.bool_]:
     """Return the `PIECES` of some parts, bool [7], without those of `but`."""
     without = {piece for part in but for piece in _OF.get(part, (part,))}
-    found = {piece for part in parts for piece in _OF.get(part, (part,))} - without
-    return np.array([piece in found for piece in PIECES])
+    pieces = {piece for part in parts for piece in _OF.get(part, (part,))} - without
+    return np.array([piece in pieces for piece in PIECES])
 
 
 @lru_cache(maxsize=8)
@@ -70,8 +70,8 @@ def piece_columns(layout: MotionLayout) -> NDArray[np.int64]:
 @lru_cache(maxsize=8)
 def step_columns(layout: MotionLayout) -> NDArray[np.bool_]:
     """Return which columns hold a step to the next frame, bool [D]."""
-    found = np.zeros(layout.dim, dtype=np.bool_)
+    steps = np.zeros(layout.dim, dtype=np.bool_)
     for field in ("root_yaw_velocity", "root_xz_velocity", "velocities", "foot_contacts"):
         if layout.has(field):
-            found[layout.slice(field)] = True
-    return found
+            steps[layout.slice(field)] = True
+    return steps

@@ -71,7 +71,7 @@ def _falls(joints: Floats, fps: float) -> list[float]:
     feet = np.concatenate([joints[:, _ANKLES, 1] - _ANKLE_METRES, joints[:, _BALLS, 1]], axis=1).min(axis=1)
     feet = feet - np.percentile(feet, 5)
     height = joints[:, : len(_WEIGHTS), 1] @ _WEIGHTS
-    found = []
+    accelerations = []
     for first, end in _runs(feet > 0.04):
         seconds = (end - first) / fps
         if first == 0 or end == len(feet) or end - first < 5 or not 0.08 < seconds < 1.3:
@@ -81,21 +81,21 @@ def _falls(joints: Floats, fps: float) -> list[float]:
         times = np.arange(end - first) / fps
         curve = np.polyfit(times, height[first:end], 2)
         if np.abs(height[first:end] - np.polyval(curve, times)).max() < 0.03:
-            found.append(-2 * float(curve[0]))
-    return found
+            accelerations.append(-2 * float(curve[0]))
+    return accelerations
 
 
 def _swings(joints: Floats, fps: float) -> list[float]:
     """Return the seconds of every swing of a leg through a step."""
-    found = []
+    seconds = []
     for ankle in _ANKLES:
         path = joints[:, ankle][:, [0, 2]]
         speed = np.linalg.norm(np.diff(path, axis=0), axis=-1) * fps
         for first, end in _runs(speed > 0.25 * np.percentile(speed, 99)) if len(speed) else ():
             stride = float(np.linalg.norm(path[end] - path[first]))
             if first > 0 and end < len(speed) and _STRIDE_METRES[0] < stride < _STRIDE_METRES[1]:
-                found.append((end - first) / fps)
-    return found
+                seconds.append((end - first) / fps)
+    return seconds
 
 
 def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

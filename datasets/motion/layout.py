@@ -182,9 +182,9 @@ class MotionLayout:
         return self.has("face") if part == "face" else len(self.part(part)) > 0
 
 
-def require_layout(found: MotionLayout, wanted: MotionLayout, where: str) -> None:
+def require_layout(actual: MotionLayout, wanted: MotionLayout, where: str) -> None:
     """`UserError` naming both when data does not have the layout, family and frame rate a config expects."""
-    have = (found.name, found.family, found.fps)
+    have = (actual.name, actual.family, actual.fps)
     want = (wanted.name, wanted.family, wanted.fps)
     if have != want:
         raise UserError(

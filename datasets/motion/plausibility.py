@@ -207,13 +207,13 @@ class PlausibilityStats:
             return []
         height, up, floor, above, forward, toes = self._columns()
         small, tall = PERSON_METRES
-        found: list[Oddity] = []
+        out: list[Oddity] = []
 
         def count(kind: Kind, odd: NDArray[np.bool_], text: str, of: int | None = None) -> None:
             number, total = int(odd.sum()), of or len(self)
             if number > ODD * total:
                 share = f"{number} of {total} clips ({number / total:.0%})"
-                found.append(Oddity(kind, number, total, f"{share} {text}"))
+                out.append(Oddity(kind, number, total, f"{share} {text}"))
 
         # Written so that NaN counts as odd: a comparison with NaN is false.
         count(
@@ -255,4 +255,4 @@ class PlausibilityStats:
             )
         if self.walking >= _LEAST_WALKS and self.backwards > MOST * self.walking:
             count("backwards", forward < _BACKWARDS, "in which somebody walks go backwards", self.walking)
-        return sorted(found, key=lambda oddity: not oddity.is_error)
+        return sorted(out, key=lambda oddity: not oddity.is_error)

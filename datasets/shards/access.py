@@ -43,29 +43,29 @@ class MappedShards:
 
     def member(self, shard: int, clip: int, column: int) -> tuple[Buffer, int]:
         """(buffer, its byte where the member starts). Views keep a map that is let go alive."""
-        found = self.maps.get(shard)
-        if found is None:
-            found = self._map(shard)
+        mapped = self.maps.get(shard)
+        if mapped is None:
+            mapped = self._map(shard)
         else:
             self.maps.move_to_end(shard)
-        return found, int(self._offsets[clip, column])
+        return mapped, int(self._offsets[clip, column])
 
     def _map(self, shard: int) -> mmap.mmap:
         info = self._shards[shard]
         where = self._store.where(info.name)
         with self._store.open_shard(info) as file:
             try:
-                found = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+                mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
             except (OSError, ValueError) as error:
                 raise UserError(f"{where}: cannot be read ({error})") from None
-        if len(found) != info.bytes:
+        if len(mapped) != info.bytes:
             raise UserError(
-                f"{where}: {len(found)} bytes, the manifest says {info.bytes}: truncated while in use"
+                f"{where}: {len(mapped)} bytes, the manifest says {info.bytes}: truncated while in use"
             )
-        self.maps[shard] = found
+        self.maps[shard] = mapped
         while len(self.maps) > self._most:
             self.maps.popitem(last=False)
-        return found
+        return mapped
 
 
 GROUPS_HELD = 2
@@ -159,12 +159,12 @@ def _compare(where: str, sample: dict, key: str, index: SplitIndex, rows: range,
     """Key, members and sizes of one sample are those of its row of the index."""
     if place >= len(rows):
         raise UserError(f"{where}: more samples than the {len(rows)} of the index: {_ADVICE}")
-    found = {name: len(value) for name, value in sample.items() if not name.startswith("__")}
+    members = {name: len(value) for name, value in sample.items() if not name.startswith("__")}
     sizes = index.sizes[rows[place]].tolist()
     wanted = {name: size for name, size in zip(MEMBERS, sizes, strict=True) if size}
-    if sample["__key__"] != key or found != wanted:
+    if sample["__key__"] != key or members != wanted:
         raise UserError(
-            f"{where}: sample {place} is '{sample['__key__']}' with {found}, "
+            f"{where}: sample {place} is '{sample['__key__']}' with {members}, "
             f"the index says '{key}' with {wanted}: {_ADVICE}"
         )
 

@@ -71,14 +71,14 @@ class FileCache:
                 f"{self.folder}: a file of {size} bytes is larger than the cache's limit of {self.limit}; "
                 f"raise its gigabytes"
             )
-        found = self.find(name)
-        if found is not None:
-            return found
+        cached = self.find(name)
+        if cached is not None:
+            return cached
         path = self.folder / name
         with self._lock(name):
-            found = self.find(name)
-            if found is not None:
-                return found
+            cached = self.find(name)
+            if cached is not None:
+                return cached
             self._make_room(size)
             part = path.with_name(f".{name}{_PART}")
             try:

@@ -35,10 +35,10 @@ def state_of(path: Path) -> list[int]:
     last write, as rsync does, is seen, and so are files of two machines that lie under one path.
     """
     try:
-        found = path.stat()
+        status = path.stat()
     except OSError:
         return []
-    return [found.st_size, found.st_mtime_ns, found.st_ctime_ns, found.st_ino]
+    return [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
 
 
 def require_intact(shard: LocalShard, *, content: bool = True) -> None:
@@ -56,10 +56,10 @@ def require_intact(shard: LocalShard, *, content: bool = True) -> None:
         return
     try:
         with path.open("rb") as file:
-            found = hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
+            digest = hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); {_ADVICE}") from None
-    if found != info.sha256:
+    if digest != info.sha256:
         raise UserError(f"{path}: the sha256 is not the manifest's: damaged; {_ADVICE}")
 
 
@@ -78,10 +78,10 @@ def problems(
             return str(error)
         return None
 
-    found = []
+    faults = []
     with ThreadPoolExecutor(max(1, threads)) as pool:
-        for said in pool.map(problem, shards):
-            if said is not None:
-                found.append(said)
+        for fault in pool.map(problem, shards):
+            if fault is not None:
+                faults.append(fault)
             done()
-    return found
+    return faults

@@ -57,8 +57,8 @@ def open_store(place: Path | str, cache: CacheConfig | None = None) -> Store:
 
 
 def _scheme(place: str) -> str | None:
-    found = re.match(r"([A-Za-z][A-Za-z0-9+.-]*):", place)
-    return found.group(1).lower() if found else None
+    match = re.match(r"([A-Za-z][A-Za-z0-9+.-]*):", place)
+    return match.group(1).lower() if match else None
 
 
 class LocalStore:
@@ -116,10 +116,10 @@ class RemoteStore:
 
     def read_manifest(self, digest: str | None = None) -> bytes:
         if digest is not None:
-            found = self.cache.find(f"{digest}.manifest.json")
-            if found is not None:
-                with found:
-                    return found.read()
+            cached = self.cache.find(f"{digest}.manifest.json")
+            if cached is not None:
+                with cached:
+                    return cached.read()
         where = self.where(MANIFEST_FILE)
         raw = _as_before(persist(where, lambda: self._system().cat_file(where), first=True), digest, where)
         name = f"{hashlib.sha256(raw).hexdigest()}.manifest.json"

@@ -170,18 +170,18 @@ def _index_of(tar: Path) -> tuple[set[str], dict[str, list[ClipEntry]]]:
 @lru_cache(maxsize=8)
 def _read_index(tar: Path, changed: int) -> tuple[set[str], dict[str, list[ClipEntry]]]:
     """`changed` tells the shards apart that lay at this place."""
-    index, found = ShardIndex.load_json(index_path(tar)), dict[str, list[ClipEntry]]()
+    index, clips_by_origin = ShardIndex.load_json(index_path(tar)), dict[str, list[ClipEntry]]()
     for clip in index.clips:
-        found.setdefault(clip.made_from, []).append(clip)
-    return index.kinds, found
+        clips_by_origin.setdefault(clip.made_from, []).append(clip)
+    return index.kinds, clips_by_origin
 
 
 def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -> Encoded | Dropped:
     """The samples of one item, or why there are none."""
     label = item.name
     try:
-        made = convert(item.item)
-        samples = made if isinstance(made, list) else [made]
+        output = convert(item.item)
+        samples = output if isinstance(output, list) else [output]
         return [
             (
                 sample.meta.id,

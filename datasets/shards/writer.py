@@ -160,11 +160,11 @@ class DatasetWriter(Generic[T]):
         """One line on the shards that an earlier run has finished; empty when there are none."""
         if self._news:
             return self._news
-        made = len(self._tasks) - len(self._todo)
-        if not made:
+        finished = len(self._tasks) - len(self._todo)
+        if not finished:
             return ""
         clips = sum(shard.samples for result in self._results if result and (shard := result[0]) is not None)
-        state = f"{made:,} of {len(self._tasks):,} shards ({clips:,} clips)"
+        state = f"{finished:,} of {len(self._tasks):,} shards ({clips:,} clips)"
         if self._todo:
             return f"{self.out}: goes on after {state} of an earlier run"
         whole = self._how.part is None and (self.out / MANIFEST_FILE).exists()
@@ -252,13 +252,13 @@ def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dic
     """Never write over another dataset, or over a finished one that was made with other options."""
     try:
         manifest = json.loads((out / MANIFEST_FILE).read_bytes())
-        found, before = manifest.get("name"), dict(manifest.get("options") or {})
+        name_before, before = manifest.get("name"), dict(manifest.get("options") or {})
     except FileNotFoundError:
         return
     except (ValueError, AttributeError, TypeError):
         raise UserError(f"{out / MANIFEST_FILE}: not a manifest; choose another folder") from None
-    if found != name:
-        raise UserError(f"{out} holds dataset '{found}', not '{name}'; choose another folder")
+    if name_before != name:
+        raise UserError(f"{out} holds dataset '{name_before}', not '{name}'; choose another folder")
     before |= {"layout": manifest.get("layout"), "fps": manifest.get("fps")}
     now = {**json.loads(json.dumps(options)), "layout": layout.name, "fps": layout.fps}
     changed = [

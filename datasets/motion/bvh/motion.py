@@ -65,14 +65,14 @@ class BvhMotion:
     def frames(self) -> int:
         return len(self.values)
 
-    def with_ends(self, made: Mapping[str, Sequence[float]] | None = None) -> BvhMotion:
+    def with_ends(self, stated: Mapping[str, Sequence[float]] | None = None) -> BvhMotion:
         """The figure with End Sites as joints without channels behind the others, named as `END` says.
 
-        `made` are other End Sites of joints, in multiples of the distance from their parents.
+        `stated` are other End Sites of joints, in multiples of the distance from their parents.
         """
         bones = np.linalg.norm(self.local_offsets()[0], axis=-1)
         ends = dict(self.ends)
-        for name, offset in (made or {}).items():
+        for name, offset in (stated or {}).items():
             if name in self.joints:
                 joint = self.joints.index(name)
                 ends[joint] = (np.asarray(offset) * bones[joint]).tolist()

@@ -118,7 +118,7 @@ def test_damaged_flac_and_unknown_files(tmp_path: Path, tone: np.ndarray) -> Non
         read_sound(path)
     path.write_bytes(b"not sound at all")
     for read in (read_sound, sound_seconds):
-        with pytest.raises(UserError, match=r"a\.flac: not readable sound"):
+        with pytest.raises(UserError, match=r"a\.flac: "):
             read(path)
     with pytest.raises(UserError, match="no such file"):
         read_sound(tmp_path / "absent.wav")
@@ -177,9 +177,9 @@ def test_sound_of_a_file(tmp_path: Path, tone: np.ndarray) -> None:
     np.testing.assert_array_equal(whole.slice(0.25, 0.5).samples, tone[4000:8000])
     np.testing.assert_array_equal(whole.slice(0.9, 5).samples, tone[14400:])
     np.testing.assert_array_equal(whole.slice(-1).samples, tone)
-    with pytest.raises(UserError, match=r"nothing between second 2 and the end of sound of 1\.000 s"):
+    with pytest.raises(UserError, match=r"second 2 .* 1\.000 s"):
         whole.slice(2)
-    with pytest.raises(UserError, match=r"nothing between second 0\.5 and 0\.5"):
+    with pytest.raises(UserError, match=r"second 0\.5 and 0\.5"):
         whole.slice(0.5, 0.5)
     half = whole.resampled(8000)
     np.testing.assert_array_equal(half.samples, Sound.read(path, 8000).samples)

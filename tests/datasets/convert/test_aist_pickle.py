@@ -61,12 +61,12 @@ def test_big_endian_and_old_numpy_names(tmp_path: Path) -> None:
         ({"smpl_poses": np.zeros((5, 24, 3), np.float32)}, r"smpl_poses is \[5, 24, 3\], not \[T, 72\]"),
         ({"smpl_poses": np.zeros((0, 72), np.float32)}, "smpl_poses is"),
         ({"smpl_trans": np.full((5, 3), np.nan)}, "smpl_trans: nan at frame 0, column 0"),
-        ({"smpl_trans": np.full((5, 3), 1e9)}, "smpl_trans: absurd value .*; at most 1000 is"),
-        ({"smpl_poses": np.full((5, 72), 1e6)}, "smpl_poses: absurd value .*; at most 100 is"),
+        ({"smpl_trans": np.full((5, 3), 1e9)}, "smpl_trans: .*1000"),
+        ({"smpl_poses": np.full((5, 72), 1e6)}, "smpl_poses: .*100"),
         ({"smpl_scaling": np.array([np.inf])}, "smpl_scaling is inf"),
         ({"smpl_scaling": np.array([-93.0])}, "smpl_scaling is -93"),
         ({"smpl_scaling": np.array([1.0, 2.0])}, "2 values"),
-        ({"smpl_scaling": "93"}, "not an array of numbers"),
+        ({"smpl_scaling": "93"}, "smpl_scaling"),
         ({"smpl_trans": np.array([["a"] * 3] * 5)}, "array type"),
         ({"smpl_trans": np.empty((5, 3), object)}, "array type"),
         ({"smpl_trans": np.zeros((5, 3), complex)}, "array type"),
@@ -114,8 +114,8 @@ def test_no_other_global_is_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     ("stream", "reason"),
     [
         (b"\x80\x02}r\xff\xff\xff\xff.", "memo place 4294967295"),  # LONG_BINPUT: room for 2**32 entries
-        (b"\x80\x04\x8d" + struct.pack("<Q", 2**62) + b"x.", "cut short or damaged"),
-        (b"\x80\x05\x96" + struct.pack("<Q", 2**40) + b"x.", "cut short or damaged"),
+        (b"\x80\x04\x8d" + struct.pack("<Q", 2**62) + b"x.", "damaged"),
+        (b"\x80\x05\x96" + struct.pack("<Q", 2**40) + b"x.", "damaged"),
         (b"\x80\x02" + b"N" * 2000 + b".", "more than 1000"),
         (b"cnumpy\ndtype\n.", "dict"),
         (b"(I1\nI2\nd.", "dict"),
@@ -157,7 +157,7 @@ def test_shapes_beyond_their_data(tmp_path: Path, frames: bytes) -> None:
     raw, shape = path.read_bytes(), b"K\x05K\x03\x86"
     assert raw.count(shape) == 1
     path.write_bytes(raw.replace(shape, frames + b"K\x03\x86"))
-    with pytest.raises(UserError, match="smpl_trans is not an array of numbers"):
+    with pytest.raises(UserError, match="smpl_trans"):
         read_aist_motion(path)
 
 
@@ -182,10 +182,10 @@ def test_any_cut_or_flipped_byte_is_an_error_or_other_numbers(tmp_path: Path) ->
 
 
 def test_other_things_than_annotations(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="no such file"):
+    with pytest.raises(UserError, match=r"absent\.pkl"):
         read_aist_motion(tmp_path / "absent.pkl")
     path = saved(tmp_path, [1, 2])
-    with pytest.raises(UserError, match="holds a list, not a dict of named"):
+    with pytest.raises(UserError, match="list"):
         read_aist_motion(path)
     path.write_bytes(b"")
     with pytest.raises(UserError, match="0 bytes"):

@@ -150,7 +150,7 @@ def test_face_batches_take_face_captions_and_columns(
         batch = batches[k]
         assert set(batch["caption"]) == {"happy"} and set(batch["index"].tolist()) <= with_face
         assert batch["motion"].shape[2] == 10
-    with pytest.raises(UserError, match="layout body133 has no field 'face'"):
+    with pytest.raises(UserError, match="'face'"):
         caption_batches(train, stats, text, about="face", batch_size=8, max_frames=40, min_frames=8)
 
 
@@ -234,9 +234,9 @@ def test_caption_stretches_in_frames() -> None:
 
 
 def test_mistakes_are_named(train: ShardDataset, stats: FeatureStats, text: TextCache) -> None:
-    with pytest.raises(UserError, match="no multiple of windows_per_clip 3"):
+    with pytest.raises(UserError, match="windows_per_clip 3"):
         WindowBatches(train, stats, window=16, batch_size=8, windows_per_clip=3)
-    with pytest.raises(UserError, match="does not divide over 3 ranks"):
+    with pytest.raises(UserError, match="3 ranks"):
         WindowBatches(train, stats, window=16, batch_size=8, world=3)
     with pytest.raises(UserError, match="lower min_frames"):
         caption_batches(train, stats, text, batch_size=8, max_frames=2000, min_frames=1000)

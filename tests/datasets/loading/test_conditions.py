@@ -243,9 +243,9 @@ def test_mistakes_are_named(
     words = written(tmp_path / "words", count=12, every=0)
     with pytest.raises(UserError, match=r"no clip .* audio features"):
         frame_statistics(words, AUDIO)
-    with pytest.raises(UserError, match=r"balance.audio is 1, but no usable clip"):
+    with pytest.raises(UserError, match=r"balance.audio"):
         ConditionBatches(words, stats, readers, batch_size=4, max_frames=16, balance={"audio": 1})
-    with pytest.raises(UserError, match="does not divide over 3 ranks"):
+    with pytest.raises(UserError, match="3 ranks"):
         ConditionBatches(data, stats, readers, batch_size=4, max_frames=16, world=3)
     for wrong in (
         {"balance": {}},

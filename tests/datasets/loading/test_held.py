@@ -75,7 +75,7 @@ def test_check_finds_an_index_that_disagrees(made: ModuleType, tmp_path: Path) -
     index = json.loads(path.read_bytes())
     index["clips"][2]["held"] ^= HANDS
     path.write_text(json.dumps(index))
-    assert any("has_hands or has_face is not what the index says" in str(p) for p in check(root))
+    assert any("has_hands or has_face" in str(p) for p in check(root))
 
 
 def slow_statistics(dataset: ClipDataset) -> tuple[np.ndarray, np.ndarray]:
@@ -111,9 +111,9 @@ def test_a_part_that_no_clip_holds_has_mean_zero_and_std_one(made: ModuleType, t
     for stats in (compute(dataset), group):
         assert (stats.mean[face] == 0).all() and (stats.std[face] == 1).all()
         assert (stats.std[: face[0]] > STD_FLOOR).all() and (stats.std[: face[0]] != 1).all()
-    with pytest.raises(UserError, match="no clip of split 'train' holds hands or a face"):
+    with pytest.raises(UserError, match="split 'train'"):
         WindowBatches(dataset, group, window=8, batch_size=4)
-    with pytest.raises(UserError, match="no clip of split 'train' has 1 frames and the body parts"):
+    with pytest.raises(UserError, match="split 'train' has 1 frames"):
         EvalBatches(dataset, group, batch_size=4, max_frames=16, columns=face)
     WindowBatches(dataset, group, window=8, batch_size=4, columns=dataset.layout.part("bodyhand"))
 

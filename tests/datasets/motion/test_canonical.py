@@ -140,9 +140,9 @@ def test_resampling_takes_input_frames_where_they_fall_on_output_frames() -> Non
     np.testing.assert_array_equal(resample(joints, 30, 30), joints)
     np.testing.assert_array_equal(resample(joints[:1], 30, 20), joints[:1])
     assert resample(joints, 30, 20).dtype == np.float32
-    with pytest.raises(UserError, match="frame rates must be positive"):
+    with pytest.raises(UserError, match="not 0 and 20"):
         resample(joints, 0, 20)
-    with pytest.raises(UserError, match="without frames"):
+    with pytest.raises(UserError, match="frames"):
         resample(joints[:0], 30, 20)
 
 

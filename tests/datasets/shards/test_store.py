@@ -61,14 +61,14 @@ def test_other_schemes_are_refused_before_anything_opens(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "fsspec", None)
-    with pytest.raises(UserError, match=r"file:, http:, https:, s3: and folders, not from"):
+    with pytest.raises(UserError, match=r"file:, http:, https:, s3:"):
         ShardDataset.open(place, "train")
     assert not list(tmp_path.iterdir())
 
 
 def test_urls_that_carry_more_than_a_place_are_refused() -> None:
     for place in ("https://me:secret@host/data", "s3://key:secret@bucket/data"):
-        with pytest.raises(UserError, match="credentials belong in the environment") as raised:
+        with pytest.raises(UserError, match="credentials") as raised:
             open_store(place)
         assert "secret" not in str(raised.value)
     for place in ("https://host/data?token=1", "https://host/data#x", "s3://bucket/../other", "s3:///data"):
@@ -135,9 +135,9 @@ def test_what_will_not_pass_is_said_at_once(
 
     with loopback.web(root, answer=refuse) as (url, seen):
         for status, said in (
-            (401, "refuses access; set the credentials in the environment"),
-            (403, "refuses access; set the credentials in the environment"),
-            (404, r"no manifest\.json, so the conversion is unfinished"),
+            (401, "AWS_ACCESS_KEY_ID"),
+            (403, "AWS_ACCESS_KEY_ID"),
+            (404, r"manifest\.json"),
             (400, "HTTP 400"),
         ):
             seen.clear()
@@ -150,7 +150,7 @@ def test_what_will_not_pass_is_said_at_once(
                 ShardDataset.open(url, "train", reading=reading(tmp_path))
             assert len(seen) == retry.ATTEMPTS
     monkeypatch.setattr(retry.time, "sleep", lambda _: pytest.fail("nobody listening is no reason to wait"))
-    with pytest.raises(UserError, match=r"127\.0\.0\.1.*no server listens there"):
+    with pytest.raises(UserError, match=r"127\.0\.0\.1"):
         ShardDataset.open(url, "train", reading=reading(tmp_path))
     monkeypatch.setattr(retry, "ATTEMPTS", 1)
     with pytest.raises(UserError, match=r"manifest\.json: .*tried 1 times"):
@@ -186,7 +186,7 @@ def test_damage_on_the_server_is_named(loopback: ModuleType, root: Path, tmp_pat
     whole = shard.read_bytes()
     flipped = bytearray(whole)
     flipped[len(whole) // 2] ^= 4
-    for content, said in ((bytes(flipped), "sha256 is not the manifest's"), (whole[:-10240], "truncated")):
+    for content, said in ((bytes(flipped), "sha256"), (whole[:-10240], "truncated")):
         shard.write_bytes(content)
         with loopback.web(copy) as (url, _), pytest.raises(UserError, match=rf"val-000000\.tar: .*{said}"):
             ShardDataset.open(url, "val", reading=reading(tmp_path)).motion(0)
@@ -195,7 +195,7 @@ def test_damage_on_the_server_is_named(loopback: ModuleType, root: Path, tmp_pat
     ]
     shard.write_bytes(whole)
     (copy / "index.npz").write_bytes((copy / "index.npz").read_bytes()[:-400])
-    with loopback.web(copy) as (url, _), pytest.raises(UserError, match=r"index\.npz: not a readable index"):
+    with loopback.web(copy) as (url, _), pytest.raises(UserError, match=r"index\.npz"):
         ShardDataset.open(url, "val", reading=reading(tmp_path / "other"))
 
 
@@ -211,12 +211,12 @@ def test_a_manifest_that_changes_while_in_use_is_refused(
         sent = [pickle.dumps(ShardDataset.open(p, "val", reading=reading(tmp_path))) for p in places]
         manifest = copy / "manifest.json"
         manifest.write_text(manifest.read_text().replace('"CC0"', '"CC1"'))
-        with pytest.raises(UserError, match="changed while the data set was in use"):
+        with pytest.raises(UserError, match=r"manifest\.json"):
             pickle.loads(sent[0])
         pickle.loads(sent[1]).motion(0)  # has its own copy
         for path in (tmp_path / "cache").glob("*.manifest.json"):
             path.unlink()
-        with pytest.raises(UserError, match="changed while the data set was in use"):
+        with pytest.raises(UserError, match=r"manifest\.json"):
             pickle.loads(sent[1])
 
 
@@ -249,7 +249,7 @@ def test_the_cache_keeps_what_was_used_last(tmp_path: Path) -> None:
     assert not (tmp_path / content(2)[0]).exists() and held.read() == content(2)[1], (
         "open files stay readable"
     )
-    with pytest.raises(UserError, match="larger than the cache's limit of 3500; raise its gigabytes"):
+    with pytest.raises(UserError, match=r"3500.*gigabytes"):
         cache.get(content(9)[0], 4000, lambda path: None)
     assert not list(tmp_path.glob(".*.part"))
 
