@@ -156,30 +156,19 @@ def golden(request: pytest.FixtureRequest, shared: Path) -> tuple[dict[str, NDAr
     return arrays, MotionLayout.named(name)
 
 
-def test_every_column_equals_the_published_features(golden: tuple[dict[str, NDArray], MotionLayout]) -> None:
+def test_joints_and_columns_equal_the_published_ones(golden: tuple[dict[str, NDArray], MotionLayout]) -> None:
     arrays, layout = golden
+    joints, skeleton, offsets = arrays["joints"], layout.skeleton, arrays["tgt_offsets"]
+    np.testing.assert_allclose(retarget(joints, skeleton, offsets), arrays["uniform"], atol=5e-5)
+    np.testing.assert_allclose(uniform_joints(joints, skeleton, offsets), arrays["global"], atol=5e-5)
     want = arrays["feat263" if layout.name == "h3d263" else "feat623"]
-    ours = encode_h3d(arrays["joints"], layout, arrays["tgt_offsets"])
-    assert ours.shape == want.shape == (len(arrays["joints"]) - 1, layout.dim)
+    ours = encode_h3d(joints, layout, offsets)
+    assert ours.shape == want.shape == (len(joints) - 1, layout.dim)
     for field, _ in layout.fields:
         columns = layout.slice(field)
         np.testing.assert_allclose(
             ours[:, columns], want[:, columns], rtol=0, atol=ATOL.get(field, 5e-5), err_msg=field
         )
-
-
-def test_retargeted_and_canonical_joints(golden: tuple[dict[str, NDArray], MotionLayout]) -> None:
-    arrays, layout = golden
-    skeleton, offsets = layout.skeleton, arrays["tgt_offsets"]
-    np.testing.assert_allclose(retarget(arrays["joints"], skeleton, offsets), arrays["uniform"], atol=5e-5)
-    np.testing.assert_allclose(
-        uniform_joints(arrays["joints"], skeleton, offsets), arrays["global"], atol=5e-5
-    )
-
-
-def test_recovered_joints(golden: tuple[dict[str, NDArray], MotionLayout]) -> None:
-    arrays, layout = golden
-    want = arrays["feat263" if layout.name == "h3d263" else "feat623"]
     np.testing.assert_allclose(decode_h3d(want, layout), arrays["recovered"], atol=5e-6)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import multiprocessing
 import pickle
+import shutil
 import sys
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -41,20 +42,11 @@ def same(one: ShardDataset, other: ShardDataset) -> None:
             assert np.array_equal(a, b)
 
 
+OTHER_SCHEMES = ("gs://bucket/'x y'", "hf://datasets/x", "ssh://host/x", "python:x", "memory://x")
+
+
 @pytest.mark.parametrize(
-    "place",
-    [
-        "pipe:touch PWNED_store",
-        "pipe:touch PWNED_store|",
-        "simplecache::s3://b/c",
-        "gs://bucket/x",
-        "gs://bucket/'x y'",
-        "hf://datasets/x",
-        "ssh://host/x",
-        "python:x",
-        "PIPE:touch PWNED_store",
-        "memory://x",
-    ],
+    "place", ["pipe:touch PWNED|", "PIPE:touch PWNED", "simplecache::s3://b/c", *OTHER_SCHEMES]
 )
 def test_other_schemes_are_refused_before_anything_opens(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -177,11 +169,13 @@ def test_pauses_grow_and_leave_the_runs_random_numbers_alone(monkeypatch: pytest
         retry.persist("x", lambda: 1 // 0)
 
 
-def test_damage_on_the_server_is_named(loopback: ModuleType, root: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "data"
-    copy.mkdir()
-    for path in root.iterdir():
-        (copy / path.name).write_bytes(path.read_bytes())
+@pytest.fixture
+def copy(root: Path, tmp_path: Path) -> Path:
+    """The data set, to be changed."""
+    return Path(shutil.copytree(root, tmp_path / "data"))
+
+
+def test_damage_on_the_server_is_named(loopback: ModuleType, copy: Path, tmp_path: Path) -> None:
     shard = copy / "made-val-000000.tar"
     whole = shard.read_bytes()
     flipped = bytearray(whole)
@@ -200,12 +194,8 @@ def test_damage_on_the_server_is_named(loopback: ModuleType, root: Path, tmp_pat
 
 
 def test_a_manifest_that_changes_while_in_use_is_refused(
-    loopback: ModuleType, root: Path, tmp_path: Path
+    loopback: ModuleType, copy: Path, tmp_path: Path
 ) -> None:
-    copy = tmp_path / "data"
-    copy.mkdir()
-    for path in root.iterdir():
-        (copy / path.name).write_bytes(path.read_bytes())
     with loopback.web(copy) as (url, _):
         places = (copy, url)
         sent = [pickle.dumps(ShardDataset.open(p, "val", reading=reading(tmp_path))) for p in places]
@@ -256,15 +246,7 @@ def test_the_cache_keeps_what_was_used_last(tmp_path: Path) -> None:
 
 def test_other_files_in_its_folder_are_never_deleted(tmp_path: Path) -> None:
     """A recipe, also a stranger's, names the folder."""
-    others = [
-        "thesis.tar",
-        "photo.jpg",
-        ".hidden",
-        "film.part",
-        ".film.part",
-        "f" * 64,
-        f"{'f' * 64}.tar.part",
-    ]
+    others = ["thesis.tar", ".hidden", "film.part", ".film.part", "f" * 64, f"{'f' * 64}.tar.part"]
     for name in others:
         (tmp_path / name).write_bytes(bytes(5000))
     cache = FileCache(CacheConfig(folder=str(tmp_path), gigabytes=1.5e-6))
@@ -289,50 +271,35 @@ def refuse() -> None:
     raise UserError("refused")
 
 
-def fetch_all(url: str, folder: str, out: multiprocessing.Queue) -> None:
-    reading = Reading(cache=CacheConfig(folder=folder, gigabytes=6e-4))
-    dataset = ShardDataset.open(url, "train", reading=reading)
-    out.put(float(sum(dataset.motion(i).sum() for _ in range(2) for i in range(len(dataset)))))
+def sum_of(dataset: ShardDataset) -> float:
+    """Every motion, twice."""
+    return float(sum(dataset.motion(i).sum() for _ in range(2) for i in range(len(dataset))))
 
 
-def test_processes_share_one_small_cache(loopback: ModuleType, root: Path, tmp_path: Path) -> None:
+def read_all(url: str, cache: CacheConfig, out: multiprocessing.Queue) -> None:
+    out.put(sum_of(ShardDataset.open(url, "train", reading=Reading(cache=cache))))
+
+
+@pytest.mark.parametrize("gigabytes", [6e-4, 1.0])
+def test_processes_share_one_cache(
+    loopback: ModuleType, root: Path, tmp_path: Path, gigabytes: float
+) -> None:
+    """One that is too small for all shards, and one in which each is downloaded once."""
     local = ShardDataset.open(root, "train")
     sizes = [shard.bytes for shard in local._shards]
-    assert max(sizes) < 6e5 < sum(sizes), "the limit must force some shards out"
-    want = float(sum(local.motion(i).sum() for _ in range(2) for i in range(len(local))))
+    assert max(sizes) < 6e5 < sum(sizes), "the smaller limit must force some shards out"
     context = multiprocessing.get_context("fork")
-    with loopback.web(root) as (url, _):
-        out = context.Queue()
-        workers = [
-            context.Process(target=fetch_all, args=(url, str(tmp_path / "cache"), out)) for _ in range(3)
-        ]
-        for worker in workers:
-            worker.start()
-        assert [out.get(timeout=60) for _ in workers] == [want] * 3
-        for worker in workers:
-            worker.join()
-    left = [path for path in (tmp_path / "cache").iterdir() if path.is_file()]
-    assert not [path for path in left if path.name.startswith(".")]
-    assert sum(path.stat().st_size for path in left) <= 6e5
-
-
-def test_processes_that_want_one_file_download_it_once(
-    loopback: ModuleType, root: Path, tmp_path: Path
-) -> None:
-    context = multiprocessing.get_context("fork")
+    cache = CacheConfig(folder=str(tmp_path / "cache"), gigabytes=gigabytes)
     with loopback.web(root) as (url, seen):
         out = context.Queue()
-        big = str(tmp_path / "cache")
-        workers = [context.Process(target=fetch_shared, args=(url, big, out)) for _ in range(4)]
+        workers = [context.Process(target=read_all, args=(url, cache, out)) for _ in range(4)]
         for worker in workers:
             worker.start()
+        assert [out.get(timeout=60) for _ in workers] == [sum_of(local)] * 4
         for worker in workers:
-            out.get(timeout=60)
             worker.join()
         shards = [line for line in seen if ".tar" in line]
-        assert len(shards) == len(set(shards)) == 5
-
-
-def fetch_shared(url: str, folder: str, out: multiprocessing.Queue) -> None:
-    dataset = ShardDataset.open(url, "train", reading=Reading(cache=CacheConfig(folder=folder)))
-    out.put(float(sum(dataset.motion(i).sum() for i in range(len(dataset)))))
+    assert len(set(shards)) == 5 and (len(shards) == 5) == (gigabytes == 1.0)
+    left = [path for path in (tmp_path / "cache").iterdir() if path.is_file()]
+    assert not [path for path in left if path.name.startswith(".")]
+    assert sum(path.stat().st_size for path in left) <= gigabytes * 1e9
