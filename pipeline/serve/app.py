@@ -8,7 +8,6 @@ import sys
 import traceback
 import uuid
 from collections.abc import AsyncIterator, Callable
-from concurrent.futures import Future
 from importlib import resources
 from typing import TypeVar
 from urllib.parse import quote
@@ -17,7 +16,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp
@@ -31,8 +30,7 @@ from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
-T = TypeVar("T")
-Asked = TypeVar("Asked", MotionRequest, ChangeRequest)
+RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
 
 _BROKEN = "something broke here; the server's log says what"
 
@@ -79,21 +77,21 @@ class Site:
                 Middleware(TrustedHostMiddleware, allowed_hosts=hosts, www_redirect=False),
                 Middleware(OwnPage),
             ],
-            exception_handlers={HTTPException: refused, Exception: broken},
+            exception_handlers={**dict.fromkeys(_REFUSALS, refused), Exception: broken},
         )
 
-    async def page(self, request: Request) -> Response:
+    async def page(self, http: Request) -> Response:
         return Response(_web_file("page.html"), media_type="text/html; charset=utf-8")
 
-    async def asset(self, request: Request) -> Response:
+    async def asset(self, http: Request) -> Response:
         """A script or the style, from memory."""
-        name = request.path_params["name"]
+        name = http.path_params["name"]
         if name not in self._assets:
             raise HTTPException(404)
         kind = "text/css" if name.endswith(".css") else "text/javascript"
         return Response(self._assets[name], media_type=f"{kind}; charset=utf-8")
 
-    async def info(self, request: Request) -> Response:
+    async def info(self, http: Request) -> Response:
         bundle, limits = self.model.bundle, self.config
         longest = min(limits.max_seconds, self.model.max_seconds)
         skeleton, why = bundle.layout.skeleton, why_not(self.model)
@@ -121,33 +119,38 @@ class Site:
             }
         )
 
-    async def generate(self, request: Request) -> Response:
-        asked, sound = await self._asked(request, MotionRequest)
-        return await self._made(request, asked, lambda: make(self.model, asked, sound, self.config))
+    async def generate(self, http: Request) -> Response:
+        request, sound = await self._read_request(http, MotionRequest)
+        return await self._respond(http, request, lambda: make(self.model, request, sound, self.config))
 
-    async def edit(self, request: Request) -> Response:
+    async def edit(self, http: Request) -> Response:
         """A clip of which a part is made anew."""
-        asked, sound = await self._asked(request, ChangeRequest)
-        return await self._made(request, asked, lambda: change(self.clips, asked, sound))
+        request, sound = await self._read_request(http, ChangeRequest)
+        return await self._respond(http, request, lambda: change(self.clips, request, sound))
 
-    async def _made(
-        self, request: Request, asked: MotionRequest | ChangeRequest, call: Callable[[], Answer]
+    async def _respond(
+        self, http: Request, request: MotionRequest | ChangeRequest, call: Callable[[], Answer]
     ) -> Response:
-        answer = await self._outcome(request, self._submit(asked, call), asked)
-        headers = {"x-request": asked.request}
+        result = asyncio.wrap_future(self.worker.submit(call))
+        while not (await asyncio.wait({result}, timeout=_LOOK))[0]:
+            if await http.is_disconnected():
+                result.cancel()  # nothing is made for a client that has left before it was begun
+                raise ClientDisconnect
+        answer, headers = result.result(), {"x-request": request.request}
         if answer.file:
             headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
         return Response(answer.body, media_type=answer.kind, headers=headers)
 
-    async def stream(self, request: Request) -> Response:
-        """One motion as JSON lines, while it is made."""
-        asked, sound = await self._asked(request, MotionRequest)
+    async def stream(self, http: Request) -> Response:
+        """Return one motion as JSON lines, while it is made."""
+        # The model's thread puts lines into a queue of this loop, and None behind the last.
+        request, sound = await self._read_request(http, MotionRequest)
         loop, pieces = asyncio.get_running_loop(), asyncio.Queue[str | None]()
         gone = False
 
         def work() -> None:
             try:
-                for piece in lines(self.model, self.name, asked, sound, self.config):
+                for piece in lines(self.model, self.name, request, sound, self.config):
                     loop.call_soon_threadsafe(pieces.put_nowait, piece)
                     if gone or self.worker.stopped:
                         break
@@ -155,16 +158,17 @@ class Site:
                 words = str(error) if isinstance(error, UserError) else _BROKEN
                 if words is _BROKEN:
                     traceback.print_exception(error, file=sys.stderr)
-                said = json.dumps({"error": words, "request": asked.request}) + "\n"
-                loop.call_soon_threadsafe(pieces.put_nowait, said)
+                line = json.dumps({"error": words, "request": request.request}) + "\n"
+                loop.call_soon_threadsafe(pieces.put_nowait, line)
             finally:
                 loop.call_soon_threadsafe(pieces.put_nowait, None)
 
-        future = self._submit(asked, work)
+        future = self.worker.submit(work)
 
         async def body() -> AsyncIterator[str]:
             nonlocal gone
             try:
+                # A call that is cancelled before it begins puts no None: so the future is looked at too.
                 while not future.cancelled() and not (future.done() and pieces.empty()):
                     try:
                         piece = await asyncio.wait_for(pieces.get(), 1.0)
@@ -178,95 +182,72 @@ class Site:
                 future.cancel()
 
         return StreamingResponse(
-            body(), media_type="application/x-ndjson", headers={"x-request": asked.request}
+            body(), media_type="application/x-ndjson", headers={"x-request": request.request}
         )
 
-    async def add_sound(self, request: Request) -> Response:
+    async def add_sound(self, http: Request) -> Response:
         """Keep the sound file that the body is, under a name for later requests."""
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
         async with self._uploads:
             most = _bytes(self.config.max_sound_mb)
-            data = await read_body(request, "the sound", most, self.config.patience)
-        try:
-            name, sound = await asyncio.to_thread(self.sounds.add, data)
-        except UserError as error:
-            raise HTTPException(400, str(error)) from None
+            data = await read_body(http, "the sound", most, self.config.patience)
+        name, sound = await asyncio.to_thread(self.sounds.add, data)
         return JSONResponse({"sound": name, "seconds": round(sound.seconds, 3)})
 
-    async def add_clip(self, request: Request) -> Response:
+    async def add_clip(self, http: Request) -> Response:
         """Keep the motion file that the body is, under a name for later requests."""
         if (why := why_not(self.model)) is not None:
             raise HTTPException(400, why)
         async with self._uploads:
-            data = await read_body(request, CLIP, _bytes(self.config.max_clip_mb), self.config.patience)
-        try:
-            return JSONResponse(await asyncio.to_thread(lambda: received(*self.clips.add(data))))
-        except UserError as error:
-            raise HTTPException(400, str(error)) from None
+            data = await read_body(http, CLIP, _bytes(self.config.max_clip_mb), self.config.patience)
+        return JSONResponse(await asyncio.to_thread(lambda: received(*self.clips.add(data))))
 
-    async def _asked(self, request: Request, kind: type[Asked]) -> tuple[Asked, Sound | None]:
-        media = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    async def _read_request(self, http: Request, kind: type[RequestT]) -> tuple[RequestT, Sound | None]:
+        media = http.headers.get("content-type", "").split(";")[0].strip().lower()
         if media != "application/json":
             raise HTTPException(415, "send JSON with Content-Type: application/json")
         most = round(self.config.max_request_kb * 1024)
-        data = await read_body(request, "the request", most, self.config.patience)
+        data = await read_body(http, "the request", most, self.config.patience)
         try:
-            given = json.loads(data)
-            json.dumps(given, ensure_ascii=False).encode()
+            fields = json.loads(data)
+            json.dumps(fields, ensure_ascii=False).encode()  # half of a letter cannot be answered later
         except UnicodeEncodeError:
             raise HTTPException(400, "the request holds half of a letter (a lone surrogate)") from None
         except (ValueError, RecursionError):
             raise HTTPException(400, "the request is not JSON") from None
-        if not isinstance(given, dict):
+        if not isinstance(fields, dict):
             raise HTTPException(400, 'the request is not a JSON object like {"caption": "a person waves"}')
-        try:
-            asked = kind.parse(given, "request")
-            asked.require_within(self.config, self.model)
-            sound = None if asked.sound is None else self.sounds.get(asked.sound)
-            if isinstance(asked, ChangeRequest) and isinstance(asked.clip, str):
-                self.clips.get(asked.clip)
-        except UserError as error:
-            name = given.get("request")
-            raise HTTPException(400, str(error), {"x-request": _plain(name)} if name else None) from None
-        return asked.model_copy(update={"request": _plain(asked.request) or uuid.uuid4().hex}), sound
-
-    def _submit(self, asked: MotionRequest | ChangeRequest, call: Callable[[], T]) -> Future[T]:
-        named = {"x-request": asked.request}
-        try:
-            return self.worker.submit(call)
-        except Busy:
-            said = f"{self.config.waiting} requests are waiting already; try again in a moment"
-            raise HTTPException(429, said, {"retry-after": "2", **named}) from None
-        except Stopped:
-            raise HTTPException(503, "the server is stopping", named) from None
-
-    async def _outcome(self, request: Request, future: Future[T], asked: MotionRequest | ChangeRequest) -> T:
-        """The result; the call is dropped where its client goes away before it is begun."""
-        result, named = asyncio.wrap_future(future), {"x-request": asked.request}
-        try:
-            while not (await asyncio.wait({result}, timeout=_LOOK))[0]:
-                if await request.is_disconnected():
-                    result.cancel()
-                    raise HTTPException(400, "the client has gone away", named)
-            return result.result()
-        except UserError as error:
-            raise HTTPException(400, str(error), named) from None
-        except Stopped:
-            raise HTTPException(503, "the server is stopping", named) from None
+        http.state.name = _plain(fields.get("request") or "")
+        request = kind.parse(fields, "request")
+        request.require_within(self.config, self.model)
+        sound = None if request.sound is None else self.sounds.get(request.sound)
+        if isinstance(request, ChangeRequest) and isinstance(request.clip, str):
+            self.clips.get(request.clip)
+        http.state.name = http.state.name or uuid.uuid4().hex
+        return request.model_copy(update={"request": http.state.name}), sound
 
 
-async def refused(request: Request, error: Exception) -> Response:
+_REFUSALS = (HTTPException, UserError, ClientDisconnect, Busy, Stopped)
+
+
+async def refused(http: Request, error: Exception) -> Response:
     """Return a refusal as JSON of one sentence, which names its request."""
-    assert isinstance(error, HTTPException)
-    words = {404: "no such page", 405: "no such method here"}.get(error.status_code, error.detail)
-    body, headers = {"error": words}, dict(error.headers or {})
-    if "x-request" in headers:
-        body["request"] = headers["x-request"]
-    return JSONResponse(body, error.status_code, headers)
+    status, words, headers = 400, str(error), dict[str, str]()
+    if isinstance(error, HTTPException):
+        status, headers = error.status_code, dict(error.headers or {})
+        words = {404: "no such page", 405: "no such method here"}.get(status, error.detail)
+    elif isinstance(error, Busy):
+        status, headers = 429, {"retry-after": "2"}
+    elif isinstance(error, Stopped):
+        status = 503
+    body = {"error": words}
+    if name := getattr(http.state, "name", ""):
+        body["request"] = headers["x-request"] = name
+    return JSONResponse(body, status, headers)
 
 
-async def broken(request: Request, error: Exception) -> Response:
+async def broken(http: Request, error: Exception) -> Response:
     """Return 500 for an error of ours, which Starlette logs."""
     return JSONResponse({"error": _BROKEN}, 500)
 

@@ -12,6 +12,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+_STOPPING = "the server is stopping"
 
 
 class Busy(Exception):  # noqa: N818 - an answer, not a fault
@@ -38,9 +39,9 @@ class Worker:
     def submit(self, call: Callable[[], T]) -> Future[T]:
         """The future of a call; `Busy` where too many wait, `Stopped` after `stop`."""
         if self.stopped:
-            raise Stopped
+            raise Stopped(_STOPPING)
         if self.length >= self.waiting:
-            raise Busy
+            raise Busy(f"{self.waiting} requests are waiting already; try again in a moment")
         future = self._pool.submit(self._begin, call)
         self._calls.append(future)
         return future
@@ -63,5 +64,5 @@ class Worker:
 
     def _begin(self, call: Callable[[], T]) -> T:
         if self.stopped:
-            raise Stopped
+            raise Stopped(_STOPPING)
         return call()
