@@ -4,6 +4,9 @@ Names hold a checksum of the content (or of the manifest that decides it), so a 
 process downloads a file while the others that want it wait; it appears by a rename, whole or not at all.
 Locks are the kernel's (`flock`), so a killed process leaves none. The file unused for longest goes first;
 whoever has it mapped keeps its content until letting go.
+
+Not fsspec's `filecache`: a file appears there under its URL's name as soon as it is downloaded, before a
+checksum can be compared; it has no limit of size; and processes that want one file each download it.
 """
 
 from __future__ import annotations
