@@ -171,6 +171,7 @@ def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArra
         bins_per_octave=_BINS,
         tuning=tuning(samples, rate, _BINS),
     )
+    # Filters leak rounding into silence, and chroma would scale it up to full notes.
     magnitude = np.abs(spectrum)
     loudest = magnitude.max(axis=0)
     magnitude[:, loudest < _SILENCE * loudest.max()] = 0

@@ -108,6 +108,7 @@ def _dynamics(
     low, high = _SPLIT
     loudness = _decibels(power.sum(axis=1))
     lowest, median, highest = np.percentile(loudness, (5, 50, 95))
+    # Everything is relative to the piece's own range, so neither gain nor compression counts.
     wide = max(highest - lowest, _SMALLEST_RANGE)
     parts = [loudness] + [_decibels(part.sum(axis=1)) for part in np.split(power, (low, high), axis=1)]
     columns = [_relative(part) for part in parts]

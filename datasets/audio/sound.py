@@ -186,6 +186,7 @@ def read_sound(
             wanted = resampled_length(wanted, own_rate, rate)
             resampled = list(_resampled(blocks, own_rate, rate))
     samples = np.concatenate(resampled)
+    # Decoders may lack the last block of a whole file; more than that is a file that was cut.
     missing = wanted - len(samples)
     if missing > _LAST_BLOCK * rate:
         raise UserError(f"{name}: cut short: {len(samples)} samples of {wanted}")
@@ -285,6 +286,7 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
             if file.format != "MP3":
                 yield file
                 return
+            # Its length is a guess unless the first frame states it: a pipe has none, so libsndfile reads on.
             with _pipe(path) as end, soundfile.SoundFile(end, closefd=False) as piped:
                 yield piped if piped.frames == _UNKNOWN else file
     except (soundfile.SoundFileError, RuntimeError, OSError) as error:

@@ -50,6 +50,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
                 shutil.copyfileobj(file, into)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
+    # In the same folder, as a rename is atomic only within one file system.
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
         yield temporary

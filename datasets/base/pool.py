@@ -53,6 +53,7 @@ class Workers:
                 for position, task in enumerate(tasks):
                     yield position, on_one_thread(work, task)
                 return
+            # Forking would copy the locks of the parent's threads as they are, some of them held for ever.
             if self._pool is None:
                 context = multiprocessing.get_context("spawn")
                 self._pool = ProcessPoolExecutor(

@@ -204,6 +204,7 @@ class ConditionBatches(Dataset[ConditionBatch]):
         turns, clips = self.plan.local(k, self.rank, self.world)
         source = self.source
         source.prefetch(clips)
+        # Each purpose draws by a counter of its own, so that a change of one leaves the others as they were.
         draws = uniform(self.seed, _DROP, turns, clips)
         present = drop_some(self.drop, source.present[clips], source.names, draws)
         spans = source.spans(clips, present, uniform(self.seed, _CAPTION, turns, clips))
@@ -247,6 +248,7 @@ class EvalBatches(Dataset[ConditionBatch]):
         if not 0 <= k < len(self):
             raise IndexError(f"evaluation batch {k} of {len(self)}")
         rows = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.clips)))
+        # Ranks must make as many calls as each other: the last batch is filled up with its last clip.
         missing = -len(rows) % self.world
         valid = np.concatenate([np.ones(len(rows), bool), np.zeros(missing, bool)])[self.rank :: self.world]
         rows = np.concatenate([rows, np.repeat(rows[-1:], missing)])[self.rank :: self.world]

@@ -114,6 +114,7 @@ class Crops:
             for source, place in self._runs:
                 np.subtract(clip[start : start + length, source], self._mean[place], out=target[:, place])
             np.multiply(target, self._scale, out=target)
+        # Whatever the file stores for parts that the clip does not hold, the batch has the mean.
         for place in self._missing[present]:
             target[:, place] = 0.0
         if length < len(out):

@@ -137,6 +137,7 @@ class KindPlan:
         self._whole: BatchPlan | None = None
         self._own: list[tuple[NDArray[np.int64], BatchPlan]] = []
         self._turns: list[Source] = []
+        # Batches of one kind: each kind has a plan of its own, and the kinds take turns by their weights.
         if homogeneous:
             for kind in used:
                 own = groups[kind]
@@ -150,6 +151,7 @@ class KindPlan:
             if balance is None:
                 sources = list(dataset.sources(clips))
             else:
+                # Kinds are the sources of one plan; within a kind data sets of a mix keep their proportions.
                 for kind in used:
                     first = sum(source.count for source in sources)
                     inner = dataset.sources(groups[kind])
@@ -170,6 +172,7 @@ class KindPlan:
         if self._whole is not None:
             turns, items = self._whole.local(k, rank, world)
             return turns, self.clips[items]
+        # Which kind batch k is of is a function of its place in the epoch alone, the same for every rank.
         epoch, position = divmod(k, self._epoch)
         place = np.concatenate([(np.arange(share) + 0.5) / share for share in self._shares])
         which = np.repeat(np.arange(len(self._shares)), self._shares)[np.argsort(place, kind="stable")]

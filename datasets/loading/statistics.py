@@ -156,6 +156,7 @@ class Moments:
     def merge(self, other: Moments) -> Moments:
         count = self.count + other.count
         rows = np.where(count > 0, count, 1.0)
+        # Chan et al. 1983: any grouping gives the same, and nothing cancels as in sums of squares.
         delta = other.mean - self.mean
         mean = self.mean + delta * (other.count / rows)
         m2 = self.m2 + other.m2 + np.square(delta) * (self.count * other.count / rows)
@@ -198,7 +199,7 @@ def _pooled(dataset: ClipDataset, moments_of: Callable[[ClipDataset], Iterator[M
         for moments in moments_of(part):
             own = moments if own is None else own.merge(moments)
         if own is not None:
-            if len(parts) > 1:
+            if len(parts) > 1:  # as often as its weight has it drawn, not as often as it has clips
                 own = own.counted(weight / total * len(dataset) / len(part))
             pooled = own if pooled is None else pooled.merge(own)
     return pooled
@@ -253,6 +254,7 @@ def frame_statistics(dataset: ClipDataset, modality: Modality, progress: bool = 
             f"{dataset.where}: no clip of split '{dataset.split}' has {modality.name} features; convert a "
             f"source with {modality.name}, or leave it out"
         )
+    # A column that never changes would be divided by rounding; it is left as it is.
     std = moments.std
     constant = std <= _CONSTANT * np.maximum(1.0, np.abs(moments.mean))
     std = np.where(constant, 1.0, std)

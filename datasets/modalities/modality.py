@@ -183,6 +183,7 @@ class FrameModality(Modality):
 
         assert isinstance(reader, FrameStats)
         features = np.zeros((len(rows.clips), rows.frames, reader.dim), dtype=np.float32)
+        # Rows without the modality stay zero and masked, so that one batch may mix all kinds of clips.
         mask = (np.arange(rows.frames)[None] < rows.length[:, None]) & rows.present[:, None]
         for row in np.flatnonzero(rows.present).tolist():
             stored = self._stored(dataset, int(rows.clips[row]), reader.dim)

@@ -104,6 +104,7 @@ class StreamedShards:
             if shard in self._held:
                 self._held.move_to_end(shard)
                 continue
+            # The oldest shard goes, but none that this batch itself still reads.
             while len(self._held) >= self._most:
                 oldest = next((held for held in self._held if held not in wanted), None)
                 if oldest is None:
@@ -130,6 +131,7 @@ def read_shard(
     number = shard.name.removesuffix(".tar").rpartition("-")[2]
     clips: list[dict[str, bytes]] = []
     with store.open_shard(shard) as file:
+        # Hashed as it is read: the sha256 is known at the end of the one pass over the file.
         stream = _Hashed(file)
         # tarfile would also unpack a compressed file; ours begin with the first key.
         if not stream.starts_with(f"{number}-000000.".encode()):

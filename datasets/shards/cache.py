@@ -78,6 +78,7 @@ class FileCache:
         if cached is not None:
             return cached
         path = self.folder / name
+        # Another process may have downloaded it while this one waited for the lock: look again.
         with self._lock(name):
             cached = self.find(name)
             if cached is not None:
@@ -104,7 +105,7 @@ class FileCache:
                 whole = entry.name.removeprefix(".").removesuffix(_PART) if part else entry.name
                 if not entry.is_file() or not _OURS.fullmatch(whole):
                     continue
-                if part:
+                if part:  # of a killed download, unless somebody holds its lock
                     with self._lock(whole, wait=False) as mine:
                         if mine:
                             (self.folder / entry.name).unlink(missing_ok=True)

@@ -141,6 +141,7 @@ class SplitIndex:
         parts: dict[str, list[NDArray]] = {name: [] for name in _ARRAYS}
         end = 0
         for shard in shards:
+            # Ids lie one after the other as bytes: an array of text takes the longest one's room for each.
             ids = [entry.id.encode() for entry in shard.clips]
             ends = end + np.cumsum([len(source) for source in ids], dtype=np.int64)
             end = int(ends[-1]) if len(ends) else end
@@ -233,6 +234,7 @@ def _index_problem(index: SplitIndex, shards: list[ShardInfo]) -> str | None:
         return "the clip ids are damaged"
     if (samples < 1).any():
         return "a shard of the manifest has no samples"
+    # Compared once for all clips, so that reading one needs no checks.
     firsts = np.cumsum(samples) - samples
     for wrong, message in (
         (_wrong_frames(index, shards, firsts), "has other frame counts than the manifest says"),

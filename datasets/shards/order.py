@@ -57,12 +57,14 @@ def mixed_order(
     """
     places, items, turns = [], [], []
     for number, (source, share) in enumerate(zip(sources, shares(sources, size), strict=True)):
+        # A source goes on where the epoch before left it: turn and place are of its own count of draws.
         drawn = np.arange(epoch * share, (epoch + 1) * share)
         turn, place = np.divmod(drawn, source.count)
         for this in range(int(turn[0]), int(turn[-1]) + 1):
             order = source_order(source, seed, this, 0, _MIX, number + 1)
             items.append(order[place[turn == this]])
         turns.append(turn)
+        # Its draws lie evenly over the epoch, so that merging by place gives every batch its share.
         places.append((np.arange(share) + 0.5) / share)
     merged = np.argsort(np.concatenate(places), kind="stable")
     return np.concatenate(items)[merged], np.concatenate(turns)[merged]

@@ -111,6 +111,7 @@ class ShardDataset:
         except MissingFileError as error:
             raise UserError(f"{error}; convert the dataset again") from None
         self.every = every
+        # The index keeps all rows, since offsets and shards count them; what is excluded is never numbered.
         self._rows = np.arange(len(self._index))
         if manifest.excluded and not every:
             kept = [self._index.id(row) not in manifest.excluded for row in self._rows.tolist()]

@@ -46,6 +46,7 @@ def scan_tar(path: Path, *, foreign: bool = False, most: int = MOST_CLIPS) -> li
         with tarfile.open(path, mode="r:") as archive:
             for info in archive:
                 archive.members = []  # type: ignore[attr-defined]  # tarfile keeps every entry
+                # Contents fill whole blocks; behind the last one nothing but zeros may follow (`_check_end`).
                 end = info.offset_data + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
                 key, member = _checked_name(path, info, foreign)
                 if not key or not member:
@@ -53,6 +54,7 @@ def scan_tar(path: Path, *, foreign: bool = False, most: int = MOST_CLIPS) -> li
                 if info.offset_data + info.size > size:
                     last = f"the last whole key is '{clips[-1].key}'" if clips else "no key is whole"
                     raise UserError(f"{path}: truncated inside '{info.name}'; {last}")
+                # A new key ends the clip before it, which must be whole; a key may not come again later.
                 if not clips or clips[-1].key != key:
                     if clips:
                         _require_whole(path, clips, foreign)

@@ -79,6 +79,7 @@ def plan_shards(
         else:
             order = sorted(range(len(members)), key=lambda i: sha256_of_json([how.seed, names[i]]))
             content = [depends_on(item) for item in members]
+        # A fingerprint hashes all that a shard's bytes depend on: a later run keeps the shards that fit.
         for number, first in enumerate(range(0, len(members), how.clips_per_shard)):
             chosen = tuple(
                 ShardItem(names[i], sha256_of_json([made_from, split, names[i], content[i]]), members[i])
@@ -103,6 +104,7 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
     made_on: set[str] = set()
     with atomic_file(task.path) as file:
         hashing = HashingFile(file)
+        # No owner and no time in the headers: the same clips are the same bytes on any machine, on any day.
         with TarWriter(hashing, encoder=False, user="", group="", mtime=0) as tar:
             for item in task.items:
                 old = task.kept.get(item.made_from)
@@ -115,6 +117,7 @@ def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:
                     tar.write({"__key__": f"{task.number:06d}-{len(written):06d}", **members})
                     written.append(Written(clip_id, present, item.name, item.made_from))
     info = None
+    # Offsets are read back from the file that lies on the disk, not from what was meant to be written.
     entries = clip_entries(task.path, written)
     if entries:
         info = ShardInfo(

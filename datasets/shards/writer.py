@@ -122,6 +122,7 @@ class DatasetWriter(Generic[T]):
     def _take_over(self, tasks: list[ShardTask[T]]) -> None:
         """Put the shards of an earlier run aside that are not as planned, and plan to keep their clips."""
         folder = self.work_folder / OLD_FOLDER
+        # Shards that do not fit the plan move aside first: their names now belong to other clips.
         finished = {task.path for task, result in zip(tasks, self._results, strict=True) if result}
         for path in sorted(_shards_in(self.out, self._facts.name, ".tar")):
             if path not in finished:
@@ -208,6 +209,7 @@ class DatasetWriter(Generic[T]):
             audit=list(facts.audit),
             excluded=Decisions.of(self.out).left_out,
         )
+        # The index is written before the manifest: whoever sees a manifest finds everything that it names.
         if self._how.part is None:
             write_left_out(self.out, manifest.dropped)
             if not shards:
