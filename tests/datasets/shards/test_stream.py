@@ -205,8 +205,8 @@ def interleaved(entries: Members) -> Members:
     ("damage", "said"),
     [
         (lambda m: tar(m[: next(i for i, e in enumerate(m) if "-000005." in e[0])]), ": 5 samples, .* 8"),
-        (lambda m: tar(m)[:20000], "000001-00000"),
-        (lambda m: tar(m)[:-10240], "000001-00000"),
+        (lambda m: tar(m)[:20000], "tar"),
+        (lambda m: tar(m)[:-10240], "000001-0000"),
         (lambda m: tar(interleaved(m)), "sample '?0"),
         (lambda m: tar([*m, m[0]]), "the 8 of"),
         (lambda m: tar([m[0], *m]), "duplicate"),
@@ -215,7 +215,7 @@ def interleaved(entries: Members) -> Members:
         (lambda m: tar(m).replace(b"walks", b"jumps"), "sha256"),
         (lambda m: tar(m, "w:gz"), "000001-000000"),
         (lambda m: b"", "000001-000000"),
-        (lambda m: b"000001-000000.x" + b"\0" * 2000, ""),
+        (lambda m: b"000001-000000.x" + b"\0" * 2000, "no sample"),
     ],
 )
 def test_every_damage_stops_the_stream(
