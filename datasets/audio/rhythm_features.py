@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.audio.beat_net import ROWS, band_from, band_power
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.audio.tracker import Beats, track_power
+from motionloom.datasets.audio.tracker import Beats, track
 from motionloom.datasets.schema import UserError
 
 COLUMNS = (
@@ -44,7 +44,7 @@ def rhythm_features(sound: Sound, fps: float, frames: int) -> NDArray[np.float32
     if frames < 1 or fps <= 0:
         raise UserError(f"features cannot be aligned with {frames} frames at {fps:g} a second")
     power = band_power(sound)
-    beats = track_power(power)
+    beats = track(sound, power)
     at = np.minimum(np.arange(frames) / fps, max(0.0, sound.seconds))
     out = np.empty((frames, RHYTHM_DIM), dtype=np.float32)
     out[:, 0:6] = _phases(beats, at)

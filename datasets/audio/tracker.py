@@ -58,25 +58,18 @@ class Beats:
 NO_BEAT = 0.15
 """Confidence below which hardly a beat is heard: white noise has 0.07 to 0.14, three real songs 0.25, 0.45
 and 0.85. No test for music: a bare drum or a quiet stretch of a song may have less, speech up to 0.25."""
-_confidences: WeakKeyDictionary[Sound, float] = WeakKeyDictionary()
+_tracked: WeakKeyDictionary[Sound, Beats] = WeakKeyDictionary()
 
 
-def beat_confidence(sound: Sound) -> float:
-    """Return `Beats.confidence` of the piece that a sound is cut from, computed once."""
-    piece = sound.piece or sound
-    if piece not in _confidences:
-        _confidences[piece] = track(piece).confidence
-    return _confidences[piece]
+def track(sound: Sound, power: NDArray[np.float32] | None = None) -> Beats:
+    """Return the beats of a whole piece, found once; none where it is shorter than two of the slowest.
 
-
-def track(sound: Sound) -> Beats:
-    """Return the beats of a whole piece; none where it is shorter than two of the slowest."""
-    return track_power(band_power(sound))
-
-
-def track_power(power: NDArray[np.float32]) -> Beats:
-    """Return the beats of a piece by the power [T, 64] of its bands."""
-    return decode(activations(load_beat_net(), levels(power)))
+    `power` [T, 64] is that of its bands, where it is known.
+    """
+    if sound not in _tracked:
+        levels_in = levels(band_power(sound) if power is None else power)
+        _tracked[sound] = decode(activations(load_beat_net(), levels_in))
+    return _tracked[sound]
 
 
 def decode(probabilities: NDArray[np.float32]) -> Beats:

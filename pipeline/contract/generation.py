@@ -79,9 +79,10 @@ class Prompt:
             return f"nothing is heard: {'the figure stands' if self.stands else 'its words drive the motion'}"
         if self.sound is None or self.sound.seconds < _JUDGED:
             return ""
-        from motionloom.datasets.audio.tracker import NO_BEAT, beat_confidence
+        from motionloom.datasets.audio.tracker import NO_BEAT, track
 
-        return "hardly a beat is heard in the sound" if beat_confidence(self.sound) < NO_BEAT else ""
+        piece = self.sound.piece or self.sound
+        return "hardly a beat is heard in the sound" if track(piece).confidence < NO_BEAT else ""
 
     def with_words(self, text: str) -> Prompt:
         return replace(self, text=text)

@@ -25,6 +25,7 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.performance import render_song
 from motionloom.datasets.synth.music.song import draw_song
+from motionloom.pipeline.contract.generation import Prompt
 
 RATE = 16_000
 
@@ -51,9 +52,12 @@ def test_beats_of_a_metronome_are_found_and_counted(genre: str, bpm: int) -> Non
 def test_noise_and_silence_have_hardly_a_beat() -> None:
     samples = np.random.default_rng(0).standard_normal(10 * RATE).astype(np.float32)
     noise, silence = Sound(np.clip(0.2 * samples, -1, 1), RATE), Sound(np.zeros_like(samples), RATE)
-    assert tracker.beat_confidence(noise) < tracker.NO_BEAT < 0.5
-    assert tracker.beat_confidence(even_song("house", 124).slice(3.0, 5.0)) > 0.5, "by the whole piece"
-    assert tracker.beat_confidence(silence) < 0.1
+    assert tracker.track(noise).confidence < tracker.NO_BEAT
+    music = even_song("house", 124)
+    assert tracker.track(silence).confidence < 0.1 and tracker.track(music).confidence > 0.5
+    assert not Prompt(sound=music.slice(3.0, 7.0)).remark and Prompt(sound=noise).remark
+    assert Prompt(sound=silence).stands and not Prompt(sound=noise).stands
+    assert Prompt("waves", sound=silence).remark and not Prompt("waves").remark
     assert not len(tracker.track(silence.slice(0.0, 1.0)).times)
     assert silence.silent and Sound(1e-4 * noise.samples, RATE).silent and not noise.silent
 
