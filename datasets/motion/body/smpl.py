@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -57,8 +58,9 @@ class BodyModel:
     """The origin of the joints, as plain JSON for the manifest."""
 
     @staticmethod
+    @cache
     def neutral(skeleton: SkeletonName) -> BodyModel:
-        """The neutral skeleton that ships with the package; every shape has its bones."""
+        """Return the neutral skeleton that ships with the package; every shape has its bones."""
         named = Skeleton.named(skeleton)
         statement = {
             "kind": "neutral skeleton",

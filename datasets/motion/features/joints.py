@@ -6,8 +6,6 @@ those of one neutral adult (`smpl.py`).
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,8 +15,6 @@ from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.features.exact import place
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import UserError
-
-_neutral = cache(BodyModel.neutral)
 
 
 def joints_of(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:
@@ -74,7 +70,7 @@ def _posed(motion: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.flo
         raise UserError(f"layout {layout.name} is posed from all of its {layout.dim} columns")
     skeleton: SkeletonName = "smpl22" if layout.has("pose") else "smplx52"
     trans = np.asarray(motion[..., layout.slice("trans")], np.float64)
-    return smpl_joints(_rotation_vectors(motion, layout), trans, _neutral(skeleton))
+    return smpl_joints(_rotation_vectors(motion, layout), trans, BodyModel.neutral(skeleton))
 
 
 def _rotation_vectors(motion: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:

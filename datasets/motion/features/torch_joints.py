@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import torch
 from torch import Tensor
 
@@ -68,9 +66,6 @@ def _from_zero(steps: Tensor) -> Tensor:
     return torch.cat([torch.zeros_like(steps[..., :1]), steps[..., :-1].cumsum(-1)], dim=-1)
 
 
-_neutral = cache(BodyModel.neutral)
-
-
 def _posed(motion: Tensor, layout: MotionLayout) -> Tensor:
     """SMPL parameters on the neutral skeleton, in their own axes."""
     import roma
@@ -86,7 +81,7 @@ def torch_smpl_joints(local: Tensor, trans: Tensor) -> Tensor:
     """Joints [..., T, 22, 3] of local rotations [..., T, 22 or more, 3, 3] and translations [..., T, 3] in
     metres: the neutral skeleton, in the source's axes.
     """
-    body = _neutral("smpl22")
+    body = BodyModel.neutral("smpl22")
     parents, rest = body.skeleton.parents, body.rest_joints()
     offsets = torch.as_tensor(body.skeleton.bones(rest)).to(local)
     world = {0: local[..., 0, :, :]}
