@@ -340,4 +340,4 @@ def test_the_command_says_where_and_who_can_reach_it(
     server.serve(tmp_path, ServeConfig(host=host, port=0), console=said)
     text = said.file.getvalue()  # type: ignore[attr-defined]
     assert f": http://{host}:" in text and text.endswith("stopped\n")
-    assert ("--allow-host" in text) == warned
+    assert ("allow_hosts" in text) == warned
