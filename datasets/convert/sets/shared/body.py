@@ -60,10 +60,10 @@ Cfg = TypeVar("Cfg", bound=BodyConfig)
 
 
 class BodyRelease(Release[Cfg]):
-    """A set of SMPL-H or SMPL-X parameters."""
+    """A set of SMPL, SMPL-H or SMPL-X parameters."""
 
     model: ClassVar[Literal["SMPL", "SMPL-H", "SMPL-X"]]
-    """Whose shapes and rest pose the parameters mean."""
+    """Body model whose shapes and rest pose the parameters mean."""
 
     def __init__(self, config: Cfg) -> None:
         super().__init__(config)
@@ -77,9 +77,11 @@ class BodyRelease(Release[Cfg]):
         self._sounds: dict[str, float] = {}
         """Seconds of every sound file that can be read."""
         self.sound_folder = config.source
+        """Folder that `entry.sound` is relative to."""
         self.sound_start = 0.0
         """Second of a sound at which its motion begins."""
         self._cut = 0
+        """Clips that end with their sound."""
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         header = read_motion_header(path, label)
@@ -109,12 +111,11 @@ class BodyRelease(Release[Cfg]):
         self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
     ) -> Iterator[tuple[Entry, str]]:
         silent, lengths = 0, self._sounds
+        folder = "" if self.sound_folder == self.config.source else f"{self.sound_folder.name}/"
         for sound in dict.fromkeys(entry.sound for entry in entries if self.config.sound != "none"):
             if sound is not None:
+                label = f"{folder}{sound}"
                 try:
-                    label = sound
-                    if self.sound_folder != self.config.source:
-                        label = f"{self.sound_folder.name}/{sound}"
                     lengths[sound] = sound_seconds(inside(self.sound_folder, sound, label), label)
                 except UserError as error:
                     note_broken(draft, label, error)
