@@ -61,7 +61,6 @@ class AistppConfig(BodyConfig):
     layouts = ("body133", "h3d263", "smpl75")
 
     name: str = "aistpp"
-    """Name of the data set; part of the shards' file names."""
     layout: str = "body133"
     """`body133` or `h3d263` from the joints, or `smpl75`: UDE's translation and axis-angles."""
     splits: Path | None = None

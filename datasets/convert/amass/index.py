@@ -9,13 +9,12 @@ Facts of the published preparation that the numbers depend on:
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from motionloom.datasets.convert.common.files import check_id, read_text_file
+from motionloom.datasets.convert.common.files import check_id
+from motionloom.datasets.convert.common.tables import read_csv
 from motionloom.datasets.schema import UserError
 
 INDEX_FPS = 20
@@ -92,25 +91,16 @@ def clip_key(path: str) -> str:
 
 def read_index(path: Path) -> list[IndexRow]:
     """All rows; `UserError` names the line of a malformed one or of an id seen before."""
-    reader = csv.DictReader(io.StringIO(read_text_file(path)), strict=True)
     rows: dict[str, IndexRow] = {}
-    try:
-        absent = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
-        if absent:
-            raise UserError(f"{path}: no column {', '.join(absent)}; is this HumanML3D's index.csv?")
-        for line in reader:
-            row = _row(line, f"{path}:{reader.line_num}")
-            if row.id in rows:
-                raise UserError(f"{path}:{reader.line_num}: clip '{row.id}' has a row already")
-            rows[row.id] = row
-    except csv.Error as error:
-        raise UserError(f"{path}:{reader.line_num}: not a CSV file ({error})") from None
+    for where, line in read_csv(path, _COLUMNS):
+        row = _row(line, where)
+        if row.id in rows:
+            raise UserError(f"{where}: clip '{row.id}' has a row already")
+        rows[row.id] = row
     return list(rows.values())
 
 
 def _row(line: dict[str, str], where: str) -> IndexRow:
-    if None in line or any(line[name] is None for name in _COLUMNS):
-        raise UserError(f"{where}: expected {len(_COLUMNS)} values: {','.join(_COLUMNS)}")
     source = line["source_path"].removeprefix("./").removeprefix("pose_data/")
     try:
         start, end = int(line["start_frame"]), int(line["end_frame"])

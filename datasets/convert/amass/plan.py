@@ -45,11 +45,9 @@ class AmassConfig(CaptionConfig):
     everyday = ("captions",)
 
     name: str = "amass"
-    """Name of the data set; part of the shards' file names."""
     layout: str = "body133"
     """`body133` or `h3d263`; `wholebody313` has the fingers too; `smpl75` keeps the parameters, for UDE."""
     fps: float = Field(default=20.0, gt=0, le=240)
-    """Frame rate of the shards; clips are resampled by time."""
     body_model: Path | None = None
     """Your SMPL-H, SMPL-X or SMPL model (.npz) for clips of any gender. Without one, poses keep their
     rotations and take the bone lengths of one neutral adult.

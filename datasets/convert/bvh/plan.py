@@ -208,13 +208,11 @@ class BvhConfig(CaptionConfig):
     """A JSON file that says which joints of the files stand for ours, or a folder of such files, each for its
     own skeleton (docs/sources.md). Where none fits, and with `auto`, the map is guessed from the names."""
     name: str = "bvh"
-    """Name of the data set; part of the shards' file names."""
     licence: str | None = None
     """Licence of the clips, kept in every sample; needed for a conversion, not for its plan."""
     layout: str = "body133"
     """Feature layout of the shards: body133, h3d263, or one with hands and a face."""
     fps: float = Field(default=20.0, gt=0, le=240)
-    """Frame rate of the shards; clips are resampled by time."""
     source_fps: float | None = Field(default=None, ge=1, le=10_000)
     """True frame rate of the files, for collections that state a wrong one."""
     unit: Unit | Literal["auto"] = "auto"

@@ -55,6 +55,19 @@ class ConvertConfig(Config):
     strict: bool = Field(default=False, json_schema_extra={"runtime": True})
     """Stop when a clip is missing or cannot be read."""
 
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: object) -> None:
+        """Let fields to which a subclass gives another default keep their docstrings."""
+        docs: dict[str, str] = {}
+        for base in reversed(cls.__mro__):
+            fields = getattr(base, "model_fields", {})
+            docs |= {key: field.description for key, field in fields.items() if field.description}
+        bare = [key for key, field in cls.model_fields.items() if not field.description and key in docs]
+        for key in bare:
+            cls.model_fields[key].description = docs[key]
+        if bare:
+            cls.model_rebuild(force=True)
+
     @field_validator("*")
     @classmethod
     def _home(cls, value: object) -> object:

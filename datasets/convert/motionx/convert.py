@@ -99,11 +99,9 @@ class MotionXConfig(ReleaseConfig):
     layouts = ("wholebody363", "wholebody313", "body133", "tomato623", "h3d263", "smplx322")
 
     name: str = "motionx"
-    """Name of the data set; part of the shards' file names."""
     layout: str = "wholebody363"
     """Feature layout of the shards; `smplx322` keeps all columns."""
     fps: float = FPS
-    """Frame rate of the shards; clips are resampled by time."""
     subsets: tuple[str, ...] = ()
     """Convert only these subsets (`GRAB`, `idea400`, ...); empty means all."""
     splits: Path | None = None
@@ -114,7 +112,6 @@ class MotionXConfig(ReleaseConfig):
     up: Literal["y", "z"] = "y"
     """Up axis of the source. The release is Y up; `z` is for own files that no script has turned yet."""
     uncaptioned: Literal["drop", "keep"] = "drop"
-    """Leave out or keep clips that have no usable caption."""
     frame_texts: bool = False
     """Add the sentences about single frames (body_texts, hand_texts) as captions of 1/30 s and longer, with
     source `body` and `hand`. They are many: about one a frame."""

@@ -18,9 +18,9 @@ from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.tables import captions_of, read_csv
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
-from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.schema import Caption, Split, UserError
@@ -37,11 +37,9 @@ class Beat2Config(BodyConfig):
     layouts = ("wholebody363", *BodyConfig.layouts)
 
     name: str = "beat2"
-    """Name of the data set; part of the shards' file names."""
     layout: str = "wholebody363"
     """`wholebody363` with fingers and face, or one without."""
     fps: float = 30.0
-    """Frame rate of the shards; clips are resampled by time."""
     additional: Literal["train", "drop"] = "train"
     """Train on the takes that the list calls `additional`, or leave them out."""
     pause: float = 0.5
@@ -74,7 +72,8 @@ class Beat2(BodyRelease[Beat2Config]):
             listed = {}
             if (folder / LISTS).is_file():
                 listed = {
-                    row["id"].strip(): row["type"].strip() for row in read_csv(folder / LISTS, ("id", "type"))
+                    row["id"].strip(): row["type"].strip()
+                    for _, row in read_csv(folder / LISTS, ("id", "type"))
                 }
             else:
                 draft.notes.append(f"no {below}{LISTS}: split 80/5/15 by hash of the name")

@@ -17,8 +17,8 @@ from typing import Literal
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.scan import ARCHIVES, Batch, list_batches
+from motionloom.datasets.convert.common.tables import captions_of, read_csv, read_json_lines
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state
-from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv, read_json_lines
 from motionloom.datasets.schema import Caption, UserError
 
 FPS = 120.0
@@ -42,9 +42,7 @@ class BonesSeedConfig(BvhSetConfig):
     """Options of the BONES-SEED converter; `source` is the folder that holds metadata/."""
 
     name: str = "bones-seed"
-    """Name of the data set; part of the shards' file names."""
     licence: str | None = "bones-seed-license"
-    """Licence of the clips."""
     variant: Literal["uniform", "proportional"] = "uniform"
     """Motion on one skeleton for all, or on each actor's own."""
     kinds: tuple[Kind, ...] = ("natural", "short", "timeline")
@@ -76,7 +74,7 @@ def _rows(source: Path, kinds: tuple[Kind, ...], split_by: str, made: tuple[int,
     labels = sorted(folder.glob("*temporal_labels.jsonl")) if "timeline" in kinds else []
     timeline = _timeline(labels[-1]) if labels else {}
     found: dict[str, Row] = {}
-    for row in read_csv(tables[-1], ("filename", "move_duration_frames", "is_mirror", "actor_uid")):
+    for _, row in read_csv(tables[-1], ("filename", "move_duration_frames", "is_mirror", "actor_uid")):
         name, frames = row["filename"], row["move_duration_frames"]
         if not frames.strip().isdigit():
             raise UserError(f"{tables[-1].name}: '{name}' has {frames or 'no'} move_duration_frames")

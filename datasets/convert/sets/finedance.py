@@ -16,9 +16,9 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import hash_share
+from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.body import SOURCE_FPS, BodyConfig, BodyRelease
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
-from motionloom.datasets.convert.sets.shared.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.vectors import rotvecs_of_rows
 from motionloom.datasets.schema import Split, UserError
 
@@ -39,11 +39,9 @@ class FineDanceConfig(BodyConfig):
     """Options of the FineDance converter; `source` is the folder that holds motion/."""
 
     name: str = "finedance"
-    """Name of the data set; part of the shards' file names."""
     layout: str = "wholebody313"
     """`wholebody313` with fingers, `body133`, an h3d layout, or `smpl75` for UDE."""
     fps: float = 30.0
-    """Frame rate of the shards; clips are resampled by time."""
     split: Literal["genre", "dancer"] = "genre"
     """The authors' split: test dances of many genres, or by dancers of whom nothing else is seen."""
     val_share: float = 0.05

@@ -63,7 +63,6 @@ class HumanMl3dConfig(ReleaseConfig):
     layouts = ("h3d263", "body133")
 
     name: str = "humanml3d"
-    """Name of the data set; part of the shards' file names."""
     layout: str = "h3d263"
     """`h3d263` keeps the published vectors; `body133` is made from the joints."""
     fps: float = Field(default=FPS, gt=0, le=240)
@@ -74,7 +73,6 @@ class HumanMl3dConfig(ReleaseConfig):
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton (published vectors are then made again)."""
     uncaptioned: Literal["drop", "keep"] = "drop"
-    """Leave out or keep clips that have no usable caption."""
 
     @property
     def keeps_vectors(self) -> bool:

@@ -28,6 +28,7 @@ from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import original_of, read_split_files
+from motionloom.datasets.convert.common.tables import captions_of
 from motionloom.datasets.convert.sets.shared.release import (
     Entry,
     Figure,
@@ -36,7 +37,6 @@ from motionloom.datasets.convert.sets.shared.release import (
     ReleaseConfig,
     note_broken,
 )
-from motionloom.datasets.convert.sets.shared.tables import captions_of
 from motionloom.datasets.convert.sets.shared.vectors import walked
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
@@ -52,7 +52,6 @@ class Motion272Config(ReleaseConfig):
     """Options of the converter of 272-column sets; `source` is the folder that holds motion_data/."""
 
     name: str = "motion272"
-    """Name of the data set; part of the shards' file names."""
     source_fps: float = Field(default=FPS, gt=0, le=240)
     """Frame rate of the files; a copy that was made at another than 30 does not say so."""
     list_folder: str = ""

@@ -17,9 +17,9 @@ from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.files import inside, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import hash_share
+from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.sets.shared.release import Entry, ReleaseClip, note_broken
-from motionloom.datasets.convert.sets.shared.tables import captions_of, read_json, require_record
 from motionloom.datasets.schema import Caption, Split, UserError
 
 TASKS = ("text_motion", "music_dance", "speech_gesture", "two_person_interaction")
@@ -39,11 +39,9 @@ class MotionHubConfig(BodyConfig):
     """Options of the MotionHub converter; `source` is the folder that holds annotations/."""
 
     name: str = "motionhub"
-    """Name of the data set; part of the shards' file names."""
     layout: str = "wholebody313"
     """`wholebody313` with fingers, `body133`, an h3d layout, or `smpl75` for UDE."""
     fps: float = 30.0
-    """Frame rate of the shards; clips are resampled by time."""
     tasks: tuple[str, ...] = TASKS
     """Lists that clips are taken from."""
     subsets: tuple[str, ...] = ()

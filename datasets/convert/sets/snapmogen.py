@@ -25,8 +25,8 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import join_splits
+from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
-from motionloom.datasets.convert.sets.shared.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.vectors import walked
 from motionloom.datasets.schema import SPLITS, Split, UserError
 
@@ -43,7 +43,6 @@ class SnapMoGenConfig(ReleaseConfig):
     """Options of the SnapMoGen converter; `source` is the folder that holds renamed_feats/."""
 
     name: str = "snapmogen"
-    """Name of the data set; part of the shards' file names."""
     metres: float = 0.018
     """Metres in a unit of the files: 0.01 keeps the character's size, 0.018 makes it as tall as an adult."""
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.common.facts import Published
+from motionloom.datasets.convert.common.tables import captions_of, read_csv
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state, stem
-from motionloom.datasets.convert.sets.shared.tables import captions_of, read_csv
 from motionloom.datasets.schema import UserError
 
 CUTS, STYLES = "Frame_Cuts.csv", "Dataset_List.csv"
@@ -35,9 +35,7 @@ class Style100Config(BvhSetConfig):
     """Options of the 100STYLE converter; `source` is the folder that holds Frame_Cuts.csv."""
 
     name: str = "100style"
-    """Name of the data set; part of the shards' file names."""
     licence: str | None = "CC-BY-4.0"
-    """Licence of the clips."""
 
     def cut(self, label: str) -> slice:
         return self._cuts().get(stem(label), slice(None))
@@ -75,7 +73,7 @@ def _cuts(source: Path, made: tuple[int, ...]) -> dict[str, slice]:
     if not (source / CUTS).is_file():
         raise UserError(f"{source}: no {CUTS} in it; give the folder of the release")
     found = {}
-    for row in read_csv(source / CUTS, ("STYLE_NAME",)):
+    for _, row in read_csv(source / CUTS, ("STYLE_NAME",)):
         for movement in MOVEMENTS:
             start, stop = (row.get(f"{movement}_{end}", "").strip() for end in ("START", "STOP"))
             if start in ("", "N/A", "NA", "nan") or stop in ("", "N/A", "NA", "nan"):
@@ -92,7 +90,7 @@ def _cuts(source: Path, made: tuple[int, ...]) -> dict[str, slice]:
 def _rows(source: Path, made: tuple[int, ...]) -> dict[str, Row]:
     """Captions of every file that has frames. Clips of one style stay together: new styles are tested."""
     styles = read_csv(source / STYLES, ("Style Name", "Description")) if (source / STYLES).is_file() else []
-    described = {_words(row["Style Name"]): row["Description"].strip().rstrip(".") for row in styles}
+    described = {_words(row["Style Name"]): row["Description"].strip().rstrip(".") for _, row in styles}
     found = {}
     for name in _cuts(source, made[:1]):
         style, _, movement = name.rpartition("_")

@@ -114,8 +114,8 @@ def test_humanml_index_with_splits(amass: ModuleType, humanml: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("path,start\n", r"no column source_path, start_frame, end_frame, new_name"),
-        ("{head}./pose_data/A/b/c.npy,0,9\n", r":2: expected 4 values"),
+        ("path,start\n", r"no column 'source_path'"),
+        ("{head}./pose_data/A/b/c.npy,0,9\n", r":2: 3 columns"),
         ("{head}./pose_data/A/b/c.npy,x,9,000000.npy\n", r":2: frames 'x' to '9' are not numbers"),
         ("{head}./pose_data/A/b/c.npy,-3,9,000000.npy\n", r":2: start_frame -3 is negative"),
         ("{head}./pose_data/../../x.npy,0,9,000000.npy\n", r":2: clip id .* is not a plain relative name"),

@@ -37,9 +37,7 @@ class ReleaseConfig(ConvertConfig):
     layouts: ClassVar[tuple[str, ...]] = ("body133", "h3d263")
 
     layout: str = "body133"
-    """Feature layout of the shards."""
     fps: float = 20.0
-    """Frame rate of the shards; clips are resampled by time."""
     splits: Path | None = None
     """Folder of train.txt, val.txt, test.txt with clip ids; else the set's own lists."""
     uncaptioned: Literal["drop", "keep"] = "keep"

@@ -1,4 +1,4 @@
-"""Lists and captions of a published set: JSON, JSON lines, CSV, and words in several forms."""
+"""Lists and captions as sets publish them: JSON, JSON lines, CSV, and words in several forms."""
 
 from __future__ import annotations
 
@@ -39,10 +39,11 @@ def require_record(value: object, place: str) -> dict[str, object]:
     return value
 
 
-def read_csv(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
-    """The rows of a table with a header; `UserError` names a column that is missing, or a row that is cut."""
+def read_csv(path: Path, columns: Iterable[str]) -> list[tuple[str, dict[str, str]]]:
+    """(place, row) of a table with a header; `UserError` names a missing column or a row that is cut."""
     lines = read_text_file(path, path.name).split("\n")
     reader = csv.reader((f"{line}\n" for line in lines), strict=True)
+    rows = []
     try:
         header = [name.strip() for name in next(reader, [])]
         missing = [name for name in columns if name not in header]
@@ -50,14 +51,12 @@ def read_csv(path: Path, columns: Iterable[str]) -> list[dict[str, str]]:
             raise UserError(
                 f"{path.name}: no column '{missing[0]}'; there are {', '.join(header[:12]) or 'none'}"
             )
-        rows = []
         for row in reader:
+            place = f"{path.name}:{reader.line_num}"
             if any(cell.strip() for cell in row):
                 if len(row) != len(header):
-                    raise UserError(
-                        f"{path.name}:{reader.line_num}: {len(row)} columns, the header has {len(header)}"
-                    )
-                rows.append(dict(zip(header, row, strict=True)))
+                    raise UserError(f"{place}: {len(row)} columns, the header has {len(header)}")
+                rows.append((place, dict(zip(header, row, strict=True))))
     except csv.Error as error:
         raise UserError(f"{path.name}:{reader.line_num}: not a table ({error})") from None
     return rows
