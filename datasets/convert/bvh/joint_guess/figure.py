@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Literal
@@ -25,21 +25,6 @@ from motionloom.datasets.motion.bvh.motion import BvhMotion
 
 FINGERS = ("index", "middle", "pinky", "ring", "thumb")
 """The fingers of `smplx52`, in its order."""
-
-
-@dataclass(frozen=True)
-class FingerWords:
-    """Words of a hand: a finger's name followed by a joint's, outwards from the knuckle."""
-
-    names: tuple[str, ...]
-    """Names of `FINGERS`, in that order."""
-    joints: tuple[str, ...]
-    thumb: tuple[str, ...]
-
-    def chain(self, finger: str) -> tuple[str, ...]:
-        """Words of the joints of one finger, outwards."""
-        name = self.names[FINGERS.index(finger)]
-        return tuple(name + joint for joint in (self.thumb if finger == "thumb" else self.joints))
 
 
 @dataclass(frozen=True)
@@ -55,7 +40,8 @@ class Convention:
     """Hip, knee, ankle, ball of the foot."""
     arm: tuple[str, ...]
     """Collar, shoulder, elbow, wrist."""
-    fingers: FingerWords | None = None
+    fingers: Mapping[str, tuple[str, ...]]
+    """Words of the joints of each finger, outwards; none where the tool has no fingers."""
 
 
 _TABLE = """
@@ -79,41 +65,44 @@ Kinect | spinebase spinemid spineshoulder | neck head | hip knee ankle foot | - 
 """  # noqa: E501 (a table)
 """Tool | pelvis, spine upwards | neck, head | leg | arm; `-` is a joint that the tool does not have."""
 
-_FOUR = ("1", "2", "3", "4")
-_HANDS = FingerWords(tuple(f"hand{finger}" for finger in FINGERS), _FOUR, _FOUR)
-_PLAIN = FingerWords(FINGERS, _FOUR, _FOUR)
-_UNITY = ("index", "middle", "little", "ring", "thumb")
-_FINGERS = {
-    "Mixamo, HumanIK, LAFAN1": _HANDS,
-    "BONES, SOMA": _HANDS,
-    "Rokoko": FingerWords(  # numbered from the thumb
-        ("finger2", "finger3", "finger5", "finger4", "finger1"),
-        ("proximal", "medial", "distal"),
-        ("metacarpal", "proximal", "distal"),
-    ),
-    "Xsens MVN (segments)": FingerWords(
-        ("second", "third", "fifth", "fourth", "first"), ("pp", "mp", "dp"), ("mc", "pp", "dp")
-    ),
-    "MakeHuman (CMU rig)": _PLAIN,
-    "MakeHuman (default rig)": FingerWords(
-        ("finger2", "finger3", "finger5", "finger4", "finger1"), ("1", "2", "3"), ("1", "2", "3")
-    ),
-    "Blender Rigify": FingerWords(("findex", "fmiddle", "fpinky", "fring", "thumb"), _FOUR, _FOUR),
-    "SMPL, SMPL-H, SMPL-X": _PLAIN,
-    "Unreal mannequin": _PLAIN,
-    "Bandai-Namco, Unity, VRM": FingerWords(
-        _UNITY, ("proximal", "intermediate", "distal"), ("metacarpal", "proximal", "distal")
-    ),
-}
+_HANDS = """
+Mixamo, HumanIK, LAFAN1 | handindex handmiddle handpinky handring handthumb | 1 2 3 4 | 1 2 3 4
+BONES, SOMA | handindex handmiddle handpinky handring handthumb | 1 2 3 4 | 1 2 3 4
+Rokoko | finger2 finger3 finger5 finger4 finger1 | proximal medial distal | metacarpal proximal distal
+Xsens MVN (segments) | second third fifth fourth first | pp mp dp | mc pp dp
+MakeHuman (CMU rig) | index middle pinky ring thumb | 1 2 3 4 | 1 2 3 4
+MakeHuman (default rig) | finger2 finger3 finger5 finger4 finger1 | 1 2 3 | 1 2 3
+Blender Rigify | findex fmiddle fpinky fring thumb | 1 2 3 4 | 1 2 3 4
+SMPL, SMPL-H, SMPL-X | index middle pinky ring thumb | 1 2 3 4 | 1 2 3 4
+Unreal mannequin | index middle pinky ring thumb | 1 2 3 4 | 1 2 3 4
+Bandai-Namco, Unity, VRM | index middle little ring thumb | proximal intermediate distal | metacarpal proximal distal
+"""  # noqa: E501 (a table)
+"""Tool | the fingers of `FINGERS` | their joints outwards | the thumb's: a word is finger and joint."""
 
 
-def _convention(row: str) -> Convention:
-    tool, *parts = (part.strip() for part in row.split("|"))
-    trunk, neck, leg, arm = (tuple(word.strip("-") for word in part.split()) for part in parts)
-    return Convention(tool, trunk, neck, leg, arm, _FINGERS.get(tool))
+def _cells(table: str) -> list[tuple[str, list[list[str]]]]:
+    """(tool, words of every other cell) of the rows of a table."""
+    rows = ([cell.strip() for cell in row.split("|")] for row in table.strip().splitlines())
+    return [(tool, [cell.split() for cell in cells]) for tool, *cells in rows]
 
 
-CONVENTIONS = tuple(map(_convention, _TABLE.strip().splitlines()))
+def _fingers(names: list[str], joints: list[str], thumb: list[str]) -> dict[str, tuple[str, ...]]:
+    parts = [joints] * 4 + [thumb]
+    rows = zip(FINGERS, names, parts, strict=True)
+    return {finger: tuple(name + joint for joint in outwards) for finger, name, outwards in rows}
+
+
+def _conventions() -> tuple[Convention, ...]:
+    hands = {tool: _fingers(*cells) for tool, cells in _cells(_HANDS)}
+    return tuple(
+        Convention(
+            tool, *(tuple(word.strip("-") for word in cell) for cell in cells), fingers=hands.get(tool, {})
+        )
+        for tool, cells in _cells(_TABLE)
+    )
+
+
+CONVENTIONS = _conventions()
 
 _ENDS = ("end", "leaf", "nub", "site", "tip", "top")
 _HANDLES = ("ctrl", "eff", "effector", "helper", "ik", "pole", "prop", "target", "weapon")
@@ -163,8 +152,7 @@ def vocabulary() -> frozenset[str]:
     """Every word of the table."""
     words = {word for known in CONVENTIONS for word in (*known.trunk, *known.neck, *known.leg, *known.arm)}
     for known in CONVENTIONS:
-        if known.fingers is not None:
-            words.update(word for finger in FINGERS for word in known.fingers.chain(finger))
+        words.update(word for chain in known.fingers.values() for word in chain)
     return frozenset(words - {""})
 
 

@@ -235,9 +235,8 @@ def fill_fingers(figure: Figure, arm: Limb, rows: Rows) -> None:
 def _chain(finger: str, below: dict[str, list[int]]) -> list[int]:
     """The finger's joints outwards, in the words of the convention that has most of them."""
     chains = [
-        [joint for word in known.fingers.chain(finger) for joint in below.get(word, [])]
+        [joint for word in known.fingers.get(finger, ()) for joint in below.get(word, [])]
         for known in CONVENTIONS
-        if known.fingers is not None
     ]
     return max(chains, key=len)
 
