@@ -41,7 +41,7 @@ def converter_named(name: str) -> type[AnyConverter]:
 
 
 def converters() -> list[type[AnyConverter]]:
-    """All of them."""
+    """All converters, in the order of their names."""
     return [converter_named(name) for name in names()]
 
 

@@ -121,7 +121,7 @@ def _check_one(path: Path, rules: FileRules, strict: bool, console: Console) -> 
 
 
 def _leaks(folders: list[Path], console: Console) -> list[str]:
-    """Clips that data sets have in different splits, said."""
+    """Print and return the clips that data sets have in different splits."""
     from motionloom.datasets.check.leaks import leaks_across
 
     found = leaks_across(folders)
@@ -145,7 +145,7 @@ def joints(
         Path | None, typer.Option("--out", "-o", help="Also write the joint map, to be completed.")
     ] = None,
 ) -> None:
-    """Joint names of a skeleton of ours; or which joints of a BVH file stand for them, as far as can be said.
+    """Joint names of a skeleton of ours; or the joints of a BVH file that stand for them, where it is certain.
 
     Example: `motionloom data joints smplx52`
 

@@ -73,7 +73,7 @@ def info() -> Info:
 
 
 def show_info(console: Console) -> None:
-    """Print the same for people."""
+    """Print these facts as text and tables."""
     facts = info()
     console.print(f"motionloom {facts.motionloom}, Python {facts.python}, {facts.platform}")
     console.print(", ".join(f"{name} {version}" for name, version in facts.libraries.items()))

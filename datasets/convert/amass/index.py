@@ -73,7 +73,7 @@ class IndexRow:
 
 
 def thinning(fps: float) -> int:
-    """Frames of the file a frame of the index."""
+    """Return how many frames of the file make one frame of the index."""
     return max(int(fps / INDEX_FPS), 1)
 
 

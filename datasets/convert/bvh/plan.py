@@ -78,7 +78,7 @@ def choose_maps(
     joints: Mapping[str, tuple[str, ...]],
     folder: Path | None,
 ) -> JointMaps:
-    """A map for every skeleton (`joints` of each) of the planned clips: a own_maps one, else a certain guess.
+    """A map for every skeleton (`joints` of each) of the planned clips: the user's, else a certain guess.
 
     Clips of other skeletons leave the plan. Guesses are written into `folder`, where there is one, to be
     completed. `UserError` when no skeleton has a map, and when one of `own_maps` fits none.
@@ -131,7 +131,7 @@ def choose_maps(
 def _settle(
     config: BvhConfig, joint_map: JointMap, motions: Sequence[BvhMotion], plan: ConversionPlan[BvhClip]
 ) -> JointMap:
-    """The map with unit and upward axis as some of its clips settle them, which the plan tells."""
+    """Return the map with the unit and upward axis that some of its clips show, with a note in the plan."""
     stated = replace(
         joint_map,
         unit=joint_map.unit or (None if config.unit == "auto" else config.unit),
@@ -183,7 +183,7 @@ def guess_source(source: Path, target: Skeleton) -> JointGuess:
 
 
 def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
-    """Write the map of a guess, and say what to do with it."""
+    """Write the map of a guess; return what the user can do with it."""
     if folder is None:
         return f"`motionloom data joints {guess.source} -o joint_map.json` writes a map to complete"
     path = folder / MAPS_FOLDER / f"skeleton-{key}.json"

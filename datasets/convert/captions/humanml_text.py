@@ -45,7 +45,7 @@ def read_humanml_captions(
 
 
 def parse_caption(line: str, *, seconds: float | None, source: str = "humanml3d") -> Caption:
-    """One line. `UserError` says what is wrong with it."""
+    """Return the caption of one line; `UserError` says what is wrong with it."""
     fields = line.split("#")
     if len(fields) < 4:
         raise UserError(f"{len(fields)} of the 4 fields caption#tokens#start#end")

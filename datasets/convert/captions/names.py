@@ -48,7 +48,7 @@ def label_words(path: str) -> str:
 
 
 def subject_of(path: str) -> str:
-    """Whose motion a file is: by the naming of HDM05 or CMU, else the folder, else the name's first word."""
+    """The subject of a file: by the naming of HDM05 or CMU, else the folder, else the name's first word."""
     stem = _stem(path)
     for pattern in (_HDM05, _TRIAL):
         if found := pattern.fullmatch(stem):

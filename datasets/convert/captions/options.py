@@ -145,7 +145,7 @@ def list_clips(
 
 
 def nearest(name: str, candidates: Sequence[str], number: int = 2) -> list[str]:
-    """The candidates most like a name by their last names, best first; none that is like it in nothing."""
+    """The candidates nearest to a name by their last names, best first; none that has nothing in common."""
     stems: dict[str, str] = {}
     for candidate in sorted(candidates):
         stems.setdefault(_stem(candidate), candidate)
@@ -263,8 +263,8 @@ class CaptionedPlan(ConversionPlan[C]):
 
 
 def settle_captions(config: CaptionConfig, draft: CaptionedPlan[C], found: Listing) -> None:
-    """Say in the plan what is listed but missing, how captions and clips fit, and why the conversion must not
-    start if it must not.
+    """Note in the plan what is listed but missing and how captions and clips fit; `draft.stop` is the reason
+    that the conversion must not start yet.
     """
     for name, clip_id in found.missing.items():
         draft.miss(name, f"clip '{clip_id}' is listed, but its file is not in the source")

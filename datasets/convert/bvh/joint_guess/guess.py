@@ -37,7 +37,7 @@ from motionloom.datasets.motion.skeleton import Skeleton
 
 @dataclass(frozen=True)
 class GuessedJoint:
-    """One row: a joint of the target and what stands for it."""
+    """One row: a joint of the target and its sources."""
 
     joint: str
     sources: tuple[str, ...]
@@ -165,7 +165,7 @@ def _fill_by_words(figure: Figure, rows: Rows) -> None:
 
 
 def _fill_collars(figure: Figure, arms: Limbs, rows: Rows) -> None:
-    """Collars without a name: the only joint between chest and shoulder, else the mean of what is around."""
+    """Add collars without a name: the only joint between chest and shoulder, else a mean of neighbours."""
     chest = figure.common_ancestor(roots(arms))
     for arm in arms:
         shoulder, collar = arm.essential()[0], f"{arm.side}_collar"

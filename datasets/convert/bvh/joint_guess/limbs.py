@@ -73,7 +73,7 @@ def named_limb(figure: Figure, kind: Kind, side: str) -> Limb | None:
 
 
 def _agreement(figure: Figure, kind: Kind, choice: tuple[int | None, ...]) -> int:
-    """In how many slots one and the same convention has the words."""
+    """Count the slots in which one and the same convention has the words."""
     words = ["" if joint is None else figure.names[joint].word for joint in choice]
     rows: list[tuple[str, ...]] = [getattr(known, kind) for known in CONVENTIONS]
     return max(sum(a == b for a, b in zip(words, row, strict=True)) for row in rows)
@@ -115,8 +115,8 @@ class Rows:
     """Estimated End Sites of joints, in multiples of the distance from their parents."""
 
     def put(self, joint: str, sources: Iterable[int], how: How) -> None:
-        """`joint` is the mean of these; a source that appears twice weighs twice. `estimate` means the
-        estimated End Site of its source.
+        """Let `joint` be the mean of `sources`, of which one that appears twice weighs twice; with `estimate` it
+        is the estimated End Site of its source.
         """
         self.sources[joint], self.how[joint] = tuple(sources), how
 
@@ -158,7 +158,7 @@ def _pelvis(figure: Figure, legs: Limbs, arms: Limbs, rows: Rows) -> int:
 
 
 def _fill_spine(figure: Figure, pelvis: int, spine: tuple[int, ...], rows: Rows) -> None:
-    """Three of any number [ours]: the lowest, the middle and that of the collars; means where fewer."""
+    """Add three of any number of spine joints [ours]: the lowest, the middle and that of the collars."""
     if not spine:
         return
     middle = spine[(len(spine) - 1) // 2 : len(spine) // 2 + 1]
@@ -173,7 +173,7 @@ def _fill_spine(figure: Figure, pelvis: int, spine: tuple[int, ...], rows: Rows)
 
 
 def _fill_head(figure: Figure, chest: int, neck: int | None, arms: set[int], rows: Rows) -> None:
-    """Neck (unless known) and head, on the chest's branch that carries no arm."""
+    """Add neck (unless known) and head, on the chest's branch that carries no arm."""
     limbs = {figure.path(chest, arm)[0] for arm in arms if arm != chest}
     branches = [child for child in figure.children[chest] if child not in limbs]
     head = _named_head(figure, branches)
@@ -289,7 +289,7 @@ def with_feet(figure: Figure, legs: Limbs, rows: Rows) -> Limbs:
 
 
 def _end_feet(figure: Figure, legs: Limbs, rows: Rows) -> None:
-    """Rows for both feet: their End Sites where both are feet, else the estimates."""
+    """Add rows for both feet: their End Sites where both are feet, else the estimates."""
     hips = [figure.poses[:, leg.essential()[0]] for leg in legs]
     ends = []
     for leg in legs:

@@ -65,7 +65,7 @@ class BvhSetConfig(BvhConfig):
 
 
 def state(*paths: Path) -> tuple[int, ...]:
-    """When tables were changed: what is read of them is kept as long as that is the same."""
+    """Times at which tables were changed, by which what was read of them is kept."""
     return tuple(path.stat().st_mtime_ns if path.exists() else 0 for path in paths)
 
 
