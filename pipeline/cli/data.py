@@ -145,7 +145,7 @@ def joints(
         Path | None, typer.Option("--out", "-o", help="Also write the joint map, to be completed.")
     ] = None,
 ) -> None:
-    """Joint names of a skeleton of ours; or the joints of a BVH file that stand for them, where it is certain.
+    """Joint names of a skeleton of ours; or the joints of a BVH file that stand for them, if certain.
 
     Example: `motionloom data joints smplx52`
 

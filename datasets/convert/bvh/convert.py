@@ -90,7 +90,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         return FeatureStep(batches, operator.attrgetter("number"), self._sample)
 
     def convert(self, clip: BvhClip) -> Sample:
-        """Return the sample of one clip. An archive is read up to the clip: for many clips, make the batch."""
+        """Return the sample of one clip. An archive is read up to it: for many clips, make the batch."""
         return self._sample(clip, self.encode(clip.label(), self._read(clip)))
 
     def joints(self, clip: BvhClip) -> SourceJoints:

@@ -115,8 +115,8 @@ class Rows:
     """Estimated End Sites of joints, in multiples of the distance from their parents."""
 
     def put(self, joint: str, sources: Iterable[int], how: How) -> None:
-        """Let `joint` be the mean of `sources`, of which one that appears twice weighs twice; with `estimate` it
-        is the estimated End Site of its source.
+        """Let `joint` be the mean of `sources`, of which one that appears twice weighs twice; with `estimate`
+        it is the estimated End Site of its source.
         """
         self.sources[joint], self.how[joint] = tuple(sources), how
 
