@@ -218,17 +218,14 @@ def _whole_clips(
     labels = [file.label for file in files]
     listing = config.with_subjects(config.listing(labels), labels)
     draft.notes += listing.notes
-    seen: dict[str, str] = {}
     for file, header in headers:
         fps = _rate(config, file, header, draft)
         if not fps:
             continue
         clip_id = listing.id_of(file.label)
-        first = seen.setdefault(clip_id, file.label)
-        again = "" if first == file.label else f"second file for clip id '{clip_id}'; the first is {first}"
         split, texts = listing.split_of(file.label), listing.texts_of(file.label)
         clip = AmassClip(file, clip_id, split, header, fps, 0, header.frames, texts)
-        yield clip, again or listing.problem(file.label)
+        yield clip, listing.problem(file.label)
     settle_captions(config, draft, listing)
 
 

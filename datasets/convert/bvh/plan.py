@@ -330,7 +330,6 @@ def _decide(
     listing = config.with_subjects(listing, [file.path for _, file in found if not file.problem])
     broken = [scan.problem for scan in scans if scan.problem is not None]
     draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes, audit=audit)
-    ids: dict[str, str] = {}
     contents: dict[str, str] = {}
     other_rate = 0
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
@@ -347,19 +346,14 @@ def _decide(
         other_rate += stated is not None and abs(stated - clip.fps) > 0.01 * clip.fps
         frames = len(range(clip.frames)[config.cut(clip.label)])
         fps = config.source_fps or clip.fps
-        if clip_id in ids:
-            reason = f"second file for clip id '{clip_id}'; the first is {ids[clip_id]}"
-        elif clip.sha256 in contents:
-            reason = f"same bytes as {contents[clip.sha256]}"
-        else:
-            reason = (
-                config.unfit(clip.path)
-                or listing.problem(clip.path)
-                or refused
-                or config.length_problem(frames / fps)
-            )
-        ids.setdefault(clip_id, clip.label)
-        contents.setdefault(clip.sha256, clip.label)
+        same = contents.setdefault(clip.sha256, clip.label)
+        reason = (
+            (f"same bytes as {same}" if same != clip.label else "")
+            or config.unfit(clip.path)
+            or listing.problem(clip.path)
+            or refused
+            or config.length_problem(frames / fps)
+        )
         texts = listing.texts_of(clip.path)
         split, about = listing.split_of(clip.path), config.about(clip.path)
         planned = BvhClip(batches[number], number, clip, clip_id, split, texts, frames, fps, about)

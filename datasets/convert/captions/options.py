@@ -251,6 +251,7 @@ class CaptionedPlan(ConversionPlan[C]):
     def decide(self, clip: C, texts: Sequence[Caption], reason: str) -> None:
         """Take a clip or leave it out: for `reason`, or for want of captions where some were given."""
         assert isinstance(self.config, CaptionConfig)
+        reason = self.repeated(clip) or reason
         keep = self.config.uncaptioned == "keep"
         if self.config.has_captions and not texts:
             self.uncaptioned.append(clip.label())
@@ -259,7 +260,7 @@ class CaptionedPlan(ConversionPlan[C]):
                 reason = "" if keep else "no captions"
         elif texts and not reason:
             self.captioned += 1
-        self.settle(clip, reason)
+        self._settle(clip, reason)
 
 
 def settle_captions(config: CaptionConfig, draft: CaptionedPlan[C], found: Listing) -> None:

@@ -83,6 +83,8 @@ class ConversionPlan(Generic[C]):
     """Measurements of a few clips; None when none was read."""
     audit: Audit = field(default_factory=Audit)
     """Clips found and taken, beside what the makers of the source state."""
+    ids: dict[str, str] = field(default_factory=dict)
+    """Label of the first clip with each id."""
     known: set[str] = field(default_factory=set)
     """Names of the facts that `config.where` may ask for."""
 
@@ -95,7 +97,17 @@ class ConversionPlan(Generic[C]):
         self.settle(clip, "")
 
     def settle(self, clip: C, reason: str) -> None:
-        """Take a clip or leave it out for `reason`, and count it."""
+        """Take a clip or leave it out, for `reason` or because another has its id; and count it."""
+        self._settle(clip, self.repeated(clip) or reason)
+
+    def repeated(self, clip: C) -> str:
+        """Return the reason to leave out a clip whose id an earlier one has; asked once for each clip."""
+        if clip.id in self.ids:
+            return f"second file for clip id '{clip.id}'; the first is {self.ids[clip.id]}"
+        self.ids[clip.id] = clip.label()
+        return ""
+
+    def _settle(self, clip: C, reason: str) -> None:
         facts = facts_of(clip)
         self.known.update(facts)
         if not reason and not all(one.holds(facts) for one in parse_where(self.config.where)):

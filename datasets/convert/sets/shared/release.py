@@ -168,18 +168,13 @@ class Release(Converter[Cfg, ReleaseClip]):
             if isinstance(state, UserError):
                 draft.fail(file, state)
         listed = self.split_lists()
-        seen: dict[str, str] = {}
         for entry, reason in self.with_sound(entries, draft):
             state = scanned[entry.file]
             if state is None:
                 draft.miss(entry.file, f"clip '{entry.id}' is listed, but its file is not in the source")
             elif not isinstance(state, UserError):
                 clip, problem = self._clip(entry, state, listed, draft)
-                first = seen.setdefault(clip.id, clip.label())
-                again = (
-                    "" if first == clip.label() else f"second clip with id '{clip.id}'; the first is {first}"
-                )
-                draft.settle(clip, entry.problem or reason or again or problem)
+                draft.settle(clip, entry.problem or reason or problem)
         draft.limit(lambda clip: clip.id)
         return draft.finish(
             found=repeated + sum(state is not None for state in scanned.values()),
