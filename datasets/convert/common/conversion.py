@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import operator
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -108,29 +109,29 @@ class Conversion(Generic[C]):
         return sum(-(-count // _CLIPS_PER_SHARD) for count in self.plan.counts().values())
 
     def _trial(self) -> tuple[float, float] | None:
-        """Seconds that the first clip takes and those after it, from a few; None without any."""
+        """Seconds that the first clip takes, imports included, and those after it; None without any."""
         if not self.plan.items:
             return None
-        start = time.perf_counter()
-        if (features := self.converter.features([clip for _, clip in self.plan.items])) is not None:
-            batch = features.batches[0]
-            batch.trial(0.0)  # pays for imports
-            first, start = time.perf_counter() - start, time.perf_counter()
-            clips = batch.trial(_TRIAL_SECONDS)
-            return (first, (time.perf_counter() - start) / clips) if clips else None
-        # The first clip pays for imports, so it is converted twice and only the second time counts.
-        chosen = [item for _, item in limited(self.plan.items, _label, _TRIAL_CLIPS)]
-        first, done = 0.0, 0
-        for position, item in enumerate([chosen[0], *chosen]):
-            with contextlib.suppress(Exception):  # the real run reports it; here only time counts
-                self.converter.convert(item)
-            if position == 0:
-                first, start = time.perf_counter() - start, time.perf_counter()
-                continue
-            done += 1
-            if time.perf_counter() - start > _TRIAL_SECONDS:
+        first, start, count = 0.0, time.perf_counter(), 0
+        for count, _ in enumerate(self._trial_clips()):
+            now = time.perf_counter()
+            if count == 0:
+                first, start = now - start, now
+            elif now - start > _TRIAL_SECONDS:
                 break
-        return first, (time.perf_counter() - start) / done
+        return first, (time.perf_counter() - start) / max(count, 1)
+
+    def _trial_clips(self) -> Iterator[object]:
+        """Convert a few clips: the first, which pays for imports, and then all of them from the first on."""
+        if (features := self.converter.features([clip for _, clip in self.plan.items])) is not None:
+            yield from itertools.islice(features.batches[0].clips(), 1)
+            yield from features.batches[0].clips()
+            return
+        chosen = [clip for _, clip in limited(self.plan.items, _label, _TRIAL_CLIPS)]
+        for clip in (chosen[0], *chosen):
+            with contextlib.suppress(Exception):  # the real run reports it; here only time counts
+                self.converter.convert(clip)
+            yield clip
 
 
 def run_conversion(

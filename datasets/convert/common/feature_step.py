@@ -8,7 +8,6 @@ wanted.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -91,14 +90,6 @@ class FeatureBatch:
                 index.clips[label] = (frames, len(features))
                 frames += len(features)
         write_json(path.with_suffix(".json"), index.dump())
-
-    def trial(self, seconds: float) -> int:
-        """Convert clips for about this long without keeping them; returns how many."""
-        end = time.perf_counter() + seconds
-        for count, _ in enumerate(self.clips(), start=1):
-            if time.perf_counter() > end:
-                return count
-        return self.size
 
 
 @dataclass(frozen=True)
