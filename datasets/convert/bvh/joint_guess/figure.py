@@ -94,11 +94,12 @@ def _fingers(names: list[str], joints: list[str], thumb: list[str]) -> dict[str,
 
 def _conventions() -> tuple[Convention, ...]:
     hands = {tool: _fingers(*cells) for tool, cells in _cells(_HANDS)}
+    limbs = [
+        (tool, [tuple(word.strip("-") for word in cell) for cell in cells]) for tool, cells in _cells(_TABLE)
+    ]
     return tuple(
-        Convention(
-            tool, *(tuple(word.strip("-") for word in cell) for cell in cells), fingers=hands.get(tool, {})
-        )
-        for tool, cells in _cells(_TABLE)
+        Convention(tool, trunk, neck, leg, arm, hands.get(tool, {}))
+        for tool, (trunk, neck, leg, arm) in limbs
     )
 
 
