@@ -69,7 +69,8 @@ class GptModule(StageModule):
         values = {"loss": ce, "ce": ce}
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)
-        if self.tokenizer is not None and self.tma is not None:
+        begun = not self.loss_config.align_from or self.step >= self.loss_config.align_from
+        if begun and self.tokenizer is not None and self.tma is not None:
             values["align"] = self._align(batch, logits, drop, self.tokenizer.module, self.tma.module)
             values["loss"] = ce + self.loss_config.align_weight * values["align"]
         return values

@@ -113,6 +113,7 @@ stages:
   tokens: {batch_frames: 64}
   gpt:
     net: {layers: 1, dim: 48, heads: 4, ff: 96}
+    loss: {align_from: 10}
     train: {steps: 30, batch_size: 8, checkpoint_every: 6, validate_every: 12}
   face_gpt:
     net: {layers: 1, dim: 32, heads: 4, ff: 64}

@@ -152,6 +152,14 @@ def test_alignment_reaches_every_code_head() -> None:
     assert module.net.text_in.weight.grad.abs().max() > 0
 
 
+def test_alignment_begins_at_its_step() -> None:
+    module, batch = align_module(align_from=2)
+    module.step = 1
+    assert "align" not in module.losses(batch)
+    module.step = 2
+    assert "align" in module.losses(batch)
+
+
 def test_alignment_on_known_logits_decodes_the_codes() -> None:
     module, batch = align_module()
     net = module.net
