@@ -28,7 +28,7 @@ class GptLossConfig(Config):
     align_weight: float = Field(default=0.1, ge=0)
     """eta [ours]; 0 turns L_align off, and the tokenizer and TMA are then not needed."""
     align_from: int = Field(default=0, ge=0)
-    """Step at which L_align begins [ours]; it takes half of a step's time, and first predictions are noise."""
+    """Step at which L_align begins [ours]; it takes half of a step's time, and at first all is noise."""
     align_on: Literal["predictions", "samples"] = "predictions"
     """What L_align judges [ours]: tokens predicted after the true ones, or motions that the model samples
     itself. Those take several times longer; start such a stage from a trained GPT
