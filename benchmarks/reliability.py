@@ -45,7 +45,7 @@ FAMILIES = {
     "tokenizer": ("humantomato", "tokenizer (H2VQ, codebooks that reset)"),
     "tma": ("humantomato", "TMA (contrastive, latent draws)"),
     "gpt": ("humantomato", "GPT"),
-    "face_diffusion": ("humantomato", "diffusion"),
+    "face_diffusion": ("humantomato", "MDM"),
     "utt": ("ude", "UTT and its critic (two optimizers)"),
     "dmd": ("ude", "DMD"),
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -41,3 +42,16 @@ def shared() -> Path:
     if not folder.is_dir():
         pytest.skip("golden vectors and real data are not here: set MOTIONLOOM_SHARED to their folder")
     return folder
+
+
+@pytest.fixture
+def float64() -> Iterator[None]:
+    """Networks and random inputs in float64: two ways to one result then agree to far below any bound here,
+    whatever instructions and number of threads the machine sums with. What a network returns may still be
+    rounded to float32."""
+    import torch  # not before the environment is set
+
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(before)

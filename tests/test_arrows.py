@@ -134,8 +134,9 @@ def test_no_room_imports_itself_by_way_of_others() -> None:
 
 
 FLOORS = {
-    "pipeline": "cli serve runs stages results evaluation training inference contract store render launch",
-    "models": "baselines utt diffusion gpt tokenizer pretrained tma evaluator quantize discriminator "
+    "pipeline": "cli serve runs baselines stages results evaluation training inference contract store render "
+    "launch",
+    "models": "utt diffusion gpt tokenizer pretrained tma evaluator quantize discriminator "
     "condition metrics training layers",
     "datasets": "check synth actions loading convert shards modalities text motion audio base",
 }
@@ -151,6 +152,14 @@ def test_arrows_go_down_the_floors() -> None:
                 same = target.split("/")[0] == room.split("/")[0]
                 assert not same or place[top_of(room)] < place[target], f"{room} stands below {target}"
     assert set(place) == {top_of(room) for room in room_arrows() if room not in FOLDERS}
+
+
+@pytest.mark.parametrize("path", [p for folder in FOLDERS for p in files(folder)], ids=str)
+def test_nothing_imports_a_baseline_but_itself(path: Path) -> None:
+    mine = path.relative_to(ROOT).parts[:3]
+    for name in imports(path):
+        parts = tuple(name.removeprefix("motionloom.").split("."))
+        assert parts[:2] != ("pipeline", "baselines") or parts[:3] == mine, f"{path} imports {name}"
 
 
 def top_of(room: str) -> str:

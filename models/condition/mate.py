@@ -43,7 +43,7 @@ class MateConfig(StackConfig):
 
 
 class Encoded(NamedTuple):
-    """What MATE makes of a batch's conditions."""
+    """The encoded conditions of a batch."""
 
     glob: Tensor
     """[B, E], global embedding."""
@@ -114,7 +114,7 @@ class Mate(nn.Module):
         return Encoded(x[:, 0], seq, mask, self._timed(seq, sizes))
 
     def unconditional(self, batch: int) -> Encoded:
-        """What rows without any modality are encoded as, S = 0."""
+        """Return the encoding of rows without any modality, S = 0."""
         out: Encoded = self({}, batch)
         return out
 

@@ -53,7 +53,7 @@ class DmdStream:
         self._given = 0
         """Frames given."""
         self._tail: Tensor | None = None
-        """What the window before says of the frames that follow [overlap, D]."""
+        """The previous window's prediction of the frames that follow [overlap, D]."""
 
     def push(self, codes: Mapping[str, Tensor]) -> Tensor | None:
         """More tokens, per stream int64 [1, G * per_group] -> the frames [T, D] that are final now; None =
@@ -101,7 +101,7 @@ class DmdStream:
         )
 
     def _noise(self, frame: int) -> np.ndarray:
-        """What a frame is denoised from [D]."""
+        """Return the noise that a frame is denoised from [D]."""
         stream = np.random.Philox(key=self.seed + (2 << 64), counter=[0, 0, 0, frame])
         return np.random.Generator(stream).standard_normal(self.net.motion_dim)
 

@@ -1,16 +1,16 @@
-"""Motion that is partly given: diffusion under a mask, pulled towards places and pins.
+"""Motion editing: diffusion under a mask, with a gradient towards places and pins.
 
-At every denoising step the predicted clean motion is replaced by the given one where that is known (MDM's
-editing), led and smoothed so that both join [ours], and pulled by the gradient of what it
-misses by: the root's known places and headings, and pinned joints, recovered in metres (`recovery.py`).
-Networks with `observed` columns are also shown all that is known but the pins.
+At every denoising step the predicted clean motion is replaced by the known one where there is one (MDM's
+editing). The prediction is corrected near the boundary of known frames and smoothed [ours], and a gradient
+step reduces its distance to the root's known places and headings and to pinned joints, recovered in metres
+(`recovery.py`) [ours]. The in-betweener also observes all that is known but the pins.
 
-Motions longer than the training's are made in overlapping windows that agree at every step, and stretches of
-other words are windows of their own: a frame is the mean of the predictions for it, weighed by how much it
-belongs to window and words.
+Motions longer than the training's are made in overlapping windows that agree at every step, and spans of
+other captions are windows of their own: a frame is the mean of the predictions for it, weighed by how much it
+belongs to window and caption.
 
-Legend: n motions of one task, T frames, D features, S stretches of words, K rows (a window and its words),
-W frames of a window, M pins.
+Legend: n motions of one task, T frames, D features, K rows (a window and its caption), W frames of a window,
+M pins.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ import torch
 from torch import Tensor
 from torch.func import jvp
 
-from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.diffusion.inbetweener import InBetweener
+from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.observed import Places, observed_columns
 from motionloom.models.diffusion.recovery import Recovery, turned_back
 from motionloom.models.diffusion.sampling import blend_weights, window_starts
@@ -32,12 +33,12 @@ from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.frozen import evaluating
 
 HEADING_METRES = 0.5
-"""What a radian of heading counts as: how far it moves a hand."""
+"""Metres that a radian of heading counts as: how far it moves a hand [ours]."""
 
 
 @dataclass(frozen=True)
 class Pins:
-    """Joints whose place is given, in metres, in the frame of `Places`."""
+    """Joints at known positions, in metres, in the frame of `Places`."""
 
     frames: Tensor
     """int64 [M]."""
@@ -48,12 +49,12 @@ class Pins:
 
 
 @dataclass(frozen=True)
-class Given:
-    """What is known of a motion."""
+class KnownMotion:
+    """A motion of which a part is known."""
 
     motion: Tensor
-    """[T, D], normalised; anything where nothing is known, unless `likeness` is asked for."""
-    known: Tensor
+    """[T, D], normalised; any values where nothing is known, unless there is a `likeness`."""
+    mask: Tensor
     """bool [T, D]."""
     places: Places | None = None
     """One row; None where the columns hold no root."""
@@ -61,33 +62,33 @@ class Given:
 
 
 @dataclass(frozen=True)
-class Worded:
-    """Words and the frames that they are about."""
+class CaptionSpan:
+    """A caption and the frames that it is about."""
 
     text: Tensor
-    """[E]; zeros without words."""
+    """[E]; zeros without a caption."""
     conditioned: bool
     share: Tensor
-    """[T]; the shares of all stretches sum to 1 in each frame."""
+    """[T]; the shares of all spans sum to 1 in each frame."""
 
 
 class Filling:
-    """Fills in what is not given.
+    """Fills in the free values of a motion.
 
     Args:
-        recovery: None where the columns hold no root; then nothing is pulled.
-        window: Frames denoised at once: what the network was trained on.
+        recovery: None where the columns hold no root; then there is no gradient step.
+        window: Frames denoised at once: those that the network was trained on.
         overlap: Frames that neighbouring windows share.
-        guidance: Of the words, classifier-free; 1 is off.
+        guidance: Classifier-free guidance of the captions; 1 is off.
         strength: Gradient steps towards places and pins in each denoising step; a fraction is a shorter one.
-        likeness: Of free values to `given.motion`, 0 to 1: denoising begins from it, noised so far.
+        likeness: Of free values to `known.motion`, 0 to 1: denoising begins from it, noised.
     """
 
     def __init__(
         self,
-        net: MotionDiffusion,
-        given: Given,
-        words: Sequence[Worded],
+        net: TextDenoiser,
+        known: KnownMotion,
+        captions: Sequence[CaptionSpan],
         recovery: Recovery | None,
         *,
         window: int,
@@ -96,61 +97,58 @@ class Filling:
         strength: float = 1.0,
         likeness: float = 0.0,
     ) -> None:
-        self.net, self.given, self.recovery = net, given, recovery
+        self.net, self.known, self.recovery = net, known, recovery
         self.guidance, self.strength, self.likeness = guidance, strength, likeness
         self.noiser = net.config.schedule.noiser()
-        frames = len(given.motion)
+        frames = len(known.motion)
         self.size = min(window, frames)
         overlap = min(overlap, self.size // 2)
         starts = window_starts(frames, self.size, overlap)
-        blend = blend_weights(starts, self.size, overlap, frames).to(given.motion)
-        free = ~given.known.all(1)
+        blend = blend_weights(starts, self.size, overlap, frames).to(known.motion)
+        free = ~known.mask.all(1)
         rows = [
-            (start, said, blend[number] * said.share)
-            for (number, start), said in product(enumerate(starts), words)
+            (start, span, blend[number] * span.share)
+            for (number, start), span in product(enumerate(starts), captions)
         ]
-        # What lies in a window without anything to fill in, or with no word of its words, needs no network.
+        # Windows without free values, or without a frame of the span's caption, need no network.
         rows = [row for row in rows if (row[2] * free).any()]
         self.starts = [start for start, _, _ in rows]
         shares = torch.stack([share for _, _, share in rows])
         self.shares = shares / shares.sum(0).clamp(min=1e-9)
-        self.text = torch.stack([said.text for _, said, _ in rows])
-        self.conditioned = torch.tensor([said.conditioned for _, said, _ in rows], device=self.text.device)
-        self.seen = torch.stack([self._seen(start) for start in self.starts])
-        self._joints = self._joints_of()
+        self.text = torch.stack([span.text for _, span, _ in rows])
+        self.conditioned = torch.tensor([span.conditioned for _, span, _ in rows], device=self.text.device)
+        # MDM has no observed columns: it sees the known part only as it is put into its predictions.
+        observing = isinstance(net, InBetweener)
+        self.observed = [torch.stack([self._observed(one) for one in self.starts])] if observing else []
+        self._boundaries = self._boundary_filters()
 
     def __call__(self, seeds: Sequence[int], sampler: Sampler, steps: int) -> Tensor:
-        """Motions [n, T, D], normalised, one for each seed; what is known in them is the given to the bit."""
-        given, schedule = self.given, self.net.config.schedule
+        """Return motions [n, T, D], normalised, one for each seed; known values are kept to the bit."""
+        known, schedule = self.known, self.net.config.schedule
         noise = [torch.Generator().manual_seed(seed) for seed in seeds]
-        x = torch.stack([torch.randn(given.motion.shape, generator=one) for one in noise]).to(given.motion)
+        x = torch.stack([torch.randn(known.motion.shape, generator=one) for one in noise]).to(known.motion)
+        # A likeness leaves out the first steps: the motion is noised as far as the next step expects.
         skip = min(round(self.likeness * steps), steps - 1)
         if skip:
             begin = schedule.sampler(sampler, steps).timesteps[skip].expand(len(x)).to(x.device)
-            x = self.noiser.add_noise(given.motion.expand_as(x), x, begin).to(x)
+            x = self.noiser.add_noise(known.motion.expand_as(x), x, begin).to(x)
         with evaluating(self.net):
-            made = schedule.denoise(self._predict, x, noise, sampler, steps, skip=skip)
-        return self._replaced(self._joined(made))
+            filled = schedule.denoise(self._predict, x, noise, sampler, steps, skip=skip)
+        return self._with_known(self._smoothed(filled))
 
-    def _seen(self, start: int) -> Tensor:
-        """What the network is shown of a window [W, 2 D + 6]."""
+    def _observed(self, start: int) -> Tensor:
+        """Return the observed columns of a window [W, 2 D + 6]."""
         inside = slice(start, start + self.size)
-        places = None if self.given.places is None else _from_window(self.given.places, inside)
-        return observed_columns(self.given.motion[None, inside], self.given.known[None, inside], places)[0]
+        places = None if self.known.places is None else _places_of_window(self.known.places, inside)
+        return observed_columns(self.known.motion[None, inside], self.known.mask[None, inside], places)[0]
 
     @torch.no_grad()
     def _predict(self, x: Tensor, step: Tensor) -> Tensor:
-        """The network's prediction for motions x [n, T, D], after what is known and asked of it."""
-        found = self._blended(x, step)
-        if self.net.config.schedule.predicts == "sample":
-            return self._pulled(self._joined(found))
-        kept = self.noiser.alphas_cumprod[int(step)].to(x)
-        found = (x - (1 - kept).sqrt() * found) / kept.sqrt()
-        clean = self._pulled(self._joined(found))
-        return (x - kept.sqrt() * clean) / (1 - kept).sqrt()
+        """Return the predicted clean motions of x [n, T, D], corrected by what is known."""
+        return self._gradient_steps(self._smoothed(self._blended(x, step)))
 
     def _blended(self, x: Tensor, step: Tensor) -> Tensor:
-        """The means of all rows' predictions [n, T, D]."""
+        """Return the means of all rows' predictions [n, T, D]."""
         count, guided = len(x), self.guidance != 1.0 and bool(self.conditioned.any())
         windows = torch.stack([x[:, start : start + self.size] for start in self.starts], dim=1)
         rows = windows.flatten(0, 1)
@@ -160,10 +158,11 @@ class Filling:
 
         mask = torch.ones(rows.shape[:2], dtype=torch.bool, device=x.device)
         at = step.to(x.device).expand(len(rows))
-        inputs = repeated(self.text), mask, repeated(self.conditioned)
-        found = self.net(rows, at, *inputs, repeated(self.seen))
+        text, conditioned = repeated(self.text), repeated(self.conditioned)
+        observed = [repeated(columns) for columns in self.observed]
+        found = self.net(rows, at, text, mask, conditioned, *observed)
         if guided:
-            without = self.net(rows, at, inputs[0], mask, torch.zeros_like(inputs[2]), repeated(self.seen))
+            without = self.net(rows, at, text, mask, torch.zeros_like(conditioned), *observed)
             found = without + self.guidance * (found - without)
         found = found.view(count, len(self.starts), *found.shape[1:])
         out = torch.zeros_like(x)
@@ -172,100 +171,101 @@ class Filling:
             out[:, inside] += self.shares[number, inside, None] * found[:, number]
         return out
 
-    def _replaced(self, motion: Tensor) -> Tensor:
-        return torch.where(self.given.known, self.given.motion, motion)
+    def _with_known(self, motion: Tensor) -> Tensor:
+        return torch.where(self.known.mask, self.known.motion, motion)
 
-    def _misses(self, motion: Tensor) -> Tensor:
-        """By how much motions [n, T, D] miss places, headings and pins, in metres [n, ...]."""
-        assert self.recovery is not None and self.given.places is not None
-        places, pins = self.given.places, self.given.pins
+    def _errors(self, motion: Tensor) -> Tensor:
+        """Return the errors of motions [n, T, D] in places, headings and pins, in metres [n, ...]."""
+        assert self.recovery is not None and self.known.places is not None
+        places, pins = self.known.places, self.known.pins
         anchor = places.anchor.expand(len(motion))
         heading, place = self.recovery.way(motion, anchor)
-        stood, turned = places.place_known[0], places.heading_known[0]
-        misses = [
-            (place - places.place)[:, stood].flatten(1),
-            HEADING_METRES * (heading - places.heading)[:, turned],
+        errors = [
+            (place - places.place)[:, places.place_known[0]].flatten(1),
+            HEADING_METRES * (heading - places.heading)[:, places.heading_known[0]],
         ]
         if pins is not None:
             joints = self.recovery.world(motion, anchor)[:, pins.frames, pins.joints]
-            misses.append((joints - pins.positions).flatten(1))
-        return torch.cat(misses, dim=1)
+            errors.append((joints - pins.positions).flatten(1))
+        return torch.cat(errors, dim=1)
 
-    def _pulled(self, motion: Tensor) -> Tensor:
-        """Free values moved against the gradient of the squared misses, each step as far as helps most."""
-        if self.recovery is None or self.given.places is None:
+    def _gradient_steps(self, motion: Tensor) -> Tensor:
+        """Return motions moved in their free values against the gradient of the squared errors."""
+        if self.recovery is None or self.known.places is None:
             return motion
         left = self.strength
         while left > 0:
             with torch.enable_grad():
                 at = motion.detach().requires_grad_()
-                misses = self._misses(at)
-                [slope] = torch.autograd.grad(misses.square().sum() / 2, at)
-            slope = slope.masked_fill(self.given.known, 0.0)
-            change: Tensor = jvp(self._misses, (motion,), (slope,))[1]
+                [slope] = torch.autograd.grad(self._errors(at).square().sum() / 2, at)
+            slope = slope.masked_fill(self.known.mask, 0.0)
+            # The length of a step minimises the errors as they change linearly along the gradient.
+            change: Tensor = jvp(self._errors, (motion,), (slope,))[1]
             size = slope.square().sum((1, 2)) / change.square().sum(1).clamp(min=1e-12)
             motion = motion - min(left, 1.0) * size[:, None, None] * slope
             left -= 1
         return motion
 
-    def _joined(self, motion: Tensor) -> Tensor:
-        """Motions [n, T, D] with what is known in its place, and the free values led to it.
+    def _smoothed(self, motion: Tensor) -> Tensor:
+        """Return motions [n, T, D] with known values in place and free values corrected towards them.
 
-        Networks do not quite begin where the kept part ends, and small ones tremble. By how much they miss
-        what is known is taken from the free values too, less and less away from it and with as little bending
-        as that needs; then each column is the nearest to theirs whose second differences are small.
+        Networks do not quite begin where the known part ends, and small ones tremble. The error at known
+        values is therefore subtracted from the free ones too, less and less away from the boundary and with
+        as little bending as that needs; then each column becomes the nearest with small second differences.
         """
-        out = self._replaced(motion)
-        missed = out - motion
-        for columns, leading, smoother in self._joints:
-            led = out[..., columns] + torch.einsum("ts,nsd->ntd", leading, missed[..., columns])
-            out[..., columns] = torch.einsum("ts,nsd->ntd", smoother, led)
+        out = self._with_known(motion)
+        error = out - motion
+        for columns, correction, smoother in self._boundaries:
+            corrected = out[..., columns] + torch.einsum("ts,nsd->ntd", correction, error[..., columns])
+            out[..., columns] = torch.einsum("ts,nsd->ntd", smoother, corrected)
         return out
 
-    def _joints_of(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """Columns that are known in the same frames; what leads them there, and what smooths them: [T, T]."""
-        known, like = self.given.known, self.given.motion
+    def _boundary_filters(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Return, for columns that are known in the same frames: the columns, and the matrices [T, T] that
+        spread the error at known frames over free ones and that smooth the result.
+        """
+        known, like = self.known.mask, self.known.motion
         one = torch.eye(len(known), dtype=torch.float64)
         bends = one.diff(n=2, dim=0)
         bending = bends.T @ bends
+        # Columns share a mask by parts of the figure, so there are few matrices to invert.
         patterns, of = np.unique(known.T.cpu().numpy(), axis=0, return_inverse=True)
         out = []
         for number, pattern in enumerate(patterns):
             free = torch.from_numpy(~pattern)[:, None]
-            leading = torch.linalg.inv(torch.where(free, bending + _LETTING_GO * one, one)) * free
+            correction = torch.linalg.inv(torch.where(free, bending + _DECAY * one, one)) * free
             smoother = torch.linalg.inv(one + _STIFFNESS * bending * free)
             columns = torch.from_numpy(np.flatnonzero(of.reshape(-1) == number))
-            out.append((columns.to(like.device), leading.to(like), smoother.to(like)))
+            out.append((columns.to(like.device), correction.to(like), smoother.to(like)))
         return out
 
 
 _STIFFNESS = 1.0
-"""Of what is made: 1 halves what goes to and fro 3.3 times a second at 20 frames a second."""
-_LETTING_GO = 3.0**-4
-"""Of what is led: it follows for about three frames."""
+"""Weight of second differences in smoothing [ours]: 1 halves oscillations of 3.3 Hz at 20 frames a second."""
+_DECAY = 3.0**-4
+"""Weight of a correction's size beside its bending [ours]: it lasts for about three frames."""
 
 
-def _from_window(places: Places, inside: slice) -> Places:
-    """The places of a window, seen from its first known one."""
+def _places_of_window(places: Places, inside: slice) -> Places:
+    """Return the places of a window, relative to its first known one."""
     heading, place = places.heading[:, inside], places.place[:, inside]
-    turned, stood = places.heading_known[:, inside], places.place_known[:, inside]
-    both = turned & stood
-    known = both if bool(both.any()) else stood
-    first = known.byte().argmax(1)
+    heading_known, place_known = places.heading_known[:, inside], places.place_known[:, inside]
+    both = heading_known & place_known
+    first = (both if bool(both.any()) else place_known).byte().argmax(1)
     angle, origin = heading[0, first], place[0, first]
-    if not bool(both.any()) and bool(stood.any()):
-        angle = _tangent(place[0], stood[0])
-        turned = turned.clone()
-        turned[0, first] = True
+    if not bool(both.any()) and bool(place_known.any()):
+        # A path without headings faces where it goes.
+        angle = _tangent(place[0], place_known[0])
+        heading_known = heading_known.clone()
+        heading_known[0, first] = True
         heading = heading.clone()
         heading[0, first] = angle
-    away = place - origin
-    seen = turned_back(away, angle)
-    return Places(first, heading - angle, seen, turned, stood)
+    relative = turned_back(place - origin, angle)
+    return Places(first, heading - angle, relative, heading_known, place_known)
 
 
 def _tangent(place: Tensor, known: Tensor) -> Tensor:
-    """Heading [1] of the way from the first known place to the next that is half a metre off, or the last."""
+    """Return the heading [1] from the first known place to the next that is half a metre off, or the last."""
     points = place[known]
     away = points - points[0]
     far = away.norm(dim=-1) > 0.5

@@ -7,15 +7,15 @@ features.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from motionloom.models.diffusion.dmd import Dmd, dmd_loss
-from motionloom.models.diffusion.network import MotionDiffusion
-from motionloom.models.diffusion.observed import Showing
+from motionloom.models.diffusion.inbetweener import InBetweener
+from motionloom.models.diffusion.network import TextDenoiser
+from motionloom.models.diffusion.observed import Observations
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
@@ -24,7 +24,7 @@ from motionloom.models.training.stage_module import Batch, OptimConfig, StageMod
 
 
 class DenoiserModule(StageModule):
-    """Trains a denoiser of whole motions on captioned `ConditionBatches`; a kind of it says `predicted`."""
+    """Trains a denoiser of whole motions on captioned `ConditionBatches`."""
 
     net: Any
 
@@ -33,57 +33,68 @@ class DenoiserModule(StageModule):
         self.noiser = self.net.config.schedule.noiser()
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
-        [B, D] (optional: all). Time steps and noise are drawn in each call.
+        """Return the loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present"
+        bool [B, D] (optional: all). Time steps and noise are drawn in each call.
         """
         motion, schedule = batch["motion"], self.net.config.schedule
         mask = length_mask(batch["length"], motion.shape[1])
         step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
         noise = torch.randn_like(motion)
-        found = self.predicted(self.noiser.add_noise(motion, noise, step), step, batch, mask)
+        predicted = self.predict(self.noiser.add_noise(motion, noise, step), step, batch, mask)
         target = motion if schedule.predicts == "sample" else noise
-        return {"loss": self.mean(found - target.to(found.dtype), mask, batch.get("present"))}
+        return {"loss": self.mean(predicted - target.to(predicted.dtype), mask, batch.get("present"))}
 
-    @abstractmethod
-    def predicted(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
-        """The network's answer [B, T, D] to noisy motions at step [B]; mask bool [B, T]."""
+    def predict(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
+        """Return the network's prediction [B, T, D] for noisy motions at step [B]; mask bool [B, T]."""
+        predicted: Tensor = self.net(noisy, step, batch["conditions"]["text"], mask)
+        return predicted
 
     def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
-        """Of squared errors [B, T, D] where mask [B, T] and present [B, D] say: every real frame alike."""
+        """Return the mean square of errors [B, T, D] where mask [B, T] and present [B, D] are set: every real
+        frame counts alike.
+        """
         return masked_mean(error.square(), mask, present)
 
 
-class DiffusionModule(DenoiserModule):
-    """Trains a `MotionDiffusion`. Every clip counts alike, as in MDM; in evaluation no caption is dropped."""
+class TextDenoiserModule(DenoiserModule):
+    """Trains a `TextDenoiser` as MDM is: every clip counts alike; captions are dropped in training alone."""
 
-    net: MotionDiffusion
+    net: TextDenoiser
 
-    def __init__(
-        self,
-        net: MotionDiffusion,
-        optim: OptimConfig,
-        *,
-        seed: int,
-        max_steps: int,
-        showing: Showing | None = None,
-    ) -> None:
-        """`showing` is for networks with `observed` columns."""
-        super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.showing = showing
+    def predict(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
+        predicted: Tensor = self.net(*self.conditions(noisy, step, batch, mask))
+        return predicted
 
-    def predicted(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
-        hidden = self.net.config.condition_dropout if self.training else 0.0
-        conditioned = torch.rand(len(noisy), device=noisy.device) >= hidden
-        seen = None if self.showing is None else self.showing(batch["motion"], batch["length"])
-        found: Tensor = self.net(noisy, step, batch["conditions"]["text"].pooled, mask, conditioned, seen)
-        return found
+    def conditions(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> tuple[Tensor, ...]:
+        """Return the arguments of a `TextDenoiser`, with texts hidden at random."""
+        dropped = self.net.config.condition_dropout if self.training else 0.0
+        conditioned = torch.rand(len(noisy), device=noisy.device) >= dropped
+        return noisy, step, batch["conditions"]["text"].pooled, mask, conditioned
 
     def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
-        loss = mean_of_rows(error.square(), mask, present)
-        weight = self.net.config.velocity_weight
-        if weight:
-            loss = loss + weight * mean_of_rows(error.diff(dim=1).square(), mask[:, 1:], present)
-        return loss
+        return mean_of_rows(error.square(), mask, present)
+
+
+class InBetweenModule(TextDenoiserModule):
+    """Trains an `InBetweener`, which observes a part of each motion."""
+
+    net: InBetweener
+
+    def __init__(
+        self, net: InBetweener, optim: OptimConfig, *, seed: int, max_steps: int, observations: Observations
+    ) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.observations = observations
+
+    def predict(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
+        conditions = self.conditions(noisy, step, batch, mask)
+        observed = self.observations(batch["motion"], batch["length"])
+        predicted: Tensor = self.net(*conditions, observed)
+        return predicted
+
+    def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
+        speed_error = mean_of_rows(error.diff(dim=1).square(), mask[:, 1:], present)
+        return super().mean(error, mask, present) + self.net.config.velocity_weight * speed_error
 
 
 class DmdModule(StageModule):

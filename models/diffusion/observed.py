@@ -1,11 +1,10 @@
-"""What a denoiser is shown of the motion that it makes: known columns of some frames, and known places.
+"""The observed columns of the in-betweener: known features of some frames, and known places of the root.
 
-A network with `observed` columns reads them beside the noise [ours, as conditional in-betweening models do].
-Features hold the root's steps, not its place, so that where frames after a gap stand would be unknown: the
-places that are known are columns of their own, seen from the first known one.
+Features hold the root's steps, not its place, so the place of frames after a gap would be unknown. Known
+places are therefore columns of their own, relative to the first known one.
 
-Training shows each motion in one of the ways in which an edit will: its begin and end, single frames, parts
-of the figure, where the root goes, several at once, or nothing.
+Training observes each motion in one of the ways in which an edit will: its begin and end, single frames,
+parts of the figure, the root's path, several at once, or nothing.
 
 Legend: B batch, T frames, D features, P pieces of the figure (`figure_parts.py`).
 """
@@ -28,13 +27,13 @@ PLACE_COLUMNS = 6
 
 
 def observed_width(motion_dim: int) -> int:
-    """Columns that a network is shown of D features."""
+    """Return the number of observed columns of D features."""
     return 2 * motion_dim + PLACE_COLUMNS
 
 
 @dataclass(frozen=True)
 class Places:
-    """Where the root is, as far as it is known, seen from each row's `anchor` frame."""
+    """The root's place and heading where they are known, relative to each row's `anchor` frame."""
 
     anchor: Tensor
     """int64 [B]."""
@@ -55,33 +54,31 @@ class Places:
 
 
 def observed_columns(motion: Tensor, known: Tensor, places: Places | None) -> Tensor:
-    """What the network is shown [B, T, 2 D + 6] of motion [B, T, D], normalised, of which `known`
-    (bool [B, T, D]) is known.
-    """
-    shown = torch.cat([motion * known, known.to(motion.dtype)], dim=-1)
+    """Return the observed columns [B, T, 2 D + 6] of normalised motion [B, T, D], `known` bool [B, T, D]."""
+    features = torch.cat([motion * known, known.to(motion.dtype)], dim=-1)
     width = (*motion.shape[:-1], PLACE_COLUMNS)
-    beside = motion.new_zeros(width) if places is None else places.columns().to(motion.dtype)
-    return torch.cat([shown, beside], dim=-1)
+    root = motion.new_zeros(width) if places is None else places.columns().to(motion.dtype)
+    return torch.cat([features, root], dim=-1)
 
 
 def known_columns(pieces: Tensor, layout: MotionLayout, columns: NDArray[np.int64]) -> Tensor:
-    """Which values are known, bool [B, T, D], where `pieces` of the figure are, bool [B, T, P]."""
+    """Return which values are known, bool [B, T, D], given the known pieces of the figure, bool [B, T, P]."""
     of = torch.from_numpy(piece_columns(layout)[columns]).to(pieces.device)
     steps = torch.from_numpy(step_columns(layout)[columns]).to(pieces.device)
-    # A clip's last frame repeats the step before.
+    # A step is known where both its frames are; a clip's last frame repeats the step before.
     following = torch.cat([pieces[:, 1:], pieces[:, -1:]], dim=1)
     both = pieces & following
     both = both & both[..., LOWER : LOWER + 1]
     return torch.where(steps, both[..., of], pieces[..., of])
 
 
-class Showing:
-    """Draws what training shows of each motion.
+class Observations:
+    """Draws what training observes of each motion.
 
     Args:
-        layout: Of whole frames; `columns` of it are the motion's.
-        recovery: The root's way; None where the columns hold no root.
-        share: Of the motions, those that are shown anything.
+        layout: The layout of whole frames; the motions have these `columns` of it.
+        recovery: Recovers the root's path; None where the columns hold no root, then no places are observed.
+        share: Share of the motions of which anything is observed.
     """
 
     def __init__(
@@ -89,21 +86,22 @@ class Showing:
     ) -> None:
         self.layout, self.columns, self.recovery, self.share = layout, columns, recovery, share
 
-    @staticmethod
+    @classmethod
     def of(
+        cls,
         layout: MotionLayout,
         columns: NDArray[np.int64],
         mean: NDArray[np.float32],
         std: NDArray[np.float32],
         share: float,
-    ) -> Showing:
-        """Of motion normalised by `mean` and `std`; where the columns hold no root, no places are shown."""
+    ) -> Observations:
+        """Return those of motion normalised by `mean` and `std`."""
         rooted = Recovery.possible(layout, columns)
         recovery = Recovery(layout, columns, mean, std) if rooted else None
-        return Showing(layout, columns, recovery, share)
+        return cls(layout, columns, recovery, share)
 
     def __call__(self, motion: Tensor, length: Tensor) -> Tensor:
-        """The observed columns [B, T, 2 D + 6] of motion [B, T, D], the first `length` [B] frames of it."""
+        """Return the observed columns [B, T, 2 D + 6] of motion [B, T, D] with `length` [B] real frames."""
         pieces, path = self._draw(length, motion.shape[1])
         known = known_columns(pieces, self.layout, self.columns)
         places = None

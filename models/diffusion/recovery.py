@@ -19,7 +19,7 @@ from motionloom.datasets.schema import UserError
 
 
 class Recovery:
-    """Of the `columns` of a layout, of features that were normalised by `mean` and `std` [D] of its columns.
+    """Recovers joints from the `columns` of a layout, normalised by `mean` and `std` [D] of its columns.
 
     `UserError` where the columns do not hold the root.
     """

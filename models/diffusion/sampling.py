@@ -19,7 +19,7 @@ from torch import Tensor
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd
-from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.schedule import Sampler, by_length
 from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.tokens import Codes
@@ -29,7 +29,7 @@ from motionloom.models.tokenizer.base import GROUP_FRAMES
 
 @torch.no_grad()
 def sample_motions(
-    net: MotionDiffusion,
+    net: TextDenoiser,
     text: Tensor,
     frames: Sequence[int],
     *,

@@ -31,7 +31,7 @@ class StepOutput(Protocol):
 
 
 class Scheduler(Protocol):
-    """What is used of diffusers' schedulers."""
+    """The part of diffusers' schedulers that is used here."""
 
     timesteps: Tensor
     alphas_cumprod: Tensor

@@ -14,7 +14,7 @@ from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.distributed import gather_rows_with_grad, masked_mean
 
 MOVEMENT, MATCHING = "movement", "matching"
-"""The players, in the order in which they are trained."""
+"""The groups, in the order in which they are trained."""
 
 
 class EvaluatorLossConfig(Config):

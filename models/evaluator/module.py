@@ -14,12 +14,12 @@ from motionloom.models.evaluator.losses import (
     movement_loss,
 )
 from motionloom.models.evaluator.network import UNIT, Evaluator
+from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.training.players import Player, PlayersModule
 from motionloom.models.training.stage_module import Batch
 
 
-class EvaluatorModule(PlayersModule):
+class EvaluatorModule(AlternatingModule):
     """Trains an `Evaluator` on captioned `ConditionBatches`.
 
     For the first `movement_steps` the movement encoder is trained with a decoder that no latent needs, from
@@ -44,28 +44,30 @@ class EvaluatorModule(PlayersModule):
         self.movement_optim, self.movement_steps = movement_optim, movement_steps
         self.loss_config = loss or EvaluatorLossConfig()
 
-    def players(self) -> Sequence[Player]:
+    def optimizer_groups(self) -> Sequence[OptimizerGroup]:
         """The movement encoder first, then the pairs; not in turn."""
         net = self.net
         texts = (
             (net.text_encoder,) if net.class_embedding is None else (net.text_encoder, net.class_embedding)
         )
         return (
-            Player(
+            OptimizerGroup(
                 MOVEMENT,
                 (net.movement_encoder, self.decoder),
                 self.movement_optim,
                 end_step=self.movement_steps,
             ),
-            Player(MATCHING, (net.motion_encoder, *texts), self.optim_config, start_step=self.movement_steps),
+            OptimizerGroup(
+                MATCHING, (net.motion_encoder, *texts), self.optim_config, start_step=self.movement_steps
+            ),
         )
 
-    def play(self, player: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
+    def losses_of(self, group: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """Losses of a batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
         [B, D] (optional: all).
         """
         net, motion, length, present = self.net, batch["motion"], batch["length"], batch.get("present")
-        if player == MATCHING:
+        if group == MATCHING:
             text = batch["conditions"]["text"]
             latents = net.encode_text(text.features, text.mask), net.encode_motion(motion, length, present)
             return matching_loss(*latents, margin=self.loss_config.margin)

@@ -33,7 +33,7 @@ from motionloom.datasets.schema import Config
 from motionloom.models.layers.transformer import length_mask
 
 PART: Part = "bodyhand"
-"""What is judged; a face has no counterpart in the published evaluator."""
+"""The columns that are judged; a face has no counterpart in the published evaluator."""
 
 UNIT = 4
 """Frames of a unit."""

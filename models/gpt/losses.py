@@ -30,8 +30,8 @@ class GptLossConfig(Config):
     align_from: int = Field(default=0, ge=0)
     """Step at which L_align begins [ours]; it takes half of a step's time, and at first all is noise."""
     align_on: Literal["predictions", "samples"] = "predictions"
-    """What L_align judges [ours]: tokens predicted after the true ones, or motions that the model samples
-    itself. Those take several times longer; start such a stage from a trained GPT
+    """Motions that L_align judges [ours]: tokens predicted after the true ones, or motions that the model
+    samples itself. Those take several times longer; start such a stage from a trained GPT
     (`inputs: {start: gpt}`)."""
     samples: int = Field(default=2, ge=2)
     """Motions sampled for each caption, for `align_on: samples`."""

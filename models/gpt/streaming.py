@@ -48,7 +48,7 @@ class TokenStream:
         self._text: Tensor | None = None
         self._cache: KVCache | None = None
         self._inputs = gpt.null_text.new_zeros(1, 0, gpt.config.dim)
-        """What the network has not read yet, [1 or 2, L, D]."""
+        """Embeddings that the network has not read yet, [1 or 2, L, D]."""
         self._block = torch.zeros(1, 0, dtype=torch.int64, device=gpt.null_text.device)
         """Tokens of this block, those that it goes on from included, [1, L]."""
         self._drawn = 0

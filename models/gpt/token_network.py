@@ -71,7 +71,7 @@ class TokenNetwork(nn.Module):
     def embed_inputs(
         self, tokens: Tensor, kinds: Tensor, inputs: Tensor | None, known: Tensor | None, block_size: int
     ) -> Tensor:
-        """What training reads before each token but the first: embeddings [B, L - 1, D].
+        """Return the inputs before each token but the first in training: embeddings [B, L - 1, D].
 
         Args:
             tokens: int64 [B, L], padded with -1.

@@ -147,7 +147,7 @@ class Basis(nn.Module):
         return joints, x[..., self.wrists[field]].reshape(*x.shape[:-1], 2, 1, 1, 3)
 
     def _spread(self) -> Tensor:
-        """What velocities are divided by, [2, 5, 3, 3]."""
+        """Return the divisors of velocities, [2, 5, 3, 3]."""
         return self.std[self.fingers[1]].reshape(*FINGERS, 3)
 
 

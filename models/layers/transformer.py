@@ -51,7 +51,7 @@ def waves(position: Tensor, dim: int) -> Tensor:
 
 
 class StackConfig(Config):
-    """What configs of transformers share; subclasses choose defaults and have a width `dim`."""
+    """Sizes of a transformer; subclasses choose defaults and have a width `dim`."""
 
     heads: int = Field(default=8, ge=1)
     ff: int = Field(default=1024, ge=1)
@@ -115,7 +115,7 @@ class SelfAttention(nn.Module):
         self.heads = heads
         self.attention_dropout = attention_dropout
         self.scale: float | None = None
-        """Of the products of queries and keys; None is the width of a head to the power of -1/2."""
+        """Factor of the products of queries and keys; None is the width of a head to the power of -1/2."""
         self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
         self.out = nn.Linear(dim, dim)
 

@@ -114,7 +114,7 @@ SHORTEST = 4
 
 
 class Physics(NamedTuple):
-    """Of one motion."""
+    """Metrics of one motion."""
 
     skating: float
     """Share of the steps in which a foot slides, see `foot_skating`."""
@@ -127,7 +127,7 @@ class Physics(NamedTuple):
 
 
 def physics(joints: NDArray[np.floating], fps: float) -> Physics:
-    """Of joints [T >= 4, N >= 12, 3]."""
+    """Return the metrics of joints [T >= 4, N >= 12, 3]."""
     x = np.asarray(joints, dtype=np.float64)
     if x.ndim != 3 or len(x) < SHORTEST or x.shape[1] < 12 or x.shape[2] != 3:
         raise UserError(f"physics needs joints [T >= 4, N >= 12, 3], not {list(x.shape)}")

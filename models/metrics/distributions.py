@@ -30,7 +30,7 @@ def statistics(x: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _eigenvalues(a: Tensor, b: Tensor) -> Tensor:
-    """Those of `a` `b` [Z], both symmetric and not negative."""
+    """Return the eigenvalues of `a` `b` [Z], both symmetric and not negative."""
     from scipy.linalg import LinAlgError, eigh
 
     try:

@@ -24,14 +24,14 @@ _FEET = (7, 10, 8, 11)
 _SIDES = ((1, 2), (16, 17))
 """Left and right hip, left and right shoulder."""
 PUBLIC_SIDES = ((3, 2), (18, 17))
-"""What public code reads in their place: it removes the root, and then looks hips and shoulders up by the
-numbers they had with it. The heading is that of the lowest spine joint and the right hip, and so on."""
+"""Joints that public code reads in their place: it removes the root, and then looks hips and shoulders up by
+the numbers they had with it. The heading is that of the lowest spine joint and the right hip, and so on."""
 _SOFTNESS = 0.5
 KINDS = ("joints", "pose", "root", "path")
 
 
 class PositionErrors(NamedTuple):
-    """Of one motion; means over joints."""
+    """Errors of one motion; means over joints."""
 
     ape: dict[str, float]
     """By `KINDS`, in m; mean over frames. Of several motions the mean over all frames counts."""
@@ -43,7 +43,7 @@ class PositionErrors(NamedTuple):
 def position_errors(
     made: Tensor, real: Tensor, *, sides: tuple[tuple[int, int], ...] = _SIDES
 ) -> PositionErrors:
-    """Of one motion against what was recorded for the same caption or song: [T, N, 3] each, metres, Y up.
+    """Return the errors of a motion against the recorded one, [T, N, 3] each, metres, Y up.
 
     Args:
         made: The motion that is judged.

@@ -1,4 +1,4 @@
-"""What all quantizers share: their result, usage metrics, and random rows that every rank agrees on.
+"""The kernel of all quantizers: their result, usage metrics, and random rows that every rank agrees on.
 
 Random rows of the global batch are chosen by a hash of (salt, step, row number) instead of a generator's
 state. The step is a registered buffer, so a resumed run repeats the undisturbed one; no rank needs to
@@ -22,7 +22,7 @@ _LAST = 2**62
 
 
 class QuantizerOutput(NamedTuple):
-    """What a quantizer returns."""
+    """The result of a quantizer."""
 
     quantized: Tensor
     """[B, L, d], straight-through: the value of the codes, the gradient of z."""
@@ -65,7 +65,7 @@ class Codebook(Protocol):
 
 
 class LearntCodebook(nn.Module):
-    """What codebooks learnt from data share: buffers, first codes drawn from a batch, freezing.
+    """Base of codebooks learnt from data: buffers, first codes drawn from a batch, freezing.
 
     A vector that is not finite counts as padding: a float16 overflow costs the optimizer one step, which the
     gradient scaler leaves out, and must not stay in the codebook for good.

@@ -12,18 +12,86 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Protocol, Self, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, Self, TypedDict, runtime_checkable
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import Config, UserError
 from motionloom.models.layers.basis import Basis
-from motionloom.models.quantize.base import Codebook
-from motionloom.models.tokenizer.config import BaseTokenizerConfig
+from motionloom.models.quantize.base import Codebook, QuantizerConfig
 
 GROUP_FRAMES = 4
+"""Frames of a group, whose tokens belong together (HumanTOMATO 3.2)."""
+
+Recon = Literal["l1", "l2", "smooth_l1"]
+
+
+class ConvSizes(TypedDict):
+    """Keyword arguments of the convolutional encoders and decoders."""
+
+    width: int
+    depth: int
+    dilation_growth: int
+
+
+class TokenizerConfig(Config):
+    """Settings of every tokenizer; the defaults are the papers' (HumanTOMATO B.2, UDE section 4.2)."""
+
+    kind: str
+
+    width: int = Field(default=512, ge=1)
+    """Channels of the convolutions."""
+    depth: int = Field(default=3, ge=1, le=32)
+    """Residual blocks per resolution."""
+    dilation_growth: int = Field(default=3, ge=1, le=16)
+    code_dim: int = Field(default=512, ge=1)
+    recon: Recon = "l2"
+    velocity_weight: float = Field(default=0.0, ge=0)
+    """Weight of the same reconstruction error between frame-to-frame differences."""
+    root_gain: float = Field(default=1.0, gt=0)
+    """How much more the root's columns count than others [ours]; see `layers/basis.py`."""
+    finger_gain: float = Field(default=0.0, ge=0)
+    """Above 0, fingers count by how they bend, in bone lengths times this [ours]; see `layers/basis.py`."""
+
+    def conv_sizes(self) -> ConvSizes:
+        """Keyword arguments of encoders and decoders."""
+        return {"width": self.width, "depth": self.depth, "dilation_growth": self.dilation_growth}
+
+    def commitment(self) -> float:
+        """Weight of the quantizers' penalty; 0 for quantizers without one."""
+        return 0.0
+
+    def codes_and_reset(self) -> tuple[int, float] | None:
+        """Return the size of each codebook and the uses below which a code is reset; None without resets."""
+        return None
+
+    @abstractmethod
+    def build(self, layout: MotionLayout) -> Tokenizer:
+        """Return an untrained tokenizer for motion of `layout`; `UserError` if the layout lacks the part."""
+
+
+class EmaTokenizerConfig(TokenizerConfig):
+    """Settings of tokenizers whose codebooks are moving averages."""
+
+    num_codes: int = Field(default=512, ge=2)
+    decay: float = Field(default=0.99, gt=0, lt=1)
+    reset_below: float = Field(default=1.0, gt=0)
+    alpha: float = Field(default=0.02, ge=0)
+    """Weight of the commitment penalty."""
+
+    def commitment(self) -> float:
+        return self.alpha
+
+    def quantizer(self) -> QuantizerConfig:
+        return QuantizerConfig(
+            num_codes=self.num_codes, dim=self.code_dim, decay=self.decay, reset_below=self.reset_below
+        )
+
+    def codes_and_reset(self) -> tuple[int, float]:
+        return self.num_codes, self.reset_below
 
 
 class Stream(NamedTuple):
@@ -36,7 +104,7 @@ class Stream(NamedTuple):
 
 
 class TokenizerOutput(NamedTuple):
-    """What `Tokenizer.forward` returns."""
+    """The result of `Tokenizer.forward`."""
 
     input: Tensor
     """[B, T, dim], the encoders' input in the coordinates of `Basis`; 0 in missing columns."""
@@ -86,7 +154,7 @@ class Tokenizer(nn.Module, ABC):
 
     def __init__(
         self,
-        config: BaseTokenizerConfig,
+        config: TokenizerConfig,
         layout: MotionLayout,
         part: Part,
         streams: tuple[Stream, ...],

@@ -18,6 +18,8 @@ A clip without hands teaches the hand codebook nothing; its hand latents are 0 w
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -27,10 +29,37 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
 from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.ema import EmaQuantizer
-from motionloom.models.tokenizer.base import Latents, Stream, Tokenizer, stream_metrics, token_mask, without
-from motionloom.models.tokenizer.config import H2VQConfig, SeparateConfig
+from motionloom.models.tokenizer.base import (
+    EmaTokenizerConfig,
+    Latents,
+    Stream,
+    Tokenizer,
+    stream_metrics,
+    token_mask,
+    without,
+)
 
 _HALVINGS = {"body": 1, "hand": 2}
+
+
+class H2VQConfig(EmaTokenizerConfig):
+    """Holistic Hierarchical VQ: a hand codebook at 4x, a body codebook at 2x."""
+
+    kind: Literal["h2vq"] = "h2vq"
+    part: Literal["bodyhand"] = "bodyhand"
+
+    def build(self, layout: MotionLayout) -> Tokenizer:
+        return H2VQ(self, layout)
+
+
+class SeparateConfig(EmaTokenizerConfig):
+    """Body and hand modelled apart (Tables 5 and 22): H2VQ's rates, but neither knows of the other."""
+
+    kind: Literal["separate"] = "separate"
+    part: Literal["bodyhand"] = "bodyhand"
+
+    def build(self, layout: MotionLayout) -> Tokenizer:
+        return SeparateVQ(self, layout)
 
 
 class BodyHandTokenizer(Tokenizer):

@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from motionloom.models.tokenizer.base import Tokenizer, TokenizerOutput
-from motionloom.models.tokenizer.config import Recon
+from motionloom.models.tokenizer.base import Recon, Tokenizer, TokenizerOutput
 from motionloom.models.training.distributed import masked_mean
 from motionloom.models.training.stage_module import Batch, StageModule
 

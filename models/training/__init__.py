@@ -1,1 +1,1 @@
-"""What the training of every network shares."""
+"""The kernel of every network's training."""

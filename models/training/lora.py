@@ -19,7 +19,7 @@ LAYERS = ("attention.qkv", "attention.out", "ff_in", "ff_out")
 """Every linear layer of a transformer block [ours]: attention alone has less room for new motion."""
 
 _NAME = "default"
-"""What peft calls the one adapter of a layer."""
+"""peft's name of a layer's only adapter."""
 
 
 class LoraConfig(Config):
@@ -28,13 +28,13 @@ class LoraConfig(Config):
     rank: int = Field(16, ge=1)
     """Width of an adapter."""
     alpha: int = Field(32, ge=1)
-    """What an adapter gives is multiplied by this over `rank`."""
+    """An adapter's output is multiplied by this over `rank`."""
     dropout: float = Field(0.0, ge=0, lt=1)
-    """Of an adapter's input."""
+    """Dropout of an adapter's input."""
     layers: tuple[str, ...] = Field(LAYERS, min_length=1)
     """Ends of the names of the linear layers that are adapted."""
     whole: tuple[str, ...] = ()
-    """What is trained whole beside the adapters, by the first word of its name: `text_in`, `embeddings`,
+    """Modules trained in full beside the adapters, by the first word of their names: `text_in`, `embeddings`,
     `heads`."""
 
 

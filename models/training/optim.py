@@ -36,7 +36,7 @@ class OptimConfig(Config):
         return kind(params, lr=self.lr, betas=self.betas, weight_decay=self.weight_decay, fused=fused)
 
     def factor(self, step: int, max_steps: int) -> float:
-        """What `lr` is multiplied by in step `step` of `max_steps`: warm-up, then schedule and drops."""
+        """Return the factor of `lr` in step `step` of `max_steps`: warm-up, then schedule and drops."""
         dropped = self.drop_factor ** sum(step >= at for at in self.drop_at)
         return dropped * self._scheduled(step, max_steps)
 

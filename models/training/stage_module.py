@@ -61,7 +61,7 @@ class Execution:
     half: torch.dtype | None = None
     """Type of mixed precision; None computes in the type of the weights."""
     scaler: GradScaler | None = None
-    """Of float16, which alone needs one."""
+    """The loss scaler of float16, which alone needs one."""
 
     def autocast(self) -> AbstractContextManager[object]:
         """Mixed precision of a forward pass; every use of a weight has a cast of its own, so that its
@@ -105,7 +105,7 @@ class StageModule(L.LightningModule, ABC):
         self.gauges: dict[str, float | Tensor] = {}
         """Learning rate and gradient norm of the step that the newest row of the log ends with."""
         self.figures: list[StepFigures] = []
-        """Of all parts of steps since these lists were last cleared."""
+        """Return the means over all parts of steps since these lists were last cleared."""
         self.norms: list[tuple[int, Tensor]] = []
         """(step, norm of the gradients) likewise, where a norm was computed."""
         self._sums: dict[tuple[str, ...], tuple[Tensor, int]] = {}
@@ -186,7 +186,7 @@ class StageModule(L.LightningModule, ABC):
         return means
 
     def row_state(self) -> list[Means]:
-        """What was added since the last row, for a checkpoint."""
+        """Return the sums since the last row, for a checkpoint."""
         return [
             {"names": list(names), "sums": sums.cpu(), "count": count}
             for names, (sums, count) in self._sums.items()

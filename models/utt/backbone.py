@@ -1,4 +1,4 @@
-"""What carries a prefix and motion tokens through the UTT: a transformer, or a GRU (UDE Table 3).
+"""The UTT's network over a prefix and motion tokens: a transformer, or a GRU (UDE Table 3).
 
 Both take a prefix [B, S, D] whose padding a mask marks, and inputs [B, L, D] that may see the whole prefix
 and the inputs up to themselves. `forward` does all at once, for training; `begin` and `extend` do the same

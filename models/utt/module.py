@@ -25,14 +25,14 @@ from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.tokens import TokenSequence, interleave
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
+from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.training.players import Player, PlayersModule
 from motionloom.models.training.stage_module import Batch, Execution
 from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.network import ConditionedUtt
 
 
-class UttModule(PlayersModule):
+class UttModule(AlternatingModule):
     """Trains a `ConditionedUtt` on `ConditionBatches`; the tokenizer is only looked through."""
 
     net: ConditionedUtt
@@ -76,28 +76,28 @@ class UttModule(PlayersModule):
         self._weigh()
         return super().losses(batch)
 
-    def players(self) -> list[Player]:
+    def optimizer_groups(self) -> list[OptimizerGroup]:
         """The token model, then the discriminator of what it has made."""
-        players = [Player("tokens", (self.net,), self.optim_config)]
+        groups = [OptimizerGroup("tokens", (self.net,), self.optim_config)]
         if self.discriminator is not None:
             config = self.loss_config
-            players.append(
-                Player(
+            groups.append(
+                OptimizerGroup(
                     "critic",
                     (self.discriminator,),
                     config.discriminator_optim,
                     start_step=config.adversarial_start,
                 )
             )
-        return players
+        return groups
 
-    def play(self, player: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
-        """A player's loss of one batch.
+    def losses_of(self, group: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A group's loss of one batch.
 
         "motion" [B, T, D] (the tokenizer's columns), "length" [B], "closed" bool [B] (whether the clip ends
         with the window), "conditions", "present" bool [B, D] (optional: all).
         """
-        if player == "critic":
+        if group == "critic":
             return self._critic(batch, shared)
         return self._tokens(batch, shared)
 

@@ -1,4 +1,4 @@
-"""What a stage takes: roles, and what fills them once it is loaded."""
+"""The inputs of a stage: roles, and the loaded stages that fill them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Role:
     name: str
     optional: bool
     gives: str
-    """What must fill it: a stage of the kind of this name, or one that gives this."""
+    """The stage that must fill it: a stage of the kind of this name, or one that gives this."""
 
     @staticmethod
     def parse(text: str) -> Role:
@@ -60,7 +60,7 @@ class MissingInputError(UserError, KeyError):
 
 
 class Inputs(Mapping[str, Any]):
-    """What the inputs of a stage load as, by role; each is loaded when it is first asked for.
+    """The loaded inputs of a stage, by role; each is loaded when it is first read.
 
     A stage that trains declares its inputs as a subclass: a role is an annotated attribute, optional if its
     type allows None. `filled_by` names what fills a role that is called otherwise.

@@ -36,7 +36,7 @@ from motionloom.pipeline.store.weights import LayoutFacts
 
 
 def preview_of(stage: Stage, others: Mapping[str, Stage | Finished]) -> object:
-    """What a stage of a recipe will give, as far as it is known before it has run."""
+    """Return the preview of a recipe's stage, as far as it is known before it has run."""
     return stage.kind.preview(stage.config, previews(stage, others))
 
 
@@ -53,7 +53,7 @@ def previews(stage: Stage, others: Mapping[str, Stage | Finished]) -> Inputs:
 
 
 def preview_of_finished(stage: Finished) -> object:
-    """What a finished stage gives, without what only running it needs."""
+    """Return a completed stage's output, without what only running it needs."""
     makers: dict[str, Callable[[], object]] = {}
     for role, source in stage.inputs.items():
         makers[role] = partial(preview_of_finished, source)
@@ -128,7 +128,7 @@ def _require_roles(kind: StageKind, inputs: Mapping[str, Finished], where: str) 
 
 
 def say_gone(run: Path, stage: str, place: Path) -> str:
-    """What to say where a stage outside a run is not there any more, and one of the run was made from it."""
+    """Return the message for a stage outside a run that is gone, where one of the run was made from it."""
     return (
         f"{run}: stage '{stage}' was made from {place}, where no finished stage is any more; put it back "
         f"there (a run finds it by the way from its own folder: move both together), or run the recipe again "
@@ -229,7 +229,7 @@ def exported_sampling(folder: Path) -> SamplingConfig:
 
 
 def read_bundle(folder: Path) -> BundleFile:
-    """What an export says of itself."""
+    """Return the description of an export."""
     path = folder / BUNDLE_FILE
     if read_record(path).get("format") != FORMAT:
         raise UserError(

@@ -1,4 +1,4 @@
-"""What a stage has to show: curves and figures in the report, sizes in a dry run."""
+"""Curves and figures of a stage in the report, sizes in a dry run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Showing(Protocol):
 
     @property
     def title(self) -> str:
-        """What is shown, for people."""
+        """Return the curve's title."""
         ...
 
 
@@ -49,7 +49,7 @@ class FigureTable:
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What a dry run says of a stage that trains, computed without any data."""
+    """Sizes of a stage that trains, computed without any data."""
 
     parameters: int
     codebook: int
@@ -57,7 +57,7 @@ class ModelCard:
     local_batch: int
     memory_bytes: int
     note: str
-    """What its tokens are."""
+    """Its tokens, in words."""
     steps: int
     checkpoint_bytes: int
-    """Of all that are kept at a time."""
+    """Bytes of all checkpoints that are kept at a time."""

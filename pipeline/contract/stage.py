@@ -45,19 +45,19 @@ from motionloom.pipeline.store.artifact import require_unchanged
 CPU = torch.device("cpu")
 
 GENERATOR = "generator"
-"""What a stage gives that makes motion: `StageKind.generator`."""
+"""Offered by stages that make motion: `StageKind.generator`."""
 
 CAPTIONER = "captioner"
-"""What a stage gives that says what motions show: `StageKind.captioner`."""
+"""Offered by stages that caption motions: `StageKind.captioner`."""
 
 ALIGNMENT = "alignment"
-"""What a stage gives that embeds text and motion in one space: it loads as a `LoadedTma`."""
+"""Offered by stages that embed text and motion in one space: they load as a `LoadedTma`."""
 
 FACE_ALIGNMENT = "face_alignment"
 """The same of captions of faces and of expressions."""
 
 SHOWING = "showing"
-"""What a stage gives that has curves or figures for the report."""
+"""Offered by stages that have curves or figures for the report."""
 
 
 class StageConfig(Config):
@@ -104,7 +104,7 @@ class Finished:
     exported: bool = False
     """In an exported folder, which may come from anywhere: nothing outside `folder` is followed."""
     outside: bool = False
-    """Of another run than the one in which it is looked up, or of an export; then `name` names both."""
+    """Whether it belongs to another run or to an export; then `name` names both."""
     gone: Mapping[str, str] = field(default_factory=dict)
     """Roles whose stages have gone since, and what to say where one of them is needed."""
 
@@ -125,7 +125,7 @@ class Finished:
 
 
 class StageCache:
-    """What finished stages give, each loaded once, all on one device."""
+    """Completed stages, each loaded once, all on one device."""
 
     def __init__(self, device: torch.device = CPU) -> None:
         self.device = device
@@ -141,7 +141,7 @@ class StageCache:
         return Inputs({role: partial(self.get, stage) for role, stage in inputs.items()})
 
     def given_to(self, stage: Finished) -> Inputs:
-        """What the inputs of a finished stage give; one that is gone says so where it is asked for."""
+        """Return the inputs of a completed stage; reading one that is gone raises its message."""
         makers = {role: partial(self.get, source) for role, source in stage.inputs.items()}
         return Inputs({**{role: partial(_refuse, said) for role, said in stage.gone.items()}, **makers})
 
@@ -202,7 +202,7 @@ class StageContext:
 
 
 class StageKind(ABC, Generic[C]):
-    """What one kind of stage answers. Subclasses set the attributes and override what applies to them."""
+    """Base of stage kinds. Subclasses set the attributes and override what applies to them."""
 
     name: str
     """In recipes: `kind: name`."""
@@ -218,7 +218,7 @@ class StageKind(ABC, Generic[C]):
     """Raised when the same config makes something else than before."""
     trains: bool = False
     curves: tuple[Curve, ...] = ()
-    """Of its training log, those that are worth drawing."""
+    """Columns of its training log that the report draws."""
     shares: bool = False
     """Whether all processes of a run take part by `share` before the first of them runs the stage."""
 
@@ -252,15 +252,15 @@ class StageKind(ABC, Generic[C]):
     # What it gives to other stages.
 
     def preview(self, config: C, given: Inputs) -> object:
-        """What `load` will give, as far as it is known before the stage has run (dry runs)."""
+        """Return what `load` will return, as far as it is known before the stage has run (dry runs)."""
         return None
 
     def load(self, stage: Finished, given: Inputs, device: torch.device) -> object:
-        """What the finished stage gives to those that take it."""
+        """Return the completed stage's output, for the stages that take it."""
         return stage.folder
 
     def preview_of_finished(self, stage: Finished, given: Inputs) -> object:
-        """What `load` gives, for a dry run; a kind whose weights take long to read may leave them out."""
+        """Return the output of `load` for a dry run; a kind with large weights may leave them out."""
         return self.load(stage, given, CPU)
 
     def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
@@ -268,7 +268,7 @@ class StageKind(ABC, Generic[C]):
         raise NotImplementedError(f"stages of kind {self.name} generate nothing")
 
     def captioner(self, stage: Finished, given: Inputs, device: torch.device) -> MotionCaptioner:
-        """What says what motions show, of a kind that gives `CAPTIONER`."""
+        """Return a captioner, of a kind that offers `CAPTIONER`."""
         raise NotImplementedError(f"stages of kind {self.name} say nothing")
 
     def exported(self, config: C) -> tuple[str, ...]:

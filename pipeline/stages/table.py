@@ -1,12 +1,18 @@
-"""Our own stage kinds: every file of the folders beside this one is imported and registers its kinds."""
+"""Our own stage kinds: every file of these folders, and every baseline's `stage`, registers its kinds."""
 
 from __future__ import annotations
 
 from importlib import import_module
 from pkgutil import iter_modules
 
-from motionloom.pipeline.stages import baselines, data, networks, results
+STAGES = ("data", "networks", "results")
+"""Folders beside this file."""
+BASELINES = "motionloom.pipeline.baselines"
+"""Found by name: nothing imports a baseline."""
 
-for package in (data, networks, baselines, results):
+for folder in STAGES:
+    package = import_module(f"motionloom.pipeline.stages.{folder}")
     for module in iter_modules(package.__path__, f"{package.__name__}."):
         import_module(module.name)
+for module in iter_modules(import_module(BASELINES).__path__, f"{BASELINES}."):
+    import_module(f"{module.name}.stage")

@@ -15,7 +15,6 @@ from torch import Tensor
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import PRESENT_ALL, UserError
-from motionloom.models.baselines.mld.network import MotionVae
 from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
@@ -28,7 +27,7 @@ CPU = torch.device("cpu")
 
 
 def device_of(net: torch.nn.Module) -> torch.device:
-    """Where a network lies, and what it is given must lie."""
+    """Return the device of a network's parameters; its inputs must be there too."""
     return next(net.parameters()).device
 
 
@@ -38,7 +37,7 @@ class TrainedTokenizer:
 
     net: Tokenizer
     given: Mapping[str, Any]
-    """What its stage was given; "stats" of it."""
+    """The stage's loaded inputs; "stats" is read."""
 
     @property
     def layout(self) -> MotionLayout:
@@ -126,7 +125,7 @@ class LoadedTma:
     part: Part
     """The columns it reads."""
     given: Mapping[str, Any]
-    """What its stage was given; "stats" and "text" of it."""
+    """The stage's loaded inputs; "stats" and "text" are read."""
 
     @property
     def stats(self) -> FeatureStats:
@@ -163,15 +162,6 @@ class LoadedTma:
 
 
 @dataclass(frozen=True)
-class LoadedMotionVae:
-    """A trained auto-encoder of body and hands (MLD), which writes at most `max_frames`."""
-
-    net: MotionVae
-    layout: MotionLayout
-    max_frames: int
-
-
-@dataclass(frozen=True)
 class LoadedGpt:
     """A trained GPT and its kind of text prior ("tma" or "sentence")."""
 
@@ -186,7 +176,7 @@ class LoadedDmd:
     net: Dmd
     window: int
     given: Mapping[str, Any]
-    """What its stage was given; "tokenizer" of it."""
+    """The stage's loaded inputs; "tokenizer" is read."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +187,7 @@ class LoadedUtt:
     max_frames: int
     """Frames of a training window."""
     given: Mapping[str, Any]
-    """What its stage was given: "tokenizer", and "text" and "audio" as its modalities are."""
+    """The stage's loaded inputs: "tokenizer", and "text" and "audio" as its modalities are."""
 
     @property
     def modalities(self) -> frozenset[str]:
@@ -205,7 +195,7 @@ class LoadedUtt:
 
 
 def stream_facts(tokenizer: Tokenizer) -> dict[str, object]:
-    """What a network over a tokenizer's codes writes down: `streams` (codes by name) and `pattern`."""
+    """Return the facts of a network over a tokenizer's codes: `streams` (codes by name) and `pattern`."""
     return {
         "streams": {stream.name: stream.num_codes for stream in tokenizer.streams},
         "pattern": list(tokenizer.pattern),
@@ -224,7 +214,7 @@ def require_streams(facts: ModelFacts, tokenizer: Tokenizer, what: str) -> None:
 
 
 class MotionJudge(Protocol):
-    """What embeds motions: an alignment model (TMA, TEMOS) or an evaluator."""
+    """A model that embeds motions: an alignment model (TMA, TEMOS) or an evaluator."""
 
     @property
     def layout(self) -> MotionLayout: ...

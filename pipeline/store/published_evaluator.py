@@ -57,7 +57,7 @@ class PublishedFacts(Config):
     version: Literal[1]
     layout: Literal["h3d263"]
     sha256: dict[str, str]
-    """Of every other file."""
+    """Checksums of every other file."""
 
 
 class PublishedVocabulary(Config):
@@ -79,7 +79,7 @@ class PublishedWords:
     """[n, E]"""
     vocabulary: PublishedVocabulary
     untagged: Untagged = "refuse"
-    """What becomes of a caption without `word/POS` tags."""
+    """Treatment of captions without `word/POS` tags."""
 
     @cached_property
     def rows(self) -> Mapping[str, int]:
@@ -153,11 +153,11 @@ def load_published(
 
 
 _WIDTH = 300
-"""Of the word vectors."""
+"""Width of the word vectors."""
 
 
 def check_published(folder: Path) -> PublishedFacts:
-    """What a folder says of itself, its checksums compared."""
+    """Return a folder's description, after comparing its checksums."""
     if not folder.is_dir():
         raise UserError(
             f"{folder}: no such folder (the published evaluator); make it by docs/guo_evaluator.py"

@@ -31,11 +31,11 @@ Fact = TypeVar("Fact")
 N = TypeVar("N", bound=torch.nn.Module)
 
 MODEL_FILES = ("model.safetensors", "model.json")
-"""What a trained network leaves behind."""
+"""The files of a trained network."""
 
 
 class LayoutFacts(Config):
-    """What `MotionLayout.named` needs to give the same layout again."""
+    """The arguments of `MotionLayout.named` for a layout."""
 
     name: str
     fps: float
@@ -193,7 +193,7 @@ one, or in several."""
 
 @dataclass(frozen=True)
 class Release:
-    """What published weights are called, for a network of ours (`TrainedStage.release`)."""
+    """The names of published weights, for a network of ours (`TrainedStage.release`)."""
 
     names: Mapping[str, Source]
     """Name of each tensor in the network's state -> where it lies. What is not named stays as it was made;

@@ -18,8 +18,8 @@ from torch.distributed.device_mesh import DeviceMesh
 from torch.utils.data import DataLoader, Dataset
 
 from motionloom.models.layers.transformer import Transformer
+from motionloom.models.training.alternating import AlternatingModule
 from motionloom.models.training.distributed import rank, world_size
-from motionloom.models.training.players import PlayersModule
 from motionloom.models.training.sharding import sharded
 from motionloom.models.training.stage_module import Batch, Execution, StageModule
 from motionloom.pipeline.launch.hardware import Hardware
@@ -91,12 +91,12 @@ def _shard(module: nn.Module, mesh: DeviceMesh) -> nn.Module:
 
 
 def execution(fabric: Fabric, module: StageModule, config: TrainConfig) -> Execution:
-    """The module on its device, cut or wrapped as the strategy says; players average gradients themselves."""
+    """The module on its device, cut or wrapped as the strategy says; groups average gradients themselves."""
     model: nn.Module = module
     if isinstance(fabric.strategy, ModelParallelStrategy):
         model = fabric.strategy.setup_module(module)
     module.to(fabric.device)
-    if isinstance(fabric.strategy, DDPStrategy) and not isinstance(module, PlayersModule):
+    if isinstance(fabric.strategy, DDPStrategy) and not isinstance(module, AlternatingModule):
         model = fabric.strategy.setup_module(module)
     # bfloat16 has the range of float32, so only float16 comes with a scaler.
     scaler = getattr(fabric.strategy.precision, "scaler", None)

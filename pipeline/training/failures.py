@@ -87,7 +87,7 @@ def first_failure(module: StageModule, *, scaled: bool) -> Failure | None:
 
 
 def _is_loss(name: str) -> bool:
-    """Whether a figure is minimised: a stage's own loss, or a player's."""
+    """Whether a figure is minimised: a stage's own loss, or an optimizer group's."""
     return name == "loss" or name.endswith("_loss")
 
 

@@ -20,7 +20,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from motionloom.models.layers.transformer import SelfAttention
 from motionloom.models.quantize.ema import EmaQuantizer
-from motionloom.models.training.players import PlayersModule
+from motionloom.models.training.alternating import AlternatingModule
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.launch.hardware import Hardware
@@ -102,8 +102,8 @@ def _random(value: Any) -> Any:
 def _trained(module: StageModule) -> list[nn.Parameter]:
     """Parameters with gradients and moments: of the network, and of those that it is trained against."""
     nets = [module.net]
-    if isinstance(module, PlayersModule):
-        nets += [net for player in module.players() for net in player.nets]
+    if isinstance(module, AlternatingModule):
+        nets += [net for group in module.optimizer_groups() for net in group.nets]
     return list({id(p): p for net in nets for p in net.parameters()}.values())
 
 

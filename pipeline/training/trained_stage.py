@@ -58,7 +58,7 @@ class Example(NamedTuple):
 
     batch: Batch
     note: str = ""
-    """What its tokens are."""
+    """Its tokens, in words."""
 
 
 class TrainedStage(StageKind[C], Generic[C, I, N]):
@@ -103,7 +103,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         """Turn the trained network, in place, into what is saved."""
 
     def loaded(self, net: N, facts: ModelFacts, inputs: I) -> object:
-        """What other stages get: the trained network, frozen, or an object around it."""
+        """Return the output for other stages: the trained network, frozen, or an object around it."""
         return net
 
     def release(self, net: N) -> Release | None:

@@ -12,30 +12,10 @@ from torch import Tensor
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.figure_parts import PIECES
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.baselines.mld.losses import MotionVaeLossConfig
-from motionloom.models.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
-from motionloom.models.baselines.mld.network import (
-    LatentDenoiser,
-    LatentDiffusionConfig,
-    MotionVae,
-    MotionVaeConfig,
-)
-from motionloom.models.baselines.motionclip.module import MotionClipModule
-from motionloom.models.baselines.motionclip.network import MotionClip, MotionClipConfig, MotionClipLossConfig
-from motionloom.models.baselines.motiondiffuse.module import MotionDiffuseModule
-from motionloom.models.baselines.motiondiffuse.network import (
-    CaptionConfig,
-    MotionDiffuse,
-    MotionDiffuseConfig,
-)
-from motionloom.models.baselines.tm2t.losses import CaptionLossConfig, Seq2SeqLossConfig
-from motionloom.models.baselines.tm2t.module import CaptionerModule
-from motionloom.models.baselines.tm2t.network import Captioner, CaptionerConfig
-from motionloom.models.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig
-from motionloom.models.baselines.tm2t.seq2seq_module import Seq2SeqModule
-from motionloom.models.diffusion.module import DiffusionModule
-from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
-from motionloom.models.diffusion.observed import Showing
+from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
+from motionloom.models.diffusion.module import DenoiserModule, InBetweenModule, TextDenoiserModule
+from motionloom.models.diffusion.network import TextDenoiserConfig
+from motionloom.models.diffusion.observed import Observations
 from motionloom.models.diffusion.recovery import Recovery
 from motionloom.models.evaluator.module import EvaluatorModule
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
@@ -46,20 +26,37 @@ from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.losses import TmaLossConfig
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
-from motionloom.models.tokenizer.base import Stream
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import (
-    AnyTokenizerConfig,
-    FsqConfig,
-    H2VQConfig,
-    MqConfig,
-    RvqConfig,
-    SeparateConfig,
-    Tm2tConfig,
-)
+from motionloom.models.tokenizer.base import Stream, TokenizerConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
 from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.tokenizer.single import FsqConfig, MqConfig, RvqConfig
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.pipeline.baselines.mdm.network import Mdm
+from motionloom.pipeline.baselines.mld.losses import MotionVaeLossConfig
+from motionloom.pipeline.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
+from motionloom.pipeline.baselines.mld.network import (
+    LatentDenoiser,
+    LatentDiffusionConfig,
+    MotionVae,
+    MotionVaeConfig,
+)
+from motionloom.pipeline.baselines.motionclip.module import MotionClipModule
+from motionloom.pipeline.baselines.motionclip.network import (
+    MotionClip,
+    MotionClipConfig,
+    MotionClipLossConfig,
+)
+from motionloom.pipeline.baselines.motiondiffuse.network import (
+    CaptionConfig,
+    MotionDiffuse,
+    MotionDiffuseConfig,
+)
+from motionloom.pipeline.baselines.tm2t.losses import CaptionLossConfig, Seq2SeqLossConfig
+from motionloom.pipeline.baselines.tm2t.module import CaptionerModule, Seq2SeqModule
+from motionloom.pipeline.baselines.tm2t.network import Captioner, CaptionerConfig
+from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig
+from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig
 
 STEPS = 20
 BATCH, FRAMES, TEXT = 6, 24, 6
@@ -80,9 +77,9 @@ def motion(step: int, dim: int) -> dict[str, Tensor]:
     return {"motion": values + 0.05 * step, "length": LENGTH}
 
 
-def tokenizer(config: AnyTokenizerConfig, handed: tuple[bool, ...] = ()) -> tuple[StageModule, Batches]:
+def tokenizer(config: TokenizerConfig, handed: tuple[bool, ...] = ()) -> tuple[StageModule, Batches]:
     """`handed` says which clips of a batch hold hands; all when empty."""
-    net = build_tokenizer(config, LAYOUT)
+    net = config.build(LAYOUT)
     net.basis.learn(
         np.zeros(net.dim), np.full(net.dim, 0.02)
     )  # independent noise in every column bends fingers wildly
@@ -116,7 +113,7 @@ def tma() -> tuple[StageModule, Batches]:
 
 
 def gpt() -> tuple[StageModule, Batches]:
-    book = build_tokenizer(H2VQConfig(width=8, depth=1, code_dim=8, num_codes=9), LAYOUT)
+    book = H2VQConfig(width=8, depth=1, code_dim=8, num_codes=9).build(LAYOUT)
     for quantizer in book.codebooks().values():
         quantizer.codebook.normal_()  # spread out, so that the alignment has something to gain
     aligned = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), LAYOUT.dim, TEXT)
@@ -177,9 +174,9 @@ class UndrawnGpt(GptModule):
             torch.randint = randint
 
 
-def diffusion() -> tuple[StageModule, Batches]:
-    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2), 20, TEXT)
-    module = UndrawnDiffusion(net, OPTIM, seed=0, max_steps=STEPS)
+def mdm() -> tuple[StageModule, Batches]:
+    net = Mdm(TextDenoiserConfig(dim=16, ff=16, layers=1, heads=2), 20, TEXT)
+    module = UndrawnMdm(net, OPTIM, seed=0, max_steps=STEPS)
     return module.eval(), lambda step: motion(step, 20) | captions(step)
 
 
@@ -188,11 +185,12 @@ BODY: dict[str, Any] = {
 }  # fmt: skip
 
 
-def observed_diffusion() -> tuple[StageModule, Batches]:
+def inbetweener() -> tuple[StageModule, Batches]:
     layout, columns = BODY["layout"], BODY["layout"].part("all")
-    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2, observed=1.0), 133, TEXT)
-    showing = EndsShown(layout, columns, Recovery(layout, columns, BODY["mean"], BODY["std"]), 1.0)
-    module = UndrawnDiffusion(net, OPTIM, seed=0, max_steps=STEPS, showing=showing)
+    config = InBetweenConfig(dim=16, ff=16, layers=1, heads=2, frames_per_token=1)
+    net = InBetweener(config, 133, TEXT)
+    observations = EndsObserved(layout, columns, Recovery(layout, columns, BODY["mean"], BODY["std"]), 1.0)
+    module = UndrawnInBetweener(net, OPTIM, seed=0, max_steps=STEPS, observations=observations)
     return module.eval(), lambda step: motion(step, 133) | captions(step)
 
 
@@ -249,12 +247,16 @@ class Undrawn(StageModule):
             torch.randint, torch.randn_like = randint, randn_like
 
 
-class UndrawnDiffusion(Undrawn, DiffusionModule):
+class UndrawnMdm(Undrawn, TextDenoiserModule):
     """MDM."""
 
 
-class EndsShown(Showing):
-    """Shows all but the frames 2 to 5, and of clips of an odd length where the root is in these."""
+class UndrawnInBetweener(Undrawn, InBetweenModule):
+    """The in-betweener."""
+
+
+class EndsObserved(Observations):
+    """Observes all but the frames 2 to 5, and of clips of an odd length where the root is in these."""
 
     def _draw(self, length: Tensor, frames: int) -> tuple[Tensor, Tensor]:
         at = torch.arange(frames)
@@ -267,7 +269,7 @@ class UndrawnLatents(Undrawn, LatentDiffusionModule):
     """MLD's second stage."""
 
 
-class UndrawnMotionDiffuse(Undrawn, MotionDiffuseModule):
+class UndrawnMotionDiffuse(Undrawn, DenoiserModule):
     """MotionDiffuse's."""
 
 
@@ -344,8 +346,8 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "gpt": gpt,
     "gpt, compiled": gpt,
     "gpt, samples": gpt_samples,
-    "diffusion": diffusion,
-    "diffusion, observed": observed_diffusion,
+    "mdm": mdm,
+    "inbetween": inbetweener,
     "motion_vae": motion_vae,
     "latent_diffusion": latent_diffusion,
     "motionclip": motionclip,
@@ -357,9 +359,9 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
 }
 
 
-def drawing_diffusion() -> tuple[StageModule, Batches]:
+def drawing_mdm() -> tuple[StageModule, Batches]:
     """As trained, with its own noise."""
-    net = MotionDiffusion(DiffusionConfig(dim=16, ff=16, layers=1, heads=2, condition_dropout=0.3), 20, TEXT)
-    return DiffusionModule(
+    net = Mdm(TextDenoiserConfig(dim=16, ff=16, layers=1, heads=2, condition_dropout=0.3), 20, TEXT)
+    return TextDenoiserModule(
         net, OPTIM, seed=0, max_steps=STEPS
     ), lambda step: motion(step, 20) | captions(step)

@@ -23,8 +23,8 @@ PAUSE = "KILL_MATRIX_PAUSE"
 
 def watch_steps() -> None:
     """Have every training step of this process and its forks leave a line in the folder of RECORDS."""
+    from motionloom.models.training.alternating import AlternatingModule
     from motionloom.models.training.distributed import rank
-    from motionloom.models.training.players import PlayersModule
     from motionloom.models.training.stage_module import StageModule
 
     average = StageModule.average
@@ -49,7 +49,7 @@ def watch_steps() -> None:
         return take_step
 
     StageModule.average = averaged  # type: ignore[method-assign]
-    for module in (StageModule, PlayersModule):
+    for module in (StageModule, AlternatingModule):
         module.take_step = wrapped(module.take_step)  # type: ignore[method-assign]
 
 

@@ -14,8 +14,7 @@ from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import TokenSequence, interleave
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.base import Stream, Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, SeparateConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
 from motionloom.models.training.stage_module import OptimConfig
 
 PATTERN = ("body", "body", "hand")
@@ -41,7 +40,7 @@ def aligned_gpt(
     kind: type[H2VQConfig | SeparateConfig] = H2VQConfig, loss: dict[str, Any] | None = None, **config: Any
 ) -> tuple[GptModule, Tokenizer, Tma]:
     torch.manual_seed(0)
-    tokenizer = build_tokenizer(kind(width=16, depth=1, code_dim=8, num_codes=9), LAYOUT)
+    tokenizer = kind(width=16, depth=1, code_dim=8, num_codes=9).build(LAYOUT)
     for book in tokenizer.codebooks().values():
         book.codebook.normal_()
     tma = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 313, 10)

@@ -15,36 +15,32 @@ from unittest import mock
 
 import torch
 from rich.console import Console
-from tiny_players import context
+from tiny_adversaries import context
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.baselines.bailando.critic import ActorCritic, RewardConfig
-from motionloom.models.baselines.bailando.critic_module import ActorCriticModule
-from motionloom.models.baselines.bailando.gpt import CrossGpt, CrossGptConfig
-from motionloom.models.baselines.bailando.gpt_module import CrossGptModule
-from motionloom.models.baselines.bailando.vq import DanceVq, DanceVqConfig
-from motionloom.models.baselines.bailando.vq_module import DanceVqModule
-from motionloom.models.baselines.fact.module import FactModule
-from motionloom.models.baselines.fact.network import Fact, FactConfig
-from motionloom.models.baselines.tm2t.critic import CriticisedModule
-from motionloom.models.baselines.tm2t.losses import CriticConfig
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import DmdModule
 from motionloom.models.gpt.frozen import Frozen
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import MqConfig, Tm2tConfig
 from motionloom.models.tokenizer.module import TokenizerModule
-from motionloom.models.tokenizer.tm2t import Tm2tQuantizer
+from motionloom.models.tokenizer.single import MqConfig
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
 from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import ConditionedUtt, UttConfig
+from motionloom.pipeline.baselines.bailando.codes import DanceVq, DanceVqConfig
+from motionloom.pipeline.baselines.bailando.module import ActorCriticModule, CrossGptModule, DanceVqModule
+from motionloom.pipeline.baselines.bailando.network import ActorCritic, CrossGpt, CrossGptConfig, RewardConfig
+from motionloom.pipeline.baselines.fact.module import FactModule
+from motionloom.pipeline.baselines.fact.network import Fact, FactConfig
+from motionloom.pipeline.baselines.tm2t.losses import CriticConfig
+from motionloom.pipeline.baselines.tm2t.module import AdversarialTokenizerModule
+from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig, Tm2tQuantizer
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trainer import fit
 
@@ -129,7 +125,7 @@ def _draws_of_all() -> Iterator[None]:
 def tokenizer() -> Any:
     """A frozen one with distant codes, so that rounding changes none."""
     torch.manual_seed(1)
-    made = build_tokenizer(MQ, LAYOUT)
+    made = MQ.build(LAYOUT)
     for book in made.codebooks().values():
         nn.init.normal_(book.codebook)
         book.initialised.fill_(True)
@@ -165,10 +161,10 @@ def module_of(name: str, steps: int, *, dropout: float = 0.0) -> StageModule:
     if name not in ("mq", "tm2t", "utt", "dmd"):
         return dances(name, given, dropout)
     if name == "mq":
-        return TokenizerModule(build_tokenizer(MQ, LAYOUT), OPTIM, **given)
+        return TokenizerModule(MQ.build(LAYOUT), OPTIM, **given)
     if name == "tm2t":
         net = Tm2tQuantizer(Tm2tConfig(**{**MQ.dump(), "kind": "tm2t", "recon": "l1"}), LAYOUT)
-        return CriticisedModule(net, OPTIM, critic=CriticConfig(start=4, width=8), **given)
+        return AdversarialTokenizerModule(net, OPTIM, critic=CriticConfig(start=4, width=8), **given)
     if name == "dmd":
         small = DmdConfig(
             dim=8, ff=8, encoder_layers=1, decoder_layers=1, heads=2, dropout=dropout, attention_dropout=0.0

@@ -92,7 +92,7 @@ def end_of(job: subprocess.Popen[str], pids: Iterable[int]) -> str:
 def main(out: Path, how: str, nodes: int) -> None:
     """One rank."""
     from rich.console import Console
-    from tiny_players import Duel, Vectors, context
+    from tiny_adversaries import Duel, Vectors, context
 
     from motionloom.pipeline.launch.process import leave
     from motionloom.pipeline.launch.team import Team

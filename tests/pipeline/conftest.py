@@ -125,7 +125,8 @@ stages:
     loss: {contrastive: 0}
     train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}
   face_diffusion:
-    kind: diffusion
+    kind: mdm
+    part: face
     net: {dim: 32, ff: 64, layers: 1, heads: 4}
     train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}
   generate: {count: 1}

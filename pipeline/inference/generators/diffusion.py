@@ -1,4 +1,4 @@
-"""Motion of text by a diffusion model: MDM, MotionDiffuse, the second facial baseline (HumanTOMATO B.5.2)."""
+"""Motion of text by a diffusion model of whole motions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.models.baselines.motiondiffuse.network import MotionDiffuse
-from motionloom.models.baselines.motiondiffuse.sampling import sample_motions as sample_motiondiffuse
-from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.pipeline.contract.editing import EditRequest
@@ -44,7 +42,7 @@ class DenoisedMotion(WholeMotion):
 class DiffusionMotion(DenoisedMotion):
     """Denoising from a sentence embedding, of any part of the body (MDM; B.5.2)."""
 
-    net: MotionDiffusion
+    net: TextDenoiser
     window: int = 196
     """Frames that are edited at once: the longest motion of its training."""
 
@@ -75,24 +73,3 @@ class DiffusionMotion(DenoisedMotion):
 
     def _guidance(self, sampling: SamplingConfig) -> float:
         return sampling.face_guidance if self.part == "face" else sampling.cfg_scale
-
-
-@dataclass(frozen=True)
-class MotionDiffuseMotion(DenoisedMotion):
-    """Denoising from the tokens of a caption, without guidance (MotionDiffuse)."""
-
-    net: MotionDiffuse
-
-    @property
-    def schedule(self) -> ScheduleConfig:
-        return self.net.config.schedule
-
-    @property
-    def max_frames(self) -> int:
-        return self.net.max_frames
-
-    def normalised(self, request: GenerationRequest, frames: Sequence[int]) -> list[Tensor]:
-        sampler, steps = self.denoising(request.sampling)
-        return sample_motiondiffuse(
-            self.net, request.text(self.who), frames, seeds=request.seeds, sampler=sampler, steps=steps
-        )

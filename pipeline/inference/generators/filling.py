@@ -10,8 +10,8 @@ from torch import Tensor
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.editing import Filling, Given, Pins, Worded
-from motionloom.models.diffusion.network import MotionDiffusion
+from motionloom.models.diffusion.editing import CaptionSpan, Filling, KnownMotion, Pins
+from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.observed import Places, known_columns
 from motionloom.models.diffusion.recovery import Recovery
 from motionloom.models.diffusion.schedule import Sampler
@@ -20,7 +20,7 @@ from motionloom.pipeline.store.networks import device_of
 
 
 def fill_in(
-    net: MotionDiffusion,
+    net: TextDenoiser,
     stats: FeatureStats,
     part: Part,
     request: EditRequest,
@@ -67,7 +67,7 @@ def fill_in(
             )
     filling = Filling(
         net,
-        Given(motion.to(device), known.to(device), places, pins),
+        KnownMotion(motion.to(device), known.to(device), places, pins),
         [_worded(said, net, device) for said in request.words],
         recovery,
         window=window,
@@ -82,9 +82,9 @@ def fill_in(
     return [np.asarray(one, dtype=np.float32) for one in own.numpy()]
 
 
-def _worded(said: Said, net: MotionDiffusion, device: torch.device) -> Worded:
+def _worded(said: Said, net: TextDenoiser, device: torch.device) -> CaptionSpan:
     text = said.conditions.get("text")
     share = torch.from_numpy(said.share).float().to(device)
     if text is None or text.pooled is None:
-        return Worded(torch.zeros(net.text_dim, device=device), False, share)
-    return Worded(text.pooled[0].float().to(device), True, share)
+        return CaptionSpan(torch.zeros(net.text_dim, device=device), False, share)
+    return CaptionSpan(text.pooled[0].float().to(device), True, share)

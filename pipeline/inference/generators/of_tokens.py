@@ -1,4 +1,4 @@
-"""What the tokenizer says of whatever reads or writes its tokens."""
+"""Base of models over one tokenizer's tokens."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class OfTokens(ABC):
     @property
     @abstractmethod
     def tokenizer(self) -> TrainedTokenizer:
-        """What makes motion of its tokens, or tokens of its motion."""
+        """The tokenizer of its tokens."""
 
     @property
     def layout(self) -> MotionLayout:

@@ -1,4 +1,4 @@
-"""Motion of text by one latent: TEMOS, the facial cVAE (HumanTOMATO B.5.1), and MotionCLIP."""
+"""Motion of text by one latent: TEMOS, and the facial cVAE (HumanTOMATO B.5.1)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from motionloom.models.baselines.motionclip.network import MotionClip
-from motionloom.models.layers.transformer import length_mask
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.inference.generators.whole import WholeMotion
-from motionloom.pipeline.store.networks import LoadedTma, device_of
+from motionloom.pipeline.store.networks import LoadedTma
 
 
 @dataclass(frozen=True)
@@ -39,27 +36,6 @@ class VaeMotion(WholeMotion):
         made = net.decode(z, torch.tensor(list(frames)).to(device), max(frames))
         stride = net.config.frame_stride
         return [between(made[row].cpu().numpy(), count, stride) for row, count in enumerate(frames)]
-
-
-@dataclass(frozen=True)
-class TextAsLatent(WholeMotion):
-    """The sentence embedding is the latent, decoded as it stands (MotionCLIP): nothing is drawn."""
-
-    net: MotionClip
-    trained_frames: int
-    who = "this MotionCLIP"
-    method = "motionclip"
-
-    @property
-    def max_frames(self) -> int | None:
-        """No longer motion was in the training, and what the decoder makes of it stands still."""
-        return self.trained_frames
-
-    def normalised(self, request: GenerationRequest, frames: Sequence[int]) -> list[Tensor]:
-        text = request.pooled_text(self.who).to(device_of(self.net))
-        mask = length_mask(torch.as_tensor(frames, device=text.device), max(frames))
-        made = self.net.decode(text, mask)
-        return [self.net.features(row[:count]) for row, count in zip(made, frames, strict=True)]
 
 
 def between(values: NDArray[np.float32], frames: int, stride: int) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""What generators share that make all frames of a motion at once, of a length that they are given."""
+"""Base of generators that make all frames of a motion of given length at once."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class WholeMotion(ABC):
     layout: MotionLayout
     part: Part
     given: Mapping[str, Any]
-    """What the stage's inputs give: "stats", "text"."""
+    """The stage's loaded inputs: "stats", "text"."""
 
     who: ClassVar[str]
     """For messages, such as "this VAE"."""

@@ -85,7 +85,7 @@ class SynthStageConfig(SynthConfig, StageConfig):
 
     # The recipe's seed may stand for it, so a stage has one case more than the synthesizer.
     seed: int | None = Field(None, ge=0)  # type: ignore[assignment]
-    """Of the clips; None = the recipe's seed."""
+    """Seed of the clips; None = the recipe's."""
 
 
 class ShardsStageConfig(Reading, StageConfig):

@@ -39,7 +39,7 @@ class FeaturesConfig(StageConfig):
 
 @dataclass(frozen=True)
 class FeaturesPreview:
-    """What is known of the statistics before the stage has run."""
+    """Return a preview of the statistics before the stage has run."""
 
     dim: int
 

@@ -16,11 +16,15 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.stage import Inputs
+from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs
+from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.text import TextSource
-from motionloom.pipeline.store.weights import ModelFacts
-from motionloom.pipeline.training.config import TrainedStageConfig
+from motionloom.pipeline.store.weights import ModelFacts, load_facts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 
@@ -36,7 +40,7 @@ class CaptionStageConfig(TrainedStageConfig):
 
 
 class CaptionInputs(Inputs):
-    """The data, statistics and captions of such a stage."""
+    """Captioned clips, their statistics and the text encoder."""
 
     data: Data
     stats: FeatureStats
@@ -69,6 +73,36 @@ class CaptionStage(TrainedStage[C, I, N]):
 
     def exported(self, config: C) -> tuple[str, ...]:
         return ("stats", "text")
+
+
+class DenoiserStageConfig(CaptionStageConfig):
+    """A denoiser conditioned on a sentence embedding; the defaults are MDM's but for the steps."""
+
+    net: TextDenoiserConfig = TextDenoiserConfig()
+    train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
+
+
+D = TypeVar("D", bound=DenoiserStageConfig)
+T = TypeVar("T", bound=TextDenoiser)
+
+
+class DenoiserStage(CaptionStage[D, CaptionInputs, T]):
+    """A stage of a `TextDenoiser`; subclasses build the network and its module."""
+
+    offers = frozenset({GENERATOR})
+    inputs = CaptionInputs
+    curves = (Curve("loss"),)
+
+    def facts(self, config: D, inputs: CaptionInputs) -> ModelFacts:
+        layout = inputs.data.layout
+        width = len(part_columns(layout, config.part))
+        extra = {"motion_dim": width, "text_dim": inputs.text.dim, "part": config.part}
+        return ModelFacts.of(self.name, config.net, layout, extra)
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
+        window = stage.config.max_frames  # the longest motion of its training
+        return DiffusionMotion(given["stats"].layout, part, given, net, window)
 
 
 def clip_batches(

@@ -34,7 +34,7 @@ class DmdStageConfig(WindowStageConfig):
 
 
 class DmdInputs(WindowInputs):
-    """What it takes."""
+    """Windows and the tokenizer of their tokens."""
 
     tokenizer: TrainedTokenizer
 

@@ -36,7 +36,7 @@ class EvaluatorStageConfig(CaptionStageConfig):
     loss: EvaluatorLossConfig = EvaluatorLossConfig()
     optim: OptimConfig = OptimConfig(optimizer="adam", lr=1e-4, betas=(0.9, 0.999), grad_clip=0.5)
     movement_optim: OptimConfig = OptimConfig(optimizer="adam", lr=1e-4, betas=(0.9, 0.999), grad_clip=0.0)
-    """Of the movement autoencoder."""
+    """Optimizer of the movement autoencoder."""
     movement_steps: int = Field(40_000, ge=1)
     """Steps of the autoencoder, the first of `train.steps`; the two GRUs are trained in those behind."""
     train: TrainConfig = TrainConfig(steps=260_000, batch_size=32)

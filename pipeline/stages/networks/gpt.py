@@ -86,7 +86,7 @@ class GptStageConfig(TrainedStageConfig):
 
 
 class GptInputs(Inputs):
-    """What it takes."""
+    """Captioned clips, their tokens, and the models of prior, alignment and start."""
 
     data: Data
     text: TextSource
@@ -241,7 +241,7 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
 
 
 _SIZES = ("layers", "dim", "heads", "ff", "block_size")
-"""Of the network; a GPT goes on from another only where these are equal."""
+"""Settings of the network; a GPT goes on from another only where these are equal."""
 
 
 def require_own_text(stage: Stage, others: Mapping[str, Stage]) -> None:

@@ -29,7 +29,7 @@ class GuoEvaluatorConfig(StageConfig):
     """Where the published evaluator lies, and what it makes of captions without tags."""
 
     folder: Path
-    """What `docs/guo_evaluator.py` has made: weights, statistics and word vectors."""
+    """A folder made by `docs/guo_evaluator.py`: weights, statistics and word vectors."""
     untagged: Untagged = "refuse"
     """A caption without the `word/POS` tags that the evaluator reads is refused; `other` reads its words as
     they stand, without their classes [ours], and its figures cannot be compared with the papers'."""

@@ -57,8 +57,8 @@ class TmaStageConfig(CaptionStageConfig):
     loss: TmaLossConfig = TmaLossConfig()
     train: TrainConfig = TrainConfig(steps=50_000, batch_size=256)
     part: Literal["bodyhand", "face"] = "bodyhand"
-    """What is aligned; `face` takes the face captions. Without InfoNCE (`loss.contrastive: 0`) it is TEMOS,
-    or, of the face, the paper's facial cVAE (B.5.1)."""
+    """The aligned columns; `face` takes the face captions. Without InfoNCE (`loss.contrastive: 0`) it is
+    TEMOS, or, of the face, the paper's facial cVAE (B.5.1)."""
 
     @model_validator(mode="after")
     def _faces_have_every_frame(self) -> TmaStageConfig:
@@ -68,7 +68,7 @@ class TmaStageConfig(CaptionStageConfig):
 
 
 class TmaInputs(CaptionInputs):
-    """What it takes."""
+    """Captioned clips, and a TMA to go on from."""
 
     start: LoadedTma | None = filled_by("tma")
 

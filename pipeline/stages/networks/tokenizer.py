@@ -15,19 +15,9 @@ from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
-from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import (
-    AnyTokenizerConfig,
-    EmaTokenizerConfig,
-    FsqConfig,
-    H2VQConfig,
-    MqConfig,
-    RvqConfig,
-    SeparateConfig,
-    VqConfig,
-    parse_tokenizer,
-)
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer, TokenizerConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
+from motionloom.models.tokenizer.single import FsqConfig, MqConfig, RvqConfig, VqConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Inputs, Stage, filled_by, register
 from motionloom.pipeline.launch.hardware import Hardware
@@ -51,7 +41,7 @@ _FREE = frozenset(
 
 
 class WindowStageConfig(TrainedStageConfig):
-    """What every stage has that trains on windows of clips."""
+    """Settings of stages that train on windows of clips."""
 
     window: int = Field(64, ge=4, multiple_of=4)
     """Frames of a training window."""
@@ -60,21 +50,18 @@ class WindowStageConfig(TrainedStageConfig):
 
 
 class TokenizerStageConfig(WindowStageConfig):
-    """What every tokenizer stage has."""
+    """Settings of every tokenizer stage; subclasses set the default of `net`."""
 
     train: TrainConfig = TrainConfig(steps=100_000, batch_size=256)
-    net: AnyTokenizerConfig
+    net: TokenizerConfig
 
     def require_fit(self, hardware: Hardware) -> None:
         """A codebook must get several times the vectors that it resets codes below."""
         super().require_fit(hardware)
-        net = self.net
-        if not isinstance(net, EmaTokenizerConfig | MqConfig):
-            return
-        if isinstance(net, MqConfig) and net.quantizer != "ema":
-            return  # codes learnt by gradient are never reset
-        vectors = self.train.batch_size // self.train.accumulate * self.window // GROUP_FRAMES
-        require_uses(vectors, net.num_codes, net.reset_below)
+        resets = self.net.codes_and_reset()
+        if resets is not None:
+            vectors = self.train.batch_size // self.train.accumulate * self.window // GROUP_FRAMES
+            require_uses(vectors, *resets)
 
 
 def require_uses(vectors: int, codes: int, reset_below: float, *, times: float = 2.0) -> None:
@@ -124,14 +111,14 @@ class MqStageConfig(TokenizerStageConfig):
 
 
 class WindowInputs(Inputs):
-    """What a stage takes that trains on windows."""
+    """Inputs of stages that train on windows."""
 
     data: Data
     stats: FeatureStats
 
 
 class TokenizerInputs(WindowInputs):
-    """What it takes."""
+    """Windows, and a tokenizer to go on from."""
 
     start: TrainedTokenizer | None = filled_by("tokenizer")
 
@@ -156,8 +143,9 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
         return ModelFacts.of(config.net.kind, config.net, inputs.data.layout)
 
     def network(self, facts: ModelFacts, inputs: TokenizerInputs) -> Tokenizer:
-        config = parse_tokenizer(facts.config, f"{facts.where}: config")
-        return build_tokenizer(config, facts.layout.layout())
+        kind = type(self.config.model_fields["net"].default)
+        config: TokenizerConfig = kind.parse(facts.config, f"{facts.where}: config")
+        return config.build(facts.layout.layout())
 
     def prepare(self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs) -> None:
         """The coordinates it learns in depend on how features are normalised; or all comes from a start."""

@@ -39,7 +39,7 @@ class TokensConfig(StageConfig):
 
 @dataclass(frozen=True)
 class Tokens:
-    """What a tokens stage gives: the codes of each split."""
+    """The codes of each split."""
 
     folder: Path
     streams: tuple[Stream, ...]

@@ -40,7 +40,7 @@ class UttStageConfig(TrainedStageConfig):
     optim: OptimConfig = OptimConfig(optimizer="adam")
     train: TrainConfig = TrainConfig(steps=100_000, batch_size=64)
     modalities: tuple[str, ...] = ("text", "audio")
-    """What the model can be conditioned on, of `datasets/modalities/`; each needs the stage of its name."""
+    """Conditioning modalities, of `datasets/modalities/`; each needs the stage of its name."""
     max_frames: int = Field(160, ge=8, multiple_of=4)
     """Longest window of a clip."""
     min_frames: int = Field(16, ge=4)
@@ -63,7 +63,7 @@ class UttStageConfig(TrainedStageConfig):
 
 
 class UttInputs(Inputs):
-    """What it takes beside the stages of its modalities."""
+    """Inputs beside the stages of its modalities."""
 
     data: Data
     stats: FeatureStats

@@ -85,7 +85,7 @@ class EvaluateStage(EvaluationStage):
 
 
 class _Evaluation(EvaluationUnits):
-    """What is read from what all processes have made."""
+    """Results of all processes."""
 
     def __init__(self, context: StageContext) -> None:
         super().__init__(context)
@@ -124,7 +124,7 @@ class _Evaluation(EvaluationUnits):
 
     @cached_property
     def protocol(self) -> dict[str, Fact]:
-        """What one has to know to get the figures of generated motion again, but for the seed."""
+        """Return the settings behind figures of generated motion, but for the seed."""
         config = self.config
         assert self.bundle is not None
         return {
@@ -248,7 +248,7 @@ class _Evaluation(EvaluationUnits):
         return mean_poses([t.joints for t in self.others], self.dataset.layout.fps, lengths)
 
     def _repeats(self, made: Sequence[Arrays]) -> list[Sequence[Arrays]]:
-        """What was generated, draw by draw."""
+        """Return the generated motions, draw by draw."""
         found = list(zip(self.performances, made, strict=True))
         return [[table for (own, _), table in found if own == draw] for draw in range(self.draws)]
 

@@ -48,7 +48,7 @@ class EvaluateCaptionsConfig(StageConfig):
 
 
 class EvaluateCaptionsStage(StageKind[EvaluateCaptionsConfig]):
-    """What a captioner says of the test split."""
+    """Sentences of a captioner about the test split."""
 
     name = "evaluate_captions"
     summary = "figures of captions"

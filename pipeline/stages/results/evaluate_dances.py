@@ -98,7 +98,7 @@ class EvaluateDancesStage(EvaluationStage):
 
 
 class _DanceEvaluation(Evaluation):
-    """What one evaluation measures."""
+    """The motions and references of one evaluation."""
 
     def __init__(self, context: StageContext) -> None:
         super().__init__(context)
@@ -148,7 +148,7 @@ class _DanceEvaluation(Evaluation):
 
     @cached_property
     def protocol(self) -> dict[str, Fact]:
-        """What one has to know to get the same figures again, but for the seed."""
+        """Return the settings behind the figures, but for the seed."""
         config, clips, maker = self.config, self.clips, self.bundle.generator
         return {
             "split": self.dataset.split,

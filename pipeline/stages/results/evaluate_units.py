@@ -1,4 +1,4 @@
-"""What the processes of a run make for an evaluation: clips reconstructed, captions performed, measured."""
+"""Units of an evaluation that processes share: clips reconstructed, captions performed, measured."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class EvaluateConfig(StageConfig):
 
 
 class EvaluationUnits(Evaluation):
-    """What is made clip by clip."""
+    """Results made clip by clip."""
 
     def __init__(self, context: StageContext) -> None:
         super().__init__(context)
@@ -126,7 +126,7 @@ class EvaluationUnits(Evaluation):
         return out
 
     def judged(self, judge: Judge, truths: Sequence[Truth]) -> list[Truth]:
-        """Those that a judge can judge: faces where there are some."""
+        """Return the motions that a judge can judge: faces where there are some."""
         return [t for t in truths if judge.motions.part != "face" or t.face is not None]
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What the stages that evaluate have in common: their work is shared, their figures are written and shown."""
+"""Base of the stages that evaluate: their work is shared, their figures are written and shown."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Evaluation:
         return [(draw, piece) for turn in turns for piece in pieces for draw in turn]
 
     def seeds(self, draw: int, first: int) -> tuple[int, int | None]:
-        """Of the tokens of a draw from clip `first` on; of the noise where they are decoded several times."""
+        """Return the seeds of a draw's tokens from clip `first` on, or of the noise of repeated decodings."""
         turn, decoding = divmod(draw, self.config.decodings)
         seed = self.context.seed + 7919 * (turn + 1) + first
         return seed, None if self.config.decodings == 1 else seed + 104_729 * (decoding + 1)
@@ -105,7 +105,7 @@ class Evaluation:
         return facts({"repeats": config.repeats, **nested, "sampling": bundle.in_effect(config.sampling)})
 
     def about(self, bundle: Bundle | None) -> dict[str, Any]:
-        """What is evaluated: the stage, the split and what made the motions."""
+        """Return the evaluated stage, split and generators."""
         made_by = dict[str, Finished | None]()
         if bundle is not None:
             face = bundle.choose_face(self.config.sampling.face_model)
@@ -135,7 +135,7 @@ class Evaluation:
         self.make("reference", "features of all motions", [s.stop - s.start for s in slices], features)
 
     def reference(self, member: str) -> Features:
-        """What all processes made of it: features [n, F]."""
+        """Return all processes' results: features [n, F]."""
         count = len(even_slices(len(self._reference(member)), _REFERENCE))
         parts = list(self.context.units.read("reference", count))
         return {kind: np.concatenate([part[kind] for part in parts]) for kind in parts[0]}

@@ -59,7 +59,7 @@ from motionloom.pipeline.store.run_state import RunState, run_state
 
 
 class ReportConfig(StageConfig):
-    """What the page shows."""
+    """Contents of the page."""
 
     count: int = Field(6, ge=0, le=24)
     """Held-out clips with captions shown as truth, reconstruction and generation."""
@@ -178,7 +178,7 @@ def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion
 
 
 def _bundle(context: StageContext, modality: str) -> Bundle | None:
-    """What makes motion from it; of an unfinished run, None where no generator of the body is finished."""
+    """Return its generators; of an unfinished run, None where no generator of the body is complete."""
     makers = context.every("generators")
     unfinished = context.again is not None and run_state(context.again).unfinished
     if unfinished and all(context.stage_cache.generator(maker).part == "face" for maker in makers):

@@ -24,7 +24,7 @@ SPLITS = ("train", "val", "test")
 
 
 def draw_showings(page: Page, heading: str, kind: type[Showing], shown: Sequence[Showing]) -> None:
-    """What stages show of one kind, under a heading; nothing where there is none."""
+    """Return the figures of one kind under a heading; nothing where there is none."""
     things = [thing for thing in shown if isinstance(thing, kind)]
     if things:
         page.add_heading(heading)
@@ -100,7 +100,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def say_missing(page: Page, state: RunState) -> None:
-    """What the run does not have yet, where something is missing."""
+    """Return a note on the parts that the run does not have yet, if any."""
     lines = [f"{stage.name}: {stage.say()}" for stage in state.unfinished if stage.kind != "report"]
     if not lines:
         return

@@ -9,14 +9,21 @@ import pytest
 import torch
 
 from motionloom.datasets.conditions import Condition
-from motionloom.models.diffusion.module import DiffusionModule
-from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
+from motionloom.models.diffusion.module import TextDenoiserModule
+from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.models.training.stage_module import OptimConfig
+from motionloom.pipeline.baselines.mdm.network import Mdm
 
-SMALL = DiffusionConfig(dim=32, ff=64, layers=2, heads=2, dropout=0.0)
-OURS = SMALL.model_copy(update={"spread": True, "frames_per_token": 2})
+SMALL = TextDenoiserConfig(dim=32, ff=64, layers=2, heads=2, dropout=0.0)
+OURS = InBetweenConfig(dim=32, ff=64, layers=2, heads=2, dropout=0.0)
+
+
+def network(config: TextDenoiserConfig, motion_dim: int = 5, text_dim: int = 7) -> TextDenoiser:
+    kind = InBetweener if isinstance(config, InBetweenConfig) else Mdm
+    return kind(config, motion_dim, text_dim)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -57,9 +64,9 @@ def test_a_shift_is_noise_so_many_times_as_strong(shift: float) -> None:
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("config", [SMALL, OURS])
 @pytest.mark.parametrize("frames", [7, 8])
-def test_padding_plays_no_part(config: DiffusionConfig, frames: int) -> None:
+def test_padding_plays_no_part(config: TextDenoiserConfig, frames: int) -> None:
     torch.manual_seed(0)
-    net = MotionDiffusion(config, 5, 7).eval()
+    net = network(config).eval()
     x, text = torch.randn(1, 12, 5), torch.randn(1, 7)
     step, conditioned = torch.tensor([30]), torch.tensor([True])
     mask = torch.arange(12)[None] < frames
@@ -70,18 +77,18 @@ def test_padding_plays_no_part(config: DiffusionConfig, frames: int) -> None:
 
 
 def test_frames_of_a_token_lie_side_by_side() -> None:
-    net = MotionDiffusion(OURS, 3, 7)
+    net = InBetweener(OURS, 3, 7)
     x = torch.arange(15.0).view(1, 5, 3)
-    tokens = net._tokens(x)
+    tokens = net.tokens(x)
     assert tokens.shape == (1, 3, 6) and tokens[0, 1].tolist() == [6, 7, 8, 9, 10, 11]
     assert tokens[0, 2].tolist() == [12, 13, 14, 0, 0, 0]
 
 
-def test_a_spread_text_reaches_every_frame_without_attention() -> None:
+def test_the_condition_is_added_to_every_frame() -> None:
     torch.manual_seed(0)
     x, mask, step = torch.randn(1, 12, 5), torch.ones(1, 12, dtype=torch.bool), torch.tensor([30])
     for config, reached in ((SMALL, False), (OURS, True)):
-        net = MotionDiffusion(config.model_copy(update={"layers": 1}), 5, 7).eval()
+        net = network(config.model_copy(update={"layers": 1})).eval()
         for values in net.stack.blocks.parameters():
             torch.nn.init.zeros_(values)  # blocks that pass on what they are given
         one, two = (net(x, step, torch.full((1, 7), t), mask, torch.tensor([True])) for t in (0.0, 1.0))
@@ -89,9 +96,9 @@ def test_a_spread_text_reaches_every_frame_without_attention() -> None:
 
 
 @pytest.mark.parametrize("config", [SMALL, OURS])
-def test_hidden_text_has_no_influence(config: DiffusionConfig) -> None:
+def test_hidden_text_has_no_influence(config: TextDenoiserConfig) -> None:
     torch.manual_seed(0)
-    net = MotionDiffusion(config, 5, 7).eval()
+    net = network(config).eval()
     x, mask, step = torch.randn(1, 12, 5), torch.ones(1, 12, dtype=torch.bool), torch.tensor([30])
     for conditioned, same in ((False, True), (True, False)):
         pair = [net(x, step, torch.randn(1, 7) * 3, mask, torch.tensor([conditioned])) for _ in range(2)]
@@ -103,8 +110,8 @@ def test_hidden_text_has_no_influence(config: DiffusionConfig) -> None:
 def test_learns_which_motion_a_text_means(sampler: Sampler) -> None:
     """Two texts, two constant motions: each text must give its own."""
     torch.manual_seed(0)
-    net = MotionDiffusion(SMALL, 3, 2)
-    module = DiffusionModule(net, OptimConfig(lr=3e-3), seed=0, max_steps=150)
+    net = Mdm(SMALL, 3, 2)
+    module = TextDenoiserModule(net, OptimConfig(lr=3e-3), seed=0, max_steps=150)
     optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
     text = torch.eye(2).repeat(16, 1)
     motion = (text[:, :1] * 2 - 1)[:, None].expand(-1, 8, 3) * torch.tensor([1.0, -1.0, 0.5])
@@ -123,7 +130,7 @@ def test_learns_which_motion_a_text_means(sampler: Sampler) -> None:
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
 def test_a_motion_does_not_depend_on_its_batch(sampler: Sampler) -> None:
     torch.manual_seed(0)
-    net = MotionDiffusion(SMALL, 5, 7)
+    net = Mdm(SMALL, 5, 7)
     text = torch.randn(3, 7)
     together = sample_motions(net, text, [8, 12, 8], seeds=[4, 5, 6], sampler=sampler, steps=5)
     for row, frames in enumerate([8, 12, 8]):
@@ -135,7 +142,7 @@ def test_a_motion_does_not_depend_on_its_batch(sampler: Sampler) -> None:
 @pytest.mark.parametrize("guidance", [1.0, 3.0])
 def test_guidance_goes_from_without_text_past_with_text(guidance: float) -> None:
     """A denoiser that answers 1 with text and 0 without: guided by s the answer is 0 + s * (1 - 0)."""
-    net = MotionDiffusion(SMALL, 5, 7)
+    net = Mdm(SMALL, 5, 7)
     net.forward = lambda x, step, text, mask, conditioned: (  # type: ignore[method-assign]
         torch.ones_like(x) * conditioned[:, None, None]
     )

@@ -11,8 +11,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
 from motionloom.models.diffusion.module import DmdModule
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import MqConfig
+from motionloom.models.tokenizer.single import MqConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
@@ -34,7 +33,7 @@ def tokenizer(finger_gain: float, root_gain: float) -> Tokenizer:
         {"part": "all", "width": 8, "code_dim": 6, "num_codes": 9, "quantizer": "ema", "depth": 0,
          "finger_gain": finger_gain, "root_gain": root_gain}
     )  # fmt: skip
-    made = build_tokenizer(config, LAYOUT)
+    made = config.build(LAYOUT)
     made.basis.learn(stats().mean, stats().std)
     for book in made.codebooks().values():
         torch.nn.init.normal_(book.codebook)

@@ -11,17 +11,19 @@ from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.figure_parts import LOWER, PIECES
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.editing import Filling, Given, Pins, Worded
-from motionloom.models.diffusion.module import DiffusionModule
-from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
-from motionloom.models.diffusion.observed import Places, Showing, known_columns, observed_columns
+from motionloom.models.diffusion.editing import CaptionSpan, Filling, KnownMotion, Pins
+from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
+from motionloom.models.diffusion.module import InBetweenModule
+from motionloom.models.diffusion.network import TextDenoiser
+from motionloom.models.diffusion.observed import Observations, Places, known_columns, observed_columns
 from motionloom.models.diffusion.recovery import Recovery
 from motionloom.models.training.stage_module import OptimConfig
+from motionloom.pipeline.baselines.mdm.network import Mdm
 
 LAYOUT = MotionLayout.named("body133")
 COLUMNS = LAYOUT.part("all")
 FRAMES = 24
-TINY = DiffusionConfig(dim=16, ff=16, layers=1, heads=2, dropout=0.0, observed=0.9)
+TINY = InBetweenConfig(dim=16, ff=16, layers=1, heads=2, dropout=0.0, frames_per_token=1)
 
 
 def recovery(layout: MotionLayout = LAYOUT) -> Recovery:
@@ -50,7 +52,7 @@ def test_columns_without_the_root_have_no_way() -> None:
     unit = np.ones(363, dtype=np.float32)
     with pytest.raises(UserError, match="root"):
         Recovery(layout, layout.part("hand"), unit, unit)
-    assert Showing.of(layout, layout.part("face"), unit, unit, 1.0).recovery is None
+    assert Observations.of(layout, layout.part("face"), unit, unit, 1.0).recovery is None
 
 
 def test_a_step_is_known_where_both_its_frames_and_the_root_are() -> None:
@@ -72,7 +74,7 @@ def test_what_is_shown_is_the_truth() -> None:
     motion, length = torch.randn(64, FRAMES, len(COLUMNS)), torch.full((64,), FRAMES)
     length[::2] = 15
     own = recovery()
-    seen = Showing(LAYOUT, COLUMNS, own, 0.75)(motion, length)
+    seen = Observations(LAYOUT, COLUMNS, own, 0.75)(motion, length)
     dim = len(COLUMNS)
     known = seen[..., dim : 2 * dim].bool()
     assert torch.equal(seen[..., :dim], motion * known)
@@ -90,8 +92,10 @@ def test_what_is_shown_is_the_truth() -> None:
 def test_training_shows_and_learns() -> None:
     """Shown everything but the middle of waves, it fills in nearer than the straight line does."""
     torch.manual_seed(0)
-    config = DiffusionConfig(dim=48, ff=96, layers=1, heads=4, dropout=0.0, observed=1.0, quieted=True)
-    net = MotionDiffusion(config, len(COLUMNS), 4)
+    config = InBetweenConfig(
+        dim=48, ff=96, layers=1, heads=4, dropout=0.0, frames_per_token=1, velocity_weight=0
+    )
+    net = InBetweener(config, len(COLUMNS), 4)
     times = torch.arange(FRAMES) / FRAMES
 
     def waves(count: int) -> torch.Tensor:
@@ -103,13 +107,13 @@ def test_training_shows_and_learns() -> None:
         known[:, :8], known[:, 16:] = True, True
         return known, observed_columns(motion, known, None)
 
-    class Ends(Showing):
+    class Ends(Observations):
         def __call__(self, motion: torch.Tensor, length: torch.Tensor) -> torch.Tensor:
             return shown(motion)[1]
 
-    module = DiffusionModule(
+    module = InBetweenModule(
         net, OptimConfig(lr=3e-3, warmup_steps=0), seed=0, max_steps=200,
-        showing=Ends(LAYOUT, COLUMNS, None, 1.0),
+        observations=Ends(LAYOUT, COLUMNS, None, 1.0),
     )  # fmt: skip
     optimizer = torch.optim.AdamW(net.parameters(), 3e-3)
     for _ in range(200):
@@ -121,7 +125,7 @@ def test_training_shows_and_learns() -> None:
         optimizer.step()
     [truth] = waves(1)
     known = shown(truth[None])[0][0]
-    made = filled(net, Given(truth, known), steps=10)[0]
+    made = filled(net, KnownMotion(truth, known), steps=10)[0]
     share = torch.linspace(0, 1, 10)[1:-1, None]
     line = truth[7] * (1 - share) + truth[16] * share
     miss, trivial = ((one - truth[8:16]).square().mean() for one in (made[8:16], line))
@@ -129,16 +133,20 @@ def test_training_shows_and_learns() -> None:
 
 
 def filled(
-    net: MotionDiffusion, given: Given, steps: int = 6, words: list[Worded] | None = None, **options: float
+    net: TextDenoiser,
+    given: KnownMotion,
+    steps: int = 6,
+    words: list[CaptionSpan] | None = None,
+    **options: float,
 ) -> torch.Tensor:
-    said = words or [Worded(torch.zeros(net.text_dim), False, torch.ones(len(given.motion)))]
+    said = words or [CaptionSpan(torch.zeros(net.text_dim), False, torch.ones(len(given.motion)))]
     window = int(options.pop("window", 200))
     rooted = recovery() if given.places is not None else None
     filling = Filling(net, given, said, rooted, window=window, overlap=window // 4, **options)
     return filling([0, 1], "ddpm", steps)
 
 
-def task(pinned: bool = True) -> Given:
+def task(pinned: bool = True) -> KnownMotion:
     """A motion whose begin and end are kept, with a pin between them."""
     torch.manual_seed(1)
     motion = torch.randn(FRAMES, len(COLUMNS)) * 0.3
@@ -151,19 +159,18 @@ def task(pinned: bool = True) -> Given:
     places = Places(anchor, heading, place + 0.5 * (torch.arange(FRAMES) >= 16)[:, None], rooted, rooted)
     wrist = LAYOUT.skeleton.index("left_wrist")
     pins = Pins(torch.tensor([12]), torch.tensor([wrist]), torch.tensor([[0.4, 1.2, 0.3]]))
-    return Given(motion, known, places, pins if pinned else None)
+    return KnownMotion(motion, known, places, pins if pinned else None)
 
 
-@pytest.mark.parametrize("predicts", ["sample", "epsilon"])
-def test_what_is_kept_is_kept_and_misses_fall_with_strength(predicts: str) -> None:
+@pytest.mark.parametrize("kind", [InBetweener, Mdm])
+def test_known_values_are_kept_and_errors_fall_with_strength(kind: type[TextDenoiser]) -> None:
     torch.manual_seed(0)
-    config = TINY.model_copy(update={"schedule": TINY.schedule.model_copy(update={"predicts": predicts})})
-    net, given = MotionDiffusion(config, len(COLUMNS), 4), task()
+    net, given = kind(TINY, len(COLUMNS), 4), task()
     assert given.places is not None and given.pins is not None
     misses = []
     for strength in (0.0, 1.0, 6.0):
         made = filled(net, given, strength=strength)
-        assert torch.equal(made[:, given.known], given.motion[given.known].expand(2, -1))
+        assert torch.equal(made[:, given.mask], given.motion[given.mask].expand(2, -1))
         anchor = given.places.anchor.expand(2)
         landing = recovery().way(made, anchor)[1][:, -1] - given.places.place[:, -1]
         joint = recovery().world(made, anchor)[:, 12, given.pins.joints] - given.pins.positions
@@ -172,7 +179,7 @@ def test_what_is_kept_is_kept_and_misses_fall_with_strength(predicts: str) -> No
     assert misses[2] < 0.7 * misses[0]
 
 
-class Echo(MotionDiffusion):
+class Echo(InBetweener):
     """Takes noisy motion for clean."""
 
     def forward(self, noisy: torch.Tensor, *more: object, **named: object) -> torch.Tensor:
@@ -181,14 +188,14 @@ class Echo(MotionDiffusion):
 
 def test_likeness_stays_near_and_seeds_differ() -> None:
     net, given = Echo(TINY, len(COLUMNS), 4), task(pinned=False)
-    still = Given(given.motion[:1].expand(FRAMES, -1), given.known)  # so that smoothing leaves it alone
+    still = KnownMotion(given.motion[:1].expand(FRAMES, -1), given.mask)  # so that smoothing leaves it alone
     made = [filled(net, still, steps=10, likeness=one) for one in (0.0, 0.5, 0.9)]
     assert not torch.equal(made[0][0], made[0][1])
     away = [float((one[0] - still.motion).norm()) for one in made]
     assert away[0] > away[1] > away[2]
 
 
-class Aside(MotionDiffusion):
+class Aside(InBetweener):
     """Makes what is given, all of it off by 1."""
 
     wanted: torch.Tensor
@@ -199,24 +206,24 @@ class Aside(MotionDiffusion):
 
 def test_what_the_network_misses_of_the_kept_part_is_led_off() -> None:
     net, given = Aside(TINY, len(COLUMNS), 4), task(pinned=False)
-    still = Given(torch.zeros_like(given.motion), given.known)
+    still = KnownMotion(torch.zeros_like(given.motion), given.mask)
     net.wanted = still.motion
     made = filled(net, still)[0]
-    off = made[8:16, given.known[0] & ~given.known[8]].mean(1)
+    off = made[8:16, given.mask[0] & ~given.mask[8]].mean(1)
     assert off[0] < 0.2 and off[-1] < 0.2  # half a smoothed jump would be left otherwise
 
 
 def test_windows_and_words_share_frames() -> None:
     """Two stretches of words: only the frames of the second change with its words; windows overlap."""
     torch.manual_seed(0)
-    net = MotionDiffusion(TINY, len(COLUMNS), 4)
+    net = InBetweener(TINY, len(COLUMNS), 4)
     net.text.weight.data *= 20
     known = torch.zeros(FRAMES, len(COLUMNS), dtype=torch.bool)
-    given = Given(torch.zeros(FRAMES, len(COLUMNS)), known)
+    given = KnownMotion(torch.zeros(FRAMES, len(COLUMNS)), known)
     late = (torch.arange(FRAMES) >= 12).float()
 
     def made(second: torch.Tensor) -> torch.Tensor:
-        words = [Worded(torch.ones(4), True, 1 - late), Worded(second, True, late)]
+        words = [CaptionSpan(torch.ones(4), True, 1 - late), CaptionSpan(second, True, late)]
         return filled(net, given, words=words, window=10, steps=2)[0]
 
     one, other = made(torch.ones(4)), made(-torch.ones(4))

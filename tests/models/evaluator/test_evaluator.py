@@ -122,18 +122,18 @@ def test_each_is_trained_in_its_time_and_by_its_own_loss() -> None:
     net = network(dropout=0.5)
     trained, given = module(net), batch()
     trained.train()
-    movement, pairs = trained.players()
-    assert [s for s in range(8) if movement.plays(s)] == [0, 1, 2, 3]
-    assert [s for s in range(8) if pairs.plays(s)] == [4, 5, 6, 7]
+    movement, pairs = trained.optimizer_groups()
+    assert [s for s in range(8) if movement.steps_at(s)] == [0, 1, 2, 3]
+    assert [s for s in range(8) if pairs.steps_at(s)] == [4, 5, 6, 7]
     every = {id(p) for p in net.parameters()} | {id(p) for p in trained.decoder.parameters()}
-    assert {id(p) for player in (movement, pairs) for p in player.params()} == every
-    for player, others in ((movement, pairs), (pairs, movement)):
+    assert {id(p) for group in (movement, pairs) for p in group.params()} == every
+    for group, others in ((movement, pairs), (pairs, movement)):
         trained.zero_grad()
-        trained.play(player.name, given, {})["loss"].backward()
-        assert all(p.grad is not None for p in player.params()), player.name
-        assert all(p.grad is None for p in others.params()), player.name
+        trained.losses_of(group.name, given, {})["loss"].backward()
+        assert all(p.grad is not None for p in group.params()), group.name
+        assert all(p.grad is None for p in others.params()), group.name
     drawn = [
-        {name: trained.play(name, given, {})["loss"].item() for name in ("movement", "matching")}
+        {name: trained.losses_of(name, given, {})["loss"].item() for name in ("movement", "matching")}
         for _ in "ab"
     ]
     assert drawn[0]["movement"] != drawn[1]["movement"] and drawn[0]["matching"] == drawn[1]["matching"]

@@ -12,7 +12,7 @@ from toy_gpt import HAND, aligned_gpt, sequences
 from motionloom.models.gpt.losses import cross_entropy
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, SeparateConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
 
 GROUPS = [5, 2, 3, 4]
 LACKS = torch.tensor([False, True, False, True])

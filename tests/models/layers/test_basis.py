@@ -10,9 +10,9 @@ import torch
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.layers.basis import Basis
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.tokenizer.single import RvqConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.evaluation.reference_baselines import local_joints
 
@@ -104,7 +104,7 @@ SIZES = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8, "reset_below": 0
 def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfig | RvqConfig]) -> None:
     torch.manual_seed(0)
     settings = config.model_validate({**SIZES, "root_gain": 5.0, "finger_gain": 2.0})
-    net = build_tokenizer(settings, LAYOUT)
+    net = settings.build(LAYOUT)
     net.basis.learn(MEAN[LAYOUT.part("bodyhand")], STD[LAYOUT.part("bodyhand")])
     x, length = torch.randn(2, 16, 313), torch.tensor([16, 8])
     x[1, 8:] = 0
@@ -114,7 +114,7 @@ def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfi
     # The palms of these random hands magnify float32's rounding some hundred times.
     torch.testing.assert_close(net.decode(codes, length), recon, rtol=1e-3, atol=1e-3)
     assert not recon[1, 8:].any(), "padding stays zero"
-    again = build_tokenizer(settings, LAYOUT)
+    again = settings.build(LAYOUT)
     again.load_state_dict(net.state_dict())
     torch.testing.assert_close(again.eval().decode(codes, length), recon, rtol=1e-3, atol=1e-3)
 
@@ -122,7 +122,7 @@ def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfi
 def test_the_loss_is_of_what_is_seen() -> None:
     torch.manual_seed(0)
     config = H2VQConfig.model_validate({**SIZES, "root_gain": 3.0, "finger_gain": 2.0})
-    net = build_tokenizer(config, LAYOUT)
+    net = config.build(LAYOUT)
     net.basis.learn(MEAN[LAYOUT.part("bodyhand")], STD[LAYOUT.part("bodyhand")])
     module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1).eval()
     x = torch.randn(2, 8, 313)

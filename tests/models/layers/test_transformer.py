@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from motionloom.models.diffusion.network import DiffusionConfig
+from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.layers.transformer import Norm, SkipTransformer, Transformer, length_mask
 
 
@@ -40,7 +40,7 @@ def theirs(ours: Transformer, norm: Norm, heads: int, ff: int) -> nn.Transformer
 @pytest.mark.parametrize("norm", get_args(Norm))
 def test_equals_torchs(norm: Norm) -> None:
     torch.manual_seed(0)
-    net = Transformer(DiffusionConfig(dim=16, heads=4, ff=40, dropout=0), 3, norm=norm)
+    net = Transformer(TextDenoiserConfig(dim=16, heads=4, ff=40, dropout=0), 3, norm=norm)
     for name, parameter in net.named_parameters():
         if "norm" in name or name.endswith("bias"):
             nn.init.normal_(parameter, mean=1.0 if name.endswith("weight") else 0.0, std=0.3)
@@ -64,7 +64,7 @@ def theirs_of_other(net: Transformer, norm: Norm) -> nn.TransformerEncoder:
 @pytest.mark.parametrize("norm", get_args(Norm))
 def test_step_by_step_equals_at_once(norm: Norm) -> None:
     torch.manual_seed(0)
-    net = Transformer(DiffusionConfig(dim=16, heads=2, ff=32, dropout=0), 2, norm=norm).double().eval()
+    net = Transformer(TextDenoiserConfig(dim=16, heads=2, ff=32, dropout=0), 2, norm=norm).double().eval()
     x = torch.randn(2, 7, 16).double()
     cache = net.cache(7)
     with torch.no_grad():
@@ -73,7 +73,7 @@ def test_step_by_step_equals_at_once(norm: Norm) -> None:
 
 
 def test_checkpointed_activations_draw_again_what_they_drew() -> None:
-    stack = Transformer(DiffusionConfig(dim=8, heads=2, ff=16, dropout=0.3), 2).double()
+    stack = Transformer(TextDenoiserConfig(dim=8, heads=2, ff=16, dropout=0.3), 2).double()
     x = torch.randn(3, 5, 8, dtype=torch.float64)
     grads = []
     for stack.checkpointed in (False, True):
@@ -88,7 +88,7 @@ def test_checkpointed_activations_draw_again_what_they_drew() -> None:
 @pytest.mark.usefixtures("float64")
 @pytest.mark.parametrize("norm", get_args(Norm))
 def test_attention_to_a_memory_equals_torchs(norm: Norm) -> None:
-    net = Transformer(DiffusionConfig(dim=16, heads=4, ff=40, dropout=0), 2, norm=norm, memory=True).eval()
+    net = Transformer(TextDenoiserConfig(dim=16, heads=4, ff=40, dropout=0), 2, norm=norm, memory=True).eval()
     for parameter in net.parameters():
         nn.init.normal_(parameter, std=0.3)
     layer = nn.TransformerDecoderLayer(
@@ -116,7 +116,7 @@ def test_attention_to_a_memory_equals_torchs(norm: Norm) -> None:
 
 @pytest.mark.usefixtures("float64")
 def test_a_u_of_blocks_merges_what_the_first_half_made_last_one_first() -> None:
-    net = SkipTransformer(DiffusionConfig(dim=8, heads=2, ff=16, dropout=0), 5, memory=True).eval()
+    net = SkipTransformer(TextDenoiserConfig(dim=8, heads=2, ff=16, dropout=0), 5, memory=True).eval()
     x, memory = torch.randn(2, 6, 8), torch.randn(2, 1, 8)
     mask = length_mask(torch.tensor([6, 3]), 6)
     a, b, c, d, e = (
@@ -128,4 +128,4 @@ def test_a_u_of_blocks_merges_what_the_first_half_made_last_one_first() -> None:
     fifth = e(net.merge[1](torch.cat([fourth, first], dim=-1)))
     torch.testing.assert_close(net(x, mask, memory=memory), net.norm(fifth))
     with pytest.raises(ValueError, match="odd"):
-        SkipTransformer(DiffusionConfig(dim=8, heads=2, ff=16), 4)
+        SkipTransformer(TextDenoiserConfig(dim=8, heads=2, ff=16), 4)

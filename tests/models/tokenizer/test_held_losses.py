@@ -10,26 +10,21 @@ from torch import Tensor
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.diffusion.module import DiffusionModule
-from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.module import TextDenoiserModule
+from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.tma.network import Tma, TmaConfig
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import (
-    AnyTokenizerConfig,
-    FsqConfig,
-    H2VQConfig,
-    RvqConfig,
-    SeparateConfig,
-    VqConfig,
-)
+from motionloom.models.tokenizer.base import TokenizerConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
 from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.tokenizer.single import FsqConfig, RvqConfig, VqConfig
 from motionloom.models.training.stage_module import OptimConfig, StageModule
+from motionloom.pipeline.baselines.mdm.network import Mdm
 
 LAYOUT = MotionLayout.named("wholebody363")
 SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "velocity_weight": 0.5}
 BOOK: dict[str, Any] = {**SMALL, "num_codes": 8, "reset_below": 0.1}
-CONFIGS: dict[str, AnyTokenizerConfig] = {
+CONFIGS: dict[str, TokenizerConfig] = {
     "h2vq": H2VQConfig(**BOOK),
     "separate": SeparateConfig(**BOOK),
     "vq all": VqConfig(**BOOK, part="all"),
@@ -40,9 +35,9 @@ HELD = [3, 1, 2, 0]
 LENGTH = torch.tensor([16, 12, 16, 9])
 
 
-def module_of(config: AnyTokenizerConfig) -> TokenizerModule:
+def module_of(config: TokenizerConfig) -> TokenizerModule:
     torch.manual_seed(0)
-    net = build_tokenizer(config, LAYOUT)
+    net = config.build(LAYOUT)
     return TokenizerModule(net, OptimConfig(), seed=0, max_steps=1)
 
 
@@ -136,8 +131,8 @@ def test_missing_columns_are_not_reconstructed(kind: str) -> None:
         net = Tma(TmaConfig(latent=8, ff=8, layers=1, heads=2, dropout=0, attention_dropout=0), 313, 6)
         module, bias = TmaModule(net, OptimConfig(), seed=0, max_steps=1), net.motion_decoder.out.bias
     else:
-        denoiser = MotionDiffusion(DiffusionConfig(dim=8, ff=8, layers=1, heads=2), 313, 6)
-        module = DiffusionModule(denoiser, OptimConfig(), seed=0, max_steps=1)
+        denoiser = Mdm(TextDenoiserConfig(dim=8, ff=8, layers=1, heads=2), 313, 6)
+        module = TextDenoiserModule(denoiser, OptimConfig(), seed=0, max_steps=1)
         bias = next(p for p in denoiser.parameters() if p.shape == (313,))
     hand = torch.from_numpy(LAYOUT.part("hand"))
     losses, _, _ = trained(module, [captioned([0, 2, 0, 2], columns)])

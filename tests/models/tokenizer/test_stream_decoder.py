@@ -10,23 +10,15 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import (
-    AnyTokenizerConfig,
-    FsqConfig,
-    H2VQConfig,
-    MqConfig,
-    RvqConfig,
-    SeparateConfig,
-    Tm2tConfig,
-    VqConfig,
-)
+from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer, TokenizerConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
+from motionloom.models.tokenizer.single import FsqConfig, MqConfig, RvqConfig, VqConfig
 from motionloom.models.tokenizer.streaming import StreamDecoder
+from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig
 
 GROUPS = 26
 SMALL = {"width": 8, "code_dim": 6, "num_codes": 16}
-KINDS: dict[str, AnyTokenizerConfig] = {
+KINDS: dict[str, TokenizerConfig] = {
     "h2vq": H2VQConfig(**SMALL, depth=2, dilation_growth=2),
     "h2vq with fingers": H2VQConfig(**SMALL, depth=1, finger_gain=2.0, root_gain=3.0),
     "vq": VqConfig(**SMALL, depth=2, dilation_growth=2),
@@ -42,7 +34,7 @@ KINDS: dict[str, AnyTokenizerConfig] = {
 def net(request: pytest.FixtureRequest) -> Tokenizer:
     """A decoder with weights that let every latent show in every frame that it reaches."""
     torch.manual_seed(0)
-    made = build_tokenizer(KINDS[request.param], MotionLayout.named("wholebody363")).double().eval()
+    made = KINDS[request.param].build(MotionLayout.named("wholebody363")).double().eval()
     for module in made.decoder.modules():
         if isinstance(module, torch.nn.Conv1d):
             torch.nn.init.uniform_(module.weight, 0.1, 0.3)  # positive: no path is closed by a ReLU

@@ -13,19 +13,9 @@ from torch.nn import functional
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.tokenizer.base import Stream, Tokenizer
-from motionloom.models.tokenizer.body_hand import H2VQ
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import (
-    FsqConfig,
-    H2VQConfig,
-    MqConfig,
-    RvqConfig,
-    SeparateConfig,
-    Tm2tConfig,
-    VqConfig,
-    parse_tokenizer,
-)
-from motionloom.models.tokenizer.single import MotionQuantizer
+from motionloom.models.tokenizer.body_hand import H2VQ, H2VQConfig, SeparateConfig
+from motionloom.models.tokenizer.single import FsqConfig, MotionQuantizer, MqConfig, RvqConfig, VqConfig
+from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig
 
 LAYOUT = MotionLayout.named("wholebody363")
 SMALL: dict[str, Any] = {"width": 16, "depth": 2, "code_dim": 8, "num_codes": 16}
@@ -49,7 +39,7 @@ def _seed() -> None:
 
 @pytest.fixture(params=list(CONFIGS))
 def tokenizer(request: pytest.FixtureRequest) -> Tokenizer:
-    net = build_tokenizer(CONFIGS[request.param], LAYOUT)
+    net = CONFIGS[request.param].build(LAYOUT)
     for _ in range(3):
         net(torch.randn(8, 16, net.dim))
     return net
@@ -79,7 +69,7 @@ def test_columns_streams_and_shapes(tokenizer: Tokenizer) -> None:
 
 
 def test_paper_sizes() -> None:
-    net = build_tokenizer(H2VQConfig(), MotionLayout.named("wholebody313"))
+    net = H2VQConfig().build(MotionLayout.named("wholebody313"))
     assert net.streams == (Stream("body", 512, 2), Stream("hand", 512, 1))
     assert net.pattern == ("body", "body", "hand")
     assert net.dim == 313
@@ -98,8 +88,8 @@ def test_paper_sizes() -> None:
 
 
 def test_sizes_of_udes_quantization() -> None:
-    config = parse_tokenizer({"kind": "mq"}, "here")
-    net = build_tokenizer(config, MotionLayout.named("smpl75"))
+    config = MqConfig()
+    net = config.build(MotionLayout.named("smpl75"))
     assert isinstance(net, MotionQuantizer)
     assert (net.dim, net.streams, net.pattern) == (75, (Stream("code", 2048, 1),), ("code",))
     assert net.bits_per_second == pytest.approx(20 / 4 * math.log2(2048))
@@ -115,7 +105,7 @@ def test_sizes_of_udes_quantization() -> None:
 
 
 def test_sizes_of_tm2ts_tokenizer() -> None:
-    net = build_tokenizer(Tm2tConfig(), MotionLayout.named("h3d263"))
+    net = Tm2tConfig().build(MotionLayout.named("h3d263"))
     sizes = [sum(p.numel() for p in part.parameters()) for part in (net.encoder, net.decoder, net.quantizer)]
     assert sizes == [17_844_224, 23_043_233, 1_048_576]
 
@@ -195,7 +185,7 @@ def test_freeze_survives_the_train_call_of_a_parent(tokenizer: Tokenizer) -> Non
 
 def test_state_dict_round_trip_is_bit_equal(tokenizer: Tokenizer) -> None:
     torch.manual_seed(5)
-    other = build_tokenizer(tokenizer.config, LAYOUT)  # type: ignore[arg-type]
+    other = tokenizer.config.build(LAYOUT)  # type: ignore[arg-type]
     other.load_state_dict(tokenizer.state_dict())
     x = torch.randn(2, 16, tokenizer.dim)
     a, b = tokenizer.encode(x), other.encode(x)
@@ -210,7 +200,7 @@ def test_state_dict_round_trip_is_bit_equal(tokenizer: Tokenizer) -> None:
 
 
 def test_body_tokens_depend_on_hands_and_hand_tokens_not_on_the_body() -> None:
-    net = build_tokenizer(CONFIGS["h2vq"], LAYOUT)
+    net = CONFIGS["h2vq"].build(LAYOUT)
     assert isinstance(net, H2VQ)
     net(torch.randn(16, 16, 313))
     net.eval()
@@ -227,25 +217,18 @@ def test_body_tokens_depend_on_hands_and_hand_tokens_not_on_the_body() -> None:
 def test_mistakes_are_named() -> None:
     body = MotionLayout.named("body133")
     with pytest.raises(UserError, match="body133 has no hand columns"):
-        build_tokenizer(H2VQConfig(**SMALL), body)
+        H2VQConfig(**SMALL).build(body)
     with pytest.raises(UserError, match="body133 has no face columns"):
-        build_tokenizer(RvqConfig(**SMALL, part="face"), body)
-    net = build_tokenizer(VqConfig(**SMALL, part="body"), body)
+        RvqConfig(**SMALL, part="face").build(body)
+    net = VqConfig(**SMALL, part="body").build(body)
     with pytest.raises(UserError, match=r"133 columns of layout body133.*263"):
         net(torch.zeros(1, 8, 263))
     with pytest.raises(UserError, match="multiple of 4"):
         net(torch.zeros(1, 10, 133))
 
 
-def test_config_kinds_and_defaults() -> None:
-    face = parse_tokenizer({"kind": "rvq", "part": "face"}, "here")
-    assert isinstance(face, RvqConfig)
+def test_defaults_are_the_papers() -> None:
+    face = RvqConfig(part="face")
     assert (face.levels, face.num_codes, face.code_dim, face.width, face.depth) == (2, 512, 512, 512, 3)
     assert (face.alpha, face.decay, face.recon, face.velocity_weight) == (0.02, 0.99, "l2", 0.0)
-    assert isinstance(parse_tokenizer({"kind": "vq", "num_codes": 4096}, "here"), VqConfig)
-    assert isinstance(parse_tokenizer({"kind": "h2vq"}, "here"), H2VQConfig)
     assert (face.root_gain, face.finger_gain) == (1.0, 0.0)
-    with pytest.raises(UserError, match="here: unknown key 'levels'"):
-        parse_tokenizer({"kind": "vq", "levels": 2}, "here")
-    with pytest.raises(UserError, match="no tokenizer of kind 'vqvae'; known: h2vq, vq"):
-        parse_tokenizer({"kind": "vqvae"}, "here")

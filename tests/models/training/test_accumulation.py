@@ -20,8 +20,9 @@ from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import interleave
-from motionloom.models.tokenizer.base import Stream, Tokenizer
-from motionloom.models.tokenizer.config import AnyTokenizerConfig, FsqConfig, H2VQConfig
+from motionloom.models.tokenizer.base import Stream, Tokenizer, TokenizerConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig
+from motionloom.models.tokenizer.single import FsqConfig
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 STEPS, BATCH = 4, 6
@@ -31,7 +32,7 @@ OPTIM = OptimConfig(lr=1e-3, grad_clip=0.5)
 Case = tuple[StageModule, list[dict[str, Tensor]]]
 
 
-def tokenizer(config: AnyTokenizerConfig) -> Case:
+def tokenizer(config: TokenizerConfig) -> Case:
     module, batches = rank_cases.tokenizer(config)
     assert isinstance(module.net, Tokenizer)
     for book in module.net.codebooks().values():

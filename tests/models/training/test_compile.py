@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import torch
 from batch_rows import rows_of
-from rank_cases import CASES, Undrawn, drawing_diffusion
+from rank_cases import CASES, Undrawn, drawing_mdm
 from ude_training import train
 
 pytestmark = pytest.mark.slow
 
-ONCE = {case: make for case, make in CASES.items() if "," not in case} | {"diffusion": drawing_diffusion}
+ONCE = {case: make for case, make in CASES.items() if "," not in case} | {"mdm": drawing_mdm}
 
 
 @pytest.mark.parametrize("case", sorted(ONCE.keys() - {"evaluator", "seq2seq"}))  # torch.compile takes no GRU

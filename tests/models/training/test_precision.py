@@ -22,7 +22,7 @@ from motionloom.models.training.stage_module import StageModule
 
 STEPS = 4
 HALVES = [torch.bfloat16, torch.float16]
-CASES = ("h2vq", "rvq", "fsq", "tma", "diffusion", "gpt")
+CASES = ("h2vq", "rvq", "fsq", "tma", "mdm", "gpt")
 
 
 def build(case: str) -> tuple[StageModule, dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Training of MATE and UTT: the adversarial weight, both players, gradients, what is learnt."""
+"""Training of MATE and UTT: the adversarial weight, both groups, gradients, what is learnt."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from motionloom.models.discriminator.losses import AdversarialConfig, generator_
 from motionloom.models.discriminator.patch import DiscriminatorConfig
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tokenizer.base import Stream, Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, MqConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig
+from motionloom.models.tokenizer.single import MqConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.module import UttModule
@@ -35,7 +35,7 @@ def test_the_adversarial_weight_starts_and_rises() -> None:
     assert UttLossConfig(adversarial=AdversarialConfig(weight=0)).weight(10**6) == 0
 
 
-# ---- both players
+# ---- both groups
 
 SMALL = DiscriminatorConfig(dim=8, ff=8, heads=2, layers=1, dropout=0.0)
 LAYOUT = {"mq": "smpl75", "h2vq": "wholebody313"}
@@ -43,9 +43,8 @@ LAYOUT = {"mq": "smpl75", "h2vq": "wholebody313"}
 
 def toy_tokenizer(kind: str = "mq", num_codes: int = 9) -> Tokenizer:
     small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": num_codes}
-    made = build_tokenizer(
-        MqConfig(**small) if kind == "mq" else H2VQConfig(**small), MotionLayout.named(LAYOUT[kind])
-    )
+    config = MqConfig(**small) if kind == "mq" else H2VQConfig(**small)
+    made = config.build(MotionLayout.named(LAYOUT[kind]))
     for book in made.codebooks().values():
         nn.init.normal_(book.codebook)
     return made
@@ -122,8 +121,8 @@ def test_the_generators_loss_moves_mate_and_utt_and_not_the_critic(kind: str) ->
     module = toy_module(kind, loss={"adversarial": {"weight": 0.5, "sample": False}})
     assert module.discriminator is not None
     batch, shared = toy_batch(module), {}
-    module.discriminator.requires_grad_(False)  # as `PlayersModule` does in this turn
-    values = module.play("tokens", batch, shared)
+    module.discriminator.requires_grad_(False)  # as `AlternatingModule` does in this turn
+    values = module.losses_of("tokens", batch, shared)
     assert values.keys() >= {"loss", "ce", "adversarial"} | {f"accuracy_{n}" for n in module.net.utt.names}
     torch.testing.assert_close(values["loss"], values["ce"] + 0.5 * values["adversarial"])
     assert set(shared) == {"motion", "length", "glob"}
@@ -144,8 +143,8 @@ def test_the_critics_loss_moves_the_critic_alone() -> None:
     module = toy_module(loss={"adversarial": {"weight": 0.5}})
     assert module.discriminator is not None
     batch, shared = toy_batch(module), {}
-    module.play("tokens", batch, shared)
-    values = module.play("critic", batch, shared)  # also with what still has its gradient
+    module.losses_of("tokens", batch, shared)
+    values = module.losses_of("critic", batch, shared)  # also with what still has its gradient
     assert set(values) == {"loss", "real", "fake", "accuracy"}
     values["loss"].backward()
     assert set(grads(module.net).values()) == {0.0}
@@ -159,21 +158,21 @@ def test_the_critic_judges_real_frames_of_the_same_length() -> None:
     module = toy_module(loss={"adversarial": {"weight": 0.5, "sample": False}}).eval()
     batch = toy_batch(module)
     shared: dict[str, Tensor] = {}
-    module.play("tokens", batch, shared)
+    module.losses_of("tokens", batch, shared)
     assert shared["length"].tolist() == [20, 16, 8, 12]
     other = {**batch, "motion": batch["motion"].clone()}
     for row, length in enumerate([20, 16, 8, 12]):
         other["motion"][row, length:] = 99.0
-    for name, value in module.play("critic", batch, shared).items():
-        torch.testing.assert_close(module.play("critic", other, shared)[name], value)
+    for name, value in module.losses_of("critic", batch, shared).items():
+        torch.testing.assert_close(module.losses_of("critic", other, shared)[name], value)
 
 
 def test_turns_begin_with_the_adversarial_term() -> None:
     module = toy_module(loss={"adversarial": {"weight": 0.5}, "adversarial_start": 7})
-    tokens, critic = module.players()
-    assert tokens.plays(0) and not critic.plays(6) and critic.plays(7) and critic.plays(8)
+    tokens, critic = module.optimizer_groups()
+    assert tokens.steps_at(0) and not critic.steps_at(6) and critic.steps_at(7) and critic.steps_at(8)
     shared: dict[str, Tensor] = {}
-    values = module.play("tokens", toy_batch(module), shared)
+    values = module.losses_of("tokens", toy_batch(module), shared)
     assert "adversarial" not in values and not shared
     torch.testing.assert_close(values["loss"], values["ce"])
     module.eval()  # in validation the figure is there, and not in the loss
@@ -184,7 +183,7 @@ def test_turns_begin_with_the_adversarial_term() -> None:
 
 def test_without_the_term_there_is_no_critic() -> None:
     module = toy_module(loss={"adversarial": {"weight": 0.0}})
-    assert module.discriminator is None and [p.name for p in module.players()] == ["tokens"]
+    assert module.discriminator is None and [p.name for p in module.optimizer_groups()] == ["tokens"]
     assert not any("discriminator" in name for name in module.state_dict())
     values = module.losses(toy_batch(module))
     assert set(values) == {"loss", "tokens_loss", "tokens_ce", "tokens_accuracy_code"}
@@ -194,9 +193,9 @@ def test_dropped_conditions_are_the_unconditional_input() -> None:
     module = toy_module(condition_dropout=0.99, z_dim=0)
     batch = toy_batch(module)
     torch.manual_seed(0)
-    dropped = module.play("tokens", batch, {})["ce"]
+    dropped = module.losses_of("tokens", batch, {})["ce"]
     none = {name: Condition(c.features, torch.zeros_like(c.mask)) for name, c in batch["conditions"].items()}
-    bare = module.play("tokens", {**batch, "conditions": none}, {})["ce"]
+    bare = module.losses_of("tokens", {**batch, "conditions": none}, {})["ce"]
     torch.testing.assert_close(dropped, bare)
 
 
@@ -211,14 +210,14 @@ def test_corrupted_inputs_keep_their_targets() -> None:
 
     module.net.utt.forward = spy  # type: ignore[method-assign]
     batch = toy_batch(module)
-    module.play("tokens", batch, {})
+    module.losses_of("tokens", batch, {})
     tokens = module.sequences(batch).tokens
     assert torch.equal(seen["tokens"], tokens)
     special = (tokens == -1) | (tokens == 9)
     assert torch.equal(seen["inputs"][special], tokens[special])
     assert (seen["inputs"] != tokens)[~special].float().mean() > 0.5
     module.eval()
-    module.play("tokens", batch, {})
+    module.losses_of("tokens", batch, {})
     assert seen["inputs"] is None
 
 
@@ -264,7 +263,7 @@ def test_conditions_bring_the_cross_entropy_below_the_entropy_of_the_codes(adver
         net, OptimConfig(optimizer="adam", lr=4e-3), seed=0, max_steps=220, tokenizer=tokenizer,
         loss=UttLossConfig.parse(loss, "loss"),
     )  # fmt: skip
-    optimizers = [torch.optim.Adam(player.params(), lr=4e-3) for player in module.players()]
+    optimizers = [torch.optim.Adam(group.params(), lr=4e-3) for group in module.optimizer_groups()]
 
     def batch(seed: int, kind: str) -> dict[str, Any]:
         codes = torch.randint(6, (16, 4), generator=torch.Generator().manual_seed(seed))
@@ -289,16 +288,17 @@ def test_conditions_bring_the_cross_entropy_below_the_entropy_of_the_codes(adver
 
     for step in range(220):
         shared: dict[str, Tensor] = {}
-        for player, optimizer in zip(module.players(), optimizers, strict=True):
+        for group, optimizer in zip(module.optimizer_groups(), optimizers, strict=True):
             optimizer.zero_grad()
-            module.play(player.name, batch(step, "mixed"), shared)["loss"].backward()
+            module.losses_of(group.name, batch(step, "mixed"), shared)["loss"].backward()
             shared = {name: value.detach() for name, value in shared.items()}
             optimizer.step()
     module.eval()
     entropy = float(torch.log(torch.tensor(6.0)))
     with torch.no_grad():
         found = {
-            k: float(module.play("tokens", batch(10_000, k), {})["ce"]) for k in ("text", "audio", "none")
+            k: float(module.losses_of("tokens", batch(10_000, k), {})["ce"])
+            for k in ("text", "audio", "none")
         }
     assert found["text"] < 0.5 * entropy and found["audio"] < 0.5 * entropy, found
     assert found["none"] > 0.95 * entropy, "without conditions nothing says which code comes"

@@ -1,4 +1,4 @@
-"""A new model is its folder in `models/` and one file in `stages/networks/`: nothing names either."""
+"""A new baseline is its folder: nothing names it."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from motionloom.pipeline import baselines
 from motionloom.pipeline.contract import stage
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.stages import networks
 
-PACER = Path(__file__).resolve().parents[2] / "helpers/pacer_stage.py"
+PACER = Path(__file__).resolve().parents[2] / "helpers/pacer"
 
 
-def test_a_file_beside_the_others_is_a_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_beside_the_baselines_is_a_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stage, "_KINDS", dict(stage.stage_kinds()))
-    shutil.copy(PACER, tmp_path / "pacer.py")
-    monkeypatch.setattr(networks, "__path__", [*networks.__path__, str(tmp_path)])
+    shutil.copytree(PACER, tmp_path / "pacer")
+    monkeypatch.setattr(baselines, "__path__", [*baselines.__path__, str(tmp_path)])
     runpy.run_module("motionloom.pipeline.stages.table")
-    made = sys.modules.pop("motionloom.pipeline.stages.networks.pacer")
+    made = sys.modules.pop("motionloom.pipeline.baselines.pacer.stage")
     assert type(stage.stage_kind("pacer", "here")).__module__ == made.__name__
 
 

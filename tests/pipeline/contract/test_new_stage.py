@@ -1,6 +1,6 @@
-"""A stage kind from one file outside the package (`tests/helpers/pacer_stage.py`), through the whole program.
+"""A baseline from one folder outside the package (`tests/helpers/pacer/`), through the whole program.
 
-Nothing but that file and a recipe: the installed program is started with `MOTIONLOOM_STAGES=pacer_stage`.
+Nothing but that folder and a recipe: the installed program is started with `MOTIONLOOM_STAGES=pacer.stage`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
@@ -55,7 +56,7 @@ stages:
 """
 
 
-def environment(stages: str | None = "pacer_stage") -> dict[str, str]:
+def environment(stages: str | None = "pacer.stage") -> dict[str, str]:
     """Of the program: helpers on Python's path, and the module that registers the kind."""
     path = os.pathsep.join(filter(None, (str(HELPERS), os.environ.get("PYTHONPATH"))))
     given = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "COLUMNS": "140"}
@@ -63,7 +64,7 @@ def environment(stages: str | None = "pacer_stage") -> dict[str, str]:
     return given if stages is None else {**given, registry.VARIABLE: stages}
 
 
-def start(*arguments: object, stages: str | None = "pacer_stage") -> subprocess.Popen[str]:
+def start(*arguments: object, stages: str | None = "pacer.stage") -> subprocess.Popen[str]:
     return subprocess.Popen(
         [str(PROGRAM), *map(str, arguments)],
         stdout=subprocess.PIPE,
@@ -74,7 +75,7 @@ def start(*arguments: object, stages: str | None = "pacer_stage") -> subprocess.
     )
 
 
-def program(*arguments: object, code: int = 0, stages: str | None = "pacer_stage") -> str:
+def program(*arguments: object, code: int = 0, stages: str | None = "pacer.stage") -> str:
     process = start(*arguments, stages=stages)
     output, _ = process.communicate(timeout=240)
     assert process.returncode == code, output
@@ -109,10 +110,10 @@ def export(run: Path) -> Path:
 def known(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The kind in this process, for one test."""
     monkeypatch.setattr(registry, "_KINDS", dict(registry.stage_kinds()))
-    monkeypatch.delitem(sys.modules, "pacer_stage", raising=False)
-    importlib.import_module("pacer_stage")
+    monkeypatch.delitem(sys.modules, "pacer.stage", raising=False)
+    importlib.import_module("pacer.stage")
     yield
-    sys.modules.pop("pacer_stage")
+    sys.modules.pop("pacer.stage")
 
 
 def test_dry_run_counts_it_without_data(recipe: Path) -> None:
@@ -162,6 +163,17 @@ def test_export_loads_and_generates(run: Path, export: Path, known: None, tmp_pa
     shutil.move(alone, export)
 
 
+def test_released_weights_are_read_under_their_names(recipe: Path, run: Path) -> None:
+    trained = load_file(run / "stages/pacer/model.safetensors")
+    theirs = {f"generator.{name}": value for name, value in trained.items()}
+    save_file(theirs | {"critic.0.bias": np.zeros(8, np.float32)}, recipe.parent / "released.safetensors")
+    folder, weights = recipe.parent / "published", recipe.parent / "released.safetensors"
+    program("run", recipe, "--out", folder, "--until", "pacer", "--set", f"pacer.published={weights}")
+    loaded = load_file(folder / "stages/pacer/model.safetensors")
+    assert loaded.keys() == trained.keys()
+    assert all(np.array_equal(loaded[name], value) for name, value in trained.items())
+
+
 def test_the_recipe_schema_has_it(known: None) -> None:
     stages = recipe_schema()["properties"]["stages"]["additionalProperties"]["anyOf"][0]
     assert "pacer" in stages["properties"]["kind"]["enum"]
@@ -183,7 +195,7 @@ def test_without_the_module_it_is_one_sentence(recipe: Path, run: Path, export: 
 
 
 def test_a_module_that_is_not_there_is_one_sentence(recipe: Path) -> None:
-    said = program("run", recipe, "--dry-run", code=2, stages="pacer_stage, no_such_module")
+    said = program("run", recipe, "--dry-run", code=2, stages="pacer.stage, no_such_module")
     assert "MOTIONLOOM_STAGES=no_such_module: cannot be imported" in said and len(said.splitlines()) == 1
 
 

@@ -21,7 +21,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import EncodedText
-from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, StageCache
@@ -64,10 +64,10 @@ def editor(name: str = "wholebody363", face: bool = False) -> Bundle:
     rest = canonicalize(np.repeat(layout.skeleton.rest_joints[None], 9, axis=0))
     stats = FeatureStats(encode(rest, layout)[0], np.full(layout.dim, 0.02, np.float32), layout)
     given = {"stats": stats, "text": SimpleNamespace(encoder=Encoder(), spelled=lambda text: text)}
-    config = DiffusionConfig(dim=16, ff=16, layers=1, heads=2, observed=0.9)
+    config = InBetweenConfig(dim=16, ff=16, layers=1, heads=2)
     made: list[Any] = []
     for part in ("bodyhand", "face") if face else ("all",):
-        net = MotionDiffusion(config, len(layout.part(part)), 8)  # type: ignore[arg-type]
+        net = InBetweener(config, len(layout.part(part)), 8)  # type: ignore[arg-type]
         made.append(DiffusionMotion(layout, part, given, net.eval(), window=40))  # type: ignore[arg-type]
     return Bundle([stage(one) for one in made], StageCache())
 

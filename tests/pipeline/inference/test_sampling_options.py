@@ -19,10 +19,11 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import EncodedText
-from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig
+from motionloom.models.tokenizer.single import RvqConfig
+from motionloom.pipeline.baselines.mdm.network import Mdm
 from motionloom.pipeline.contract.generation import GenerationRequest, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, StageCache
@@ -45,7 +46,7 @@ from motionloom.pipeline.stages.results.evaluate_units import EvaluateConfig
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer
 
 GPT = GptConfig(layers=1, dim=16, heads=2, ff=16, block_size=32)
-DENOISER = DiffusionConfig(dim=16, ff=16, layers=1, heads=2)
+DENOISER = TextDenoiserConfig(dim=16, ff=16, layers=1, heads=2)
 CAPTIONS = ["a person walks", "jump", "a person sits"]
 
 
@@ -78,7 +79,7 @@ def bundle(
     stats = FeatureStats(np.zeros(363, np.float32), np.ones(363, np.float32), layout)
     given = {"stats": stats, "text": SimpleNamespace(encoder=Encoder())}
     small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
-    tokenizer = build_tokenizer(H2VQConfig(**small), layout).freeze()
+    tokenizer = H2VQConfig(**small).build(layout).freeze()
     gpt = opinionated(InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, 8))
 
     def of(levels: Any, net: InterleavedGPT, face: bool) -> GptGenerator:
@@ -87,11 +88,11 @@ def bundle(
 
     made: list[Any] = [of(tokenizer, gpt, False)]
     if "gpt" in faces:
-        levels = build_tokenizer(RvqConfig(part="face", **small), layout).freeze()
+        levels = RvqConfig(part="face", **small).build(layout).freeze()
         net = opinionated(InterleavedGPT(face or GPT, levels.streams, levels.pattern, 8))
         made.append(of(levels, net, True))
     if "diffusion" in faces:
-        denoiser = MotionDiffusion(face or DENOISER, 50, 8)
+        denoiser = Mdm(face or DENOISER, 50, 8)
         made.append(DiffusionMotion(layout, "face", given, denoiser.eval().requires_grad_(False)))
     if "vae" in faces:
         made.append(VaeMotion(layout, "face", given, SimpleNamespace()))  # type: ignore[arg-type]

@@ -13,9 +13,8 @@ from rich.console import Console
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import VqConfig
 from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.tokenizer.single import VqConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.dry_run import TrainingTime, estimate, estimate_table, plan_record
@@ -112,7 +111,7 @@ def test_saved_bytes_of_a_known_network() -> None:
     for fake in (True, False):
         mode = torch._subclasses.fake_tensor.FakeTensorMode(allow_non_fake_inputs=True)
         with mode if fake else torch.enable_grad():
-            net = build_tokenizer(config, MotionLayout.named("body133"))
+            net = config.build(MotionLayout.named("body133"))
             module = TokenizerModule(net, OptimConfig(), seed=0, max_steps=1)
             batch = {"motion": torch.zeros(4, 16, 133), "length": torch.full((4,), 16)}
             sizes.append(_saved_bytes(module, batch, None))

@@ -7,10 +7,10 @@ import shutil
 from pathlib import Path
 
 import pytest
-import tiny_players
+import tiny_adversaries
 import torch
 from rich.console import Console
-from tiny_players import Duel, Vectors
+from tiny_adversaries import Duel, Vectors
 from toy_stages import register_toys
 
 from motionloom.models.training.optim import OptimConfig
@@ -27,8 +27,8 @@ from motionloom.pipeline.training.trainer import fit
 class DuelConfig(TrainedStageConfig):
     """A training with a second optimizer."""
 
-    optim: OptimConfig = tiny_players.GENERATOR
-    critic: OptimConfig = tiny_players.GENERATOR
+    optim: OptimConfig = tiny_adversaries.GENERATOR
+    critic: OptimConfig = tiny_adversaries.GENERATOR
 
 
 DIES_AT: list[int] = []

@@ -73,7 +73,7 @@ stages:
   stats: {kind: stats}
   text: {kind: text}
   face_vae: {kind: tma, part: face, net: {frame_stride: 1}, loss: {contrastive: 0}}
-  diffusion: {kind: diffusion}
+  diffusion: {kind: mdm, part: face}
   tma: {kind: tma}
   generate: {kind: generate, inputs: {generators: [face_vae, diffusion]}}
 """
@@ -153,7 +153,7 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
             "extends: base\nname: child\nstages: {face_vea: null}",
             "there is no such stage to remove; did you mean 'face_vae'",
         ),
-        (LISTED.replace("{kind: diffusion}", "null"), r"stages\.diffusion"),
+        (LISTED.replace("{kind: mdm, part: face}", "null"), r"stages\.diffusion"),
     ],
 )
 def test_wrong_recipes_are_refused(text: str, says: str, load: Any) -> None:

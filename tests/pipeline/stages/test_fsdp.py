@@ -29,8 +29,7 @@ from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.network import Tma, TmaConfig
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.stage import StageCache, StageContext, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
@@ -72,9 +71,7 @@ class Tokens(Dataset[dict[str, Tensor]]):
 def train(folder: Path, **settings: Any) -> None:
     """A stage of 8 steps in `folder`, from its newest checkpoint; the lead leaves `weights.safetensors`."""
     torch.manual_seed(0)
-    book = build_tokenizer(
-        H2VQConfig(width=8, depth=1, code_dim=8, num_codes=9), MotionLayout.named("wholebody313")
-    )
+    book = H2VQConfig(width=8, depth=1, code_dim=8, num_codes=9).build(MotionLayout.named("wholebody313"))
     tma = Tma(TmaConfig(latent=16, ff=16, layers=1, heads=2), 313, 6)
     # An odd width: not every weight divides by two ranks.
     config = GptConfig(layers=2, dim=18, heads=2, ff=25, block_size=17, pkeep=0.8)

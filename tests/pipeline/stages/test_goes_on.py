@@ -17,7 +17,7 @@ import pytest
 import torch
 from rich.console import Console
 from same_stage import assert_equal, assert_same_stage, newest
-from tiny_players import Duel, train
+from tiny_adversaries import Duel, train
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.schema import UserError

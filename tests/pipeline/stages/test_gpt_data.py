@@ -19,9 +19,9 @@ from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.models.gpt.losses import group_counts
 from motionloom.models.gpt.tokens import as_codes
-from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import AnyTokenizerConfig, H2VQConfig, VqConfig
+from motionloom.models.tokenizer.base import Tokenizer, TokenizerConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig
+from motionloom.models.tokenizer.single import VqConfig
 from motionloom.pipeline.evaluation.truth import captioned, spread, truth_of
 from motionloom.pipeline.stages.networks.tokens import encode_split
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore, gpt_clips
@@ -72,11 +72,11 @@ def places(dataset: ShardDataset) -> list[int]:
 
 
 def clips_of(
-    dataset: ShardDataset, *, face: bool = False, config: AnyTokenizerConfig | None = None
+    dataset: ShardDataset, *, face: bool = False, config: TokenizerConfig | None = None
 ) -> tuple[GptClips, TokenStore, Tokenizer]:
     torch.manual_seed(0)
     small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
-    net = build_tokenizer(config or H2VQConfig(**small), dataset.layout)
+    net = config or H2VQConfig(**small).build(dataset.layout)
     net(torch.randn(8, 16, net.dim))
     net.freeze()
     store = encode_split(net, dataset, compute(dataset), 512)

@@ -17,8 +17,8 @@ from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import FACE, HANDS
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig, RvqConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig
+from motionloom.models.tokenizer.single import RvqConfig
 from motionloom.pipeline.evaluation.estimate import row_estimates
 from motionloom.pipeline.evaluation.reconstruction import face_errors, reconstruction_errors
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
@@ -46,7 +46,7 @@ def data(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Data:
 def tokenizer(data: Data, part: str = "bodyhand") -> Tokenizer:
     torch.manual_seed(0)
     config = RvqConfig(part="face", **TINY) if part == "face" else H2VQConfig(**TINY)
-    net = build_tokenizer(config, data[0][0].layout)
+    net = config.build(data[0][0].layout)
     net(torch.randn(8, 16, net.dim))
     return net.freeze()
 
@@ -120,7 +120,7 @@ def test_figures_do_not_depend_on_what_was_not_recorded(data: Data) -> None:
 @pytest.mark.parametrize("part", ["all", "bodyhand", "body"])
 def test_a_clip_through_a_tokenizer_of_any_part(data: Data, part: Part) -> None:
     dataset, stats = data[0]
-    net = build_tokenizer(RvqConfig(**TINY, part=part), dataset.layout).freeze()
+    net = RvqConfig(**TINY, part=part).build(dataset.layout).freeze()
     trained = TrainedTokenizer(net, {"stats": stats})
     hand = np.isin(dataset.layout.part("bodyhand"), dataset.layout.part("hand"))
     mean = stats.mean[dataset.layout.part("bodyhand")]

@@ -18,13 +18,12 @@ import pytest
 import torch
 from rich.console import Console
 from same_stage import assert_same_stage
-from tiny_players import context, train
+from tiny_adversaries import context, train
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.tokenizer.build import build_tokenizer
-from motionloom.models.tokenizer.config import H2VQConfig
+from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
@@ -68,7 +67,7 @@ def train_tokenizer(
     config = TrainConfig(**given)
     torch.manual_seed(5)
     kind = H2VQConfig(width=8, depth=1, code_dim=8, velocity_weight=0.5)
-    net = build_tokenizer(kind, MotionLayout.named("wholebody313"))
+    net = kind.build(MotionLayout.named("wholebody313"))
     optim = OptimConfig(lr=1e-3, warmup_steps=5, schedule="cosine", grad_clip=0.5)
     module = TokenizerModule(net, optim, seed=5, max_steps=config.steps)
     parts = config.accumulate

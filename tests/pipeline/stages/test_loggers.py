@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from lightning.pytorch.loggers.logger import Logger
-from tiny_players import train
+from tiny_adversaries import train
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware

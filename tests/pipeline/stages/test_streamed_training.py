@@ -31,7 +31,8 @@ class Recorder(DataPreview):
     ("name", "options"),
     [
         ("tma", {}),
-        ("diffusion", {}),
+        ("mdm", {}),
+        ("inbetween", {}),
         ("evaluator", {}),
         ("h2vq", {"reset_below": 0.1}),
         ("motiondiffuse", {"dim": 16, "layers": 1}),

@@ -16,9 +16,10 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.models.diffusion.network import DiffusionConfig, MotionDiffusion
+from motionloom.models.diffusion.network import TextDenoiserConfig
+from motionloom.pipeline.baselines.mdm.network import Mdm
+from motionloom.pipeline.baselines.mdm.stage import published_names
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.stages.networks.diffusion import mdm_names
 from motionloom.pipeline.store.weights import Release, Rows
 
 NAMES = Release({"weight": Rows("joined", (7, 4, 5, 6), 12), "bias": "below"}, unread=("pe", "clip.*"))
@@ -84,9 +85,8 @@ stages:
   stats: {{kind: stats, mean: {root}/Mean.npy, std: {root}/Std.npy}}
   text: {{kind: text}}
   mdm:
-    kind: diffusion
-    part: bodyhand
-    net: {{dim: 16, ff: 24, layers: 1, heads: 2, norm: post}}
+    kind: mdm
+    net: {{dim: 16, ff: 24, layers: 1, heads: 2}}
     train: {{steps: 100000}}
     published: {root}/model.safetensors
 """
@@ -94,8 +94,8 @@ stages:
 
 def test_a_release_of_mdm_is_run_and_generates(tmp_path: Path, call: Callable[..., Any]) -> None:
     synthesize(SynthConfig(clips=6, fps=20, layout="wholebody313"), tmp_path / "data")
-    net = MotionDiffusion(DiffusionConfig(dim=16, ff=24, layers=1, heads=2, norm="post"), 313, 384)
-    theirs = {there: net.state_dict()[here].clone() for here, there in mdm_names(net).items()}
+    net = Mdm(TextDenoiserConfig(dim=16, ff=24, layers=1, heads=2), 313, 384)
+    theirs = {there: net.state_dict()[here].clone() for here, there in published_names(net).items()}
     save_file(theirs | {"sequence_pos_encoder.pe": torch.zeros(9, 1, 16)}, tmp_path / "model.safetensors")
     np.save(tmp_path / "Mean.npy", np.arange(313.0))
     np.save(tmp_path / "Std.npy", np.full(313, 1e-6))
@@ -115,10 +115,6 @@ def test_a_release_of_mdm_is_run_and_generates(tmp_path: Path, call: Callable[..
     save_file(theirs | {"embed_text.bias": torch.ones(17)}, tmp_path / "model.safetensors")
     done = call("run", tmp_path / "recipe.yaml", "-o", tmp_path / "run", "--replace")
     assert done.code == 2 and "model.safetensors: tensor 'embed_text.bias' is [17]" in done.err
-    done = call(
-        "run", tmp_path / "recipe.yaml", "-o", tmp_path / "run", "--replace", "--set", "mdm.net.norm=pre"
-    )
-    assert done.code == 2 and "no published weights are known" in done.err
     (tmp_path / "model.safetensors").unlink()
     done = call("run", tmp_path / "recipe.yaml", "-o", tmp_path / "run", "--replace")
     assert done.code == 2 and "model.safetensors: no such file" in done.err

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from same_stage import assert_equal
-from tiny_players import train
+from tiny_adversaries import train
 from torch import Tensor, nn
 
 from motionloom.datasets.base.files import HashingFile, remove_temporaries

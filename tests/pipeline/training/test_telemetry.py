@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from tiny_players import train
+from tiny_adversaries import train
 
 from motionloom.datasets.base.files import write_text
 from motionloom.pipeline.render.page import Page

@@ -1,1 +1,0 @@
-"""FACT (AI Choreographer, Li et al. 2021): the next frames of a dance, from those before and the music."""

@@ -1,0 +1,1 @@
+"""The models that the papers compare themselves with, a folder each; nothing outside imports them."""

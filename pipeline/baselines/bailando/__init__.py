@@ -1,0 +1,1 @@
+"""Bailando (Siyao et al. 2022)."""

@@ -1,0 +1,79 @@
+"""Dances of two halves' codes that follow music (Bailando), as features of the layout."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from motionloom.datasets.loading.dances import joints_of_dance
+from motionloom.datasets.motion.canonical import canonicalize
+from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.features.smpl75 import fit_smpl75
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.pipeline.baselines.bailando.codes import DanceVq
+from motionloom.pipeline.baselines.bailando.network import CrossGpt
+from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.stages.networks.dances import music_of
+from motionloom.pipeline.store.networks import device_of
+
+
+@dataclass(frozen=True)
+class BailandoGenerator:
+    """One dance for each music, by the likeliest codes: what it begins with makes the difference."""
+
+    gpt: CrossGpt
+    vq: DanceVq
+    layout: MotionLayout
+    given: Mapping[str, Any]
+    """The stage's loaded inputs; "audio" is read."""
+    note: str = ""
+    """A remark that its figures must carry."""
+    method = "bailando"
+    modalities = frozenset({"audio"})
+    settings = frozenset[str]()
+    max_frames = None
+    decides_length = False
+    part: Part = "bodyhand"
+
+    @property
+    def prepared(self) -> Mapping[str, object]:
+        return {"audio": self.given.get("audio")}
+
+    @property
+    def unit_frames(self) -> int:
+        return self.vq.config.code_frames
+
+    @property
+    def seed_frames(self) -> int:
+        return self.unit_frames
+
+    @torch.no_grad()
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        """Features in their own units; the seed motions are what their codes are decoded to, and without
+        them each dance goes on from a kept code, by its seed.
+        """
+        lengths = request.lengths("Bailando")
+        count = max(lengths) // self.unit_frames
+        device, gpt = device_of(self.gpt), self.gpt
+        if request.seed_motions is None:
+            first = gpt.kept[[seed % len(gpt.kept) for seed in request.seeds]][:, None]
+        else:
+            seeds = np.stack([joints_of_dance(motion, self.layout) for motion in request.seed_motions])
+            first = self.vq.encode(torch.from_numpy(seeds).to(device, torch.float32))
+        music = gpt.heard(music_of(request, self.given), self.unit_frames, count)
+        codes = gpt.dance(first, music.to(device))
+        out = []
+        for row, frames in zip(codes, lengths, strict=True):
+            joints = self.vq.decode(row[None, : frames // self.unit_frames])[0].double().cpu().numpy()
+            if self.layout.name == "smpl75":
+                made = fit_smpl75(joints)
+            else:
+                made = encode(canonicalize(joints), self.layout.without_face())
+            # One family has a frame less than its joints.
+            out.append(np.concatenate([made, made[-1:]])[:frames])
+        return out

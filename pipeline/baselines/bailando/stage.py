@@ -1,0 +1,322 @@
+"""Bailando's stages: codes of both halves of the body, a GPT over them, actor-critic training (UDE Table 2).
+
+dance_vq -> cross_gpt -> actor_critic
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from pydantic import Field
+from torch.utils.data import Dataset
+
+from motionloom.datasets.loading.dances import BeatBatches, JointCrops, danced_joints
+from motionloom.datasets.modalities.modality import FrameStats
+from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.baselines.bailando.codes import DanceVq, DanceVqConfig, places
+from motionloom.pipeline.baselines.bailando.generator import BailandoGenerator
+from motionloom.pipeline.baselines.bailando.network import ActorCritic, CrossGpt, CrossGptConfig, RewardConfig
+from motionloom.pipeline.baselines.bailando.release import release_of_codes, release_of_gpt
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.networks.dances import dance_batches, spread_dances
+from motionloom.pipeline.stages.networks.tokenizer import require_uses
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.weights import ModelFacts, Release, load_facts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+
+if TYPE_CHECKING:
+    from motionloom.models.training.stage_module import Batch
+    from motionloom.pipeline.baselines.bailando.module import ActorCriticModule, CrossGptModule, DanceVqModule
+
+_ADAM = OptimConfig(optimizer="adam", lr=3e-5, betas=(0.5, 0.999), grad_clip=0.0)
+
+
+class DanceVqStageConfig(TrainedStageConfig):
+    """Codes of both halves, then the root; the steps of both together are `train.steps`."""
+
+    net: DanceVqConfig = DanceVqConfig()
+    optim: OptimConfig = _ADAM
+    root_optim: OptimConfig = _ADAM.model_copy(update={"lr": 5e-5})
+    root_start: int = Field(100_000, ge=1)
+    """First step that trains the root's decoder and no more the codes."""
+    train: TrainConfig = TrainConfig(steps=150_000, batch_size=32)
+    window: int = Field(240, ge=4)
+    """Frames of a training window; shorter clips are left out."""
+
+    def require_fit(self, hardware: Hardware) -> None:
+        """As for a tokenizer; the published sizes have 1.9 times the vectors."""
+        super().require_fit(hardware)
+        vectors = self.train.batch_size // self.train.accumulate * self.window // self.net.code_frames
+        require_uses(vectors, self.net.num_codes, self.net.reset_below, times=1.5)
+
+
+class DanceVqInputs(Inputs):
+    """Clips; dances need no music here."""
+
+    data: Data
+
+
+class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
+    """Joints to codes of two halves of the body."""
+
+    name = "dance_vq"
+    summary = "Bailando: codes of upper and lower body"
+    config = DanceVqStageConfig
+    inputs = DanceVqInputs
+    curves = tuple(Curve(name) for name in ("codes_recon_up", "codes_recon_down", "root_loss"))
+
+    def facts(self, config: DanceVqStageConfig, inputs: DanceVqInputs) -> ModelFacts:
+        layout = inputs.data.layout
+        if layout.family == "raw" and layout.name != "smpl75":
+            raise UserError(
+                f"Bailando makes joint positions, and layout {layout.name} is not made of them; take "
+                f"body133, smpl75, or another layout of positions"
+            )
+        if config.window % config.net.code_frames:
+            raise UserError(
+                f"window {config.window} is no multiple of the {config.net.code_frames} frames of a code "
+                f"(net.halvings {config.net.halvings})"
+            )
+        extra = {"joints": danced_joints(layout)}
+        return ModelFacts.of(self.name, config.net, layout, extra)
+
+    def network(self, facts: ModelFacts, inputs: DanceVqInputs) -> DanceVq:
+        return DanceVq(DanceVqConfig.parse(facts.config, facts.where), facts.fact("joints", int))
+
+    def release(self, net: DanceVq) -> Release:
+        """Bailando's, with the decoder of the root."""
+        return release_of_codes(net)
+
+    def module(
+        self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, seed: int
+    ) -> DanceVqModule:
+        from motionloom.pipeline.baselines.bailando.module import DanceVqModule
+
+        return DanceVqModule(
+            net, config.optim, seed=seed, max_steps=config.train.steps,
+            root_optim=config.root_optim, root_start=config.root_start,
+        )  # fmt: skip
+
+    def batches(
+        self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, seed: int, log: Log
+    ) -> Batches:
+        frames = {"max_frames": config.window, "min_frames": config.window}
+        return dance_batches(inputs.data, JointCrops, None, seed, frames=frames)
+
+    def example(self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, batch: int) -> Example:
+        codes = config.window // config.net.code_frames
+        motion = torch.zeros(batch, config.window, 3 * net.joints)
+        return Example({"motion": motion}, f"2 x {codes} codes for {config.window} frames")
+
+
+class CrossGptStageConfig(TrainedStageConfig):
+    """The GPT over codes and music; a training window holds one code more than its context."""
+
+    net: CrossGptConfig = CrossGptConfig()
+    optim: OptimConfig = _ADAM.model_copy(update={"lr": 3e-4})
+    train: TrainConfig = TrainConfig(steps=100_000, batch_size=32)
+    kept: int = Field(8, ge=1)
+    """First codes of training dances that it keeps to go on from, where no motion is given."""
+
+
+class CrossGptInputs(Inputs):
+    """Dances, their music and the trained codes."""
+
+    data: Data
+    audio: FrameStats
+    dance_vq: DanceVq
+
+
+class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt]):
+    """Music to codes of both halves of the body."""
+
+    name = "cross_gpt"
+    summary = "Bailando: music to codes"
+    config = CrossGptStageConfig
+    offers = frozenset({GENERATOR})
+    inputs = CrossGptInputs
+    curves = tuple(Curve(name) for name in ("loss", "accuracy_up", "accuracy_down"))
+
+    def facts(self, config: CrossGptStageConfig, inputs: CrossGptInputs) -> ModelFacts:
+        codes = inputs.dance_vq.config.num_codes
+        extra = {"num_codes": codes, "music_dim": inputs.audio.dim, "kept": config.kept}
+        return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
+
+    def network(self, facts: ModelFacts, inputs: CrossGptInputs) -> CrossGpt:
+        return gpt_of(facts)
+
+    def release(self, net: CrossGpt) -> Release:
+        """Bailando's, without its critic."""
+        return release_of_gpt(net)
+
+    def prepare(self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs) -> None:
+        """First codes of training dances."""
+        dataset, frames = inputs.data.split("train"), inputs.dance_vq.config.code_frames
+        clips, crops = spread_dances(dataset, config.kept, frames), JointCrops(dataset)
+        starts = torch.zeros(len(clips), frames, crops.width)
+        for row, clip in enumerate(clips):
+            crops.fill(starts[row].numpy(), dataset.motion(clip), 0, frames, 0)
+        net.kept.copy_(inputs.dance_vq.encode(places(starts))[:, 0])
+
+    def module(
+        self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, seed: int
+    ) -> CrossGptModule:
+        from motionloom.pipeline.baselines.bailando.module import CrossGptModule
+
+        steps = config.train.steps
+        return CrossGptModule(net, config.optim, seed=seed, max_steps=steps, vq=inputs.dance_vq)
+
+    def batches(
+        self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, seed: int, log: Log
+    ) -> Batches:
+        return dance_batches(
+            inputs.data, JointCrops, inputs.audio, seed, frames=window_of(net, inputs.dance_vq)
+        )
+
+    def example(
+        self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, batch: int
+    ) -> Example:
+        return Example(example_of(net, inputs.dance_vq, batch), f"3 x {net.config.context} positions")
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        gpt = self.load(stage, given, device)
+        return BailandoGenerator(gpt, given["dance_vq"], layout_of(stage), given)
+
+    def exported(self, config: CrossGptStageConfig) -> tuple[str, ...]:
+        return ("dance_vq", "audio")
+
+
+class ActorCriticStageConfig(TrainedStageConfig):
+    """Actor-critic training of a finished `cross_gpt`."""
+
+    reward: RewardConfig = RewardConfig()
+    reward_songs: Literal["train", "test"] = "train"
+    """The songs that dances are rewarded on. The published model was trained on those of the test split, on
+    which it is then evaluated; figures of such a stage say so."""
+    optim: OptimConfig = _ADAM.model_copy(update={"lr": 1e-5})
+    train: TrainConfig = TrainConfig(steps=1_000, batch_size=32)
+
+
+class ActorCriticInputs(CrossGptInputs):
+    """The same, and the GPT to start from."""
+
+    cross_gpt: CrossGpt
+
+
+class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, ActorCritic]):
+    """The GPT taught to keep the beat."""
+
+    name = "actor_critic"
+    summary = "Bailando: rewards for the beat"
+    config = ActorCriticStageConfig
+    offers = frozenset({GENERATOR})
+    inputs = ActorCriticInputs
+    curves = (Curve("actor_reward"), Curve("critic_loss"))
+
+    def facts(self, config: ActorCriticStageConfig, inputs: ActorCriticInputs) -> ModelFacts:
+        gpt = inputs.cross_gpt
+        extra = {
+            "num_codes": gpt.num_codes,
+            "music_dim": gpt.music_dim,
+            "kept": len(gpt.kept),
+            "critic_layers": config.reward.critic_layers,
+        }
+        return ModelFacts.of(self.name, gpt.config, inputs.data.layout, extra)
+
+    def network(self, facts: ModelFacts, inputs: ActorCriticInputs) -> ActorCritic:
+        return ActorCritic(gpt_of(facts), facts.fact("critic_layers", int))
+
+    def release(self, net: ActorCritic) -> Release:
+        """Bailando's."""
+        return release_of_gpt(net)
+
+    def prepare(self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs) -> None:
+        """The actor starts as the trained GPT."""
+        net.gpt.load_state_dict(inputs.cross_gpt.state_dict())
+
+    def module(
+        self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, seed: int
+    ) -> ActorCriticModule:
+        from motionloom.pipeline.baselines.bailando.module import ActorCriticModule
+
+        return ActorCriticModule(net, config.optim, seed=seed, **self._how(config, inputs))
+
+    def dry_module(
+        self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs
+    ) -> ActorCriticModule:
+        from motionloom.pipeline.baselines.bailando.module import Unrewarded
+
+        return Unrewarded(net, config.optim, seed=0, **self._how(config, inputs))
+
+    @staticmethod
+    def _how(config: ActorCriticStageConfig, inputs: ActorCriticInputs) -> dict[str, Any]:
+        known = {"vq": inputs.dance_vq, "fps": inputs.data.layout.fps}
+        return {**known, "max_steps": config.train.steps, "reward": config.reward}
+
+    def batches(
+        self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, seed: int, log: Log
+    ) -> Batches:
+        data, audio, fps = inputs.data, inputs.audio, inputs.data.layout.fps
+        test = config.reward_songs == "test"
+        found = dance_batches(
+            data, JointCrops, audio, seed, test_songs=test, frames=window_of(net.gpt, inputs.dance_vq)
+        )
+
+        def train(batch: int, rank: int, world: int) -> Dataset[object]:
+            return BeatBatches(found.train(batch, rank, world), audio, fps)  # type: ignore[arg-type, return-value]
+
+        assert found.validation is not None
+        check = found.validation
+        return Batches(train, lambda: BeatBatches(check(), audio, fps))  # type: ignore[arg-type, return-value]
+
+    def example(
+        self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, batch: int
+    ) -> Example:
+        example = example_of(net.gpt, inputs.dance_vq, batch)
+        beats = torch.zeros(example["motion"].shape[:2], dtype=torch.bool)
+        return Example({**example, "beats": beats}, f"3 x {net.gpt.config.context} positions")
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        note = "" if stage.config.reward_songs == "train" else "rewarded on the songs of the test split"
+        gpt = self.load(stage, given, device).gpt
+        return BailandoGenerator(gpt, given["dance_vq"], layout_of(stage), given, note)
+
+    def exported(self, config: ActorCriticStageConfig) -> tuple[str, ...]:
+        return ("dance_vq", "audio")
+
+
+def gpt_of(facts: ModelFacts) -> CrossGpt:
+    """The untrained GPT that facts ask for."""
+    sizes = {name: facts.fact(name, int) for name in ("num_codes", "music_dim", "kept")}
+    return CrossGpt(CrossGptConfig.parse(facts.config, facts.where), **sizes)
+
+
+def layout_of(stage: Finished) -> MotionLayout:
+    """The layout of a finished stage's data."""
+    return load_facts(stage.folder).layout.layout()
+
+
+def window_of(gpt: CrossGpt, vq: DanceVq) -> dict[str, int]:
+    """Lengths of a training window: the context, and one code more."""
+    frames = (gpt.config.context + 1) * vq.config.code_frames
+    return {"max_frames": frames, "min_frames": frames}
+
+
+def example_of(gpt: CrossGpt, vq: DanceVq, batch: int) -> Batch:
+    """A batch of windows with music."""
+    frames = window_of(gpt, vq)["max_frames"]
+    music = MODALITIES["audio"].example(batch, frames, gpt.music_dim)
+    return {"motion": torch.zeros(batch, frames, 3 * vq.joints), "conditions": {"audio": music}}
+
+
+register(DanceVqStage())
+register(CrossGptStage())
+register(ActorCriticStage())

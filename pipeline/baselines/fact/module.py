@@ -1,0 +1,46 @@
+"""Training of FACT: the squared error of the next frames (AI Choreographer, section 4.2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from motionloom.models.training.distributed import masked_mean
+from motionloom.models.training.stage_module import Batch, StageModule
+from motionloom.pipeline.baselines.fact.network import Fact, read_music
+
+
+class FactModule(StageModule):
+    """Trains a `Fact` on `ConditionBatches` of dances."""
+
+    net: Fact
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """The loss, and `still`: that of standing still in the last frame that is read.
+
+        "motion" [B, T, C] normalised, "length" [B], "present" bool [B, C] (optional: all) and
+        "conditions" with "audio". Rows without music, or too short, count for nothing.
+        """
+        net, config = self.net, self.net.config
+        features, heard, _ = batch["conditions"]["audio"]
+        end = config.clip_frames
+        motion = net.columns.read(batch["motion"][:, :end])
+        music = read_music(_length(features, config.music_frames))
+        before, after = motion[:, : config.motion_frames], motion[:, config.motion_frames :]
+        given = before
+        if self.training and config.input_noise:
+            given = before + config.input_noise * torch.randn_like(before)
+        counts = (heard.any(1) & (batch["length"] >= end))[:, None].expand(-1, config.predicted_frames)
+        present = None if net.columns.matrices else batch.get("present")
+        made, still = net(given, music).float(), before[:, -1:].expand_as(after)
+        loss, of_still = (
+            masked_mean(functional.mse_loss(one, after, reduction="none"), counts, present)
+            for one in (made, still)
+        )
+        return {"loss": loss, "still": of_still}
+
+
+def _length(values: Tensor, frames: int) -> Tensor:
+    """Values [B, T, E] as `frames` of them; 0 where there are no more."""
+    return functional.pad(values[:, :frames], (0, 0, 0, max(0, frames - values.shape[1])))

@@ -1,0 +1,113 @@
+"""FACT stage: the next frames of a dance from those before and the music (AI Choreographer, UDE Table 2)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from pydantic import Field
+
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.modalities.modality import FrameStats
+from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.datasets.motion.layout import Part
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.baselines.fact.generator import FactGenerator
+from motionloom.pipeline.baselines.fact.network import Fact, FactConfig
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.stages.networks.captions import part_columns, part_of
+from motionloom.pipeline.stages.networks.dances import dance_batches, spread_dances
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.weights import ModelFacts
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.baselines.fact.module import FactModule
+
+
+class FactStageConfig(TrainedStageConfig):
+    """FACT; the defaults are the published ones."""
+
+    net: FactConfig = FactConfig()
+    optim: OptimConfig = OptimConfig(
+        optimizer="adam", lr=1e-4, betas=(0.9, 0.999), drop_at=(100_000, 150_000), grad_clip=0.0
+    )
+    train: TrainConfig = TrainConfig(steps=300_000, batch_size=32)
+    part: Part = "bodyhand"
+    """Columns of the layout."""
+    kept: int = Field(8, ge=1)
+    """Motions of the training set that it keeps to go on from, where none is given."""
+
+
+class FactInputs(Inputs):
+    """Dances, their statistics and their music."""
+
+    data: Data
+    stats: FeatureStats
+    audio: FrameStats
+
+
+class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
+    """Music and the start of a dance to the rest of it."""
+
+    name = "fact"
+    summary = "FACT: music and a start to a dance"
+    config = FactStageConfig
+    offers = frozenset({GENERATOR})
+    inputs = FactInputs
+    curves = (Curve("loss"),)
+
+    def facts(self, config: FactStageConfig, inputs: FactInputs) -> ModelFacts:
+        layout = inputs.data.layout
+        part_columns(layout, config.part)
+        extra = {"part": config.part, "music_dim": inputs.audio.dim, "kept": config.kept}
+        return ModelFacts.of(self.name, config.net, layout, extra)
+
+    def network(self, facts: ModelFacts, inputs: FactInputs) -> Fact:
+        config, layout = FactConfig.parse(facts.config, facts.where), facts.layout.layout()
+        sizes = {name: facts.fact(name, int) for name in ("music_dim", "kept")}
+        return Fact(config, layout, part_of(facts), **sizes)
+
+    def prepare(self, config: FactStageConfig, net: Fact, inputs: FactInputs) -> None:
+        """Statistics for matrices, and starts of training dances."""
+        stats, columns = inputs.stats, inputs.data.layout.part(config.part)
+        net.columns.learn(torch.from_numpy(stats.mean[columns]), torch.from_numpy(stats.std[columns]))
+        dataset, frames = inputs.data.split("train"), config.net.motion_frames
+        for row, clip in enumerate(spread_dances(dataset, config.kept, config.net.clip_frames)):
+            start = stats.normalize(dataset.motion(clip)[:frames])[:, columns]
+            net.kept[row] = torch.from_numpy(start)
+
+    def module(self, config: FactStageConfig, net: Fact, inputs: FactInputs, seed: int) -> FactModule:
+        from motionloom.pipeline.baselines.fact.module import FactModule
+
+        return FactModule(net, config.optim, seed=seed, max_steps=config.train.steps)
+
+    def batches(self, config: FactStageConfig, net: Fact, inputs: FactInputs, seed: int, log: Log) -> Batches:
+        columns = inputs.data.layout.part(config.part)
+        frames = {"max_frames": config.net.window_frames, "min_frames": config.net.clip_frames}
+        return dance_batches(
+            inputs.data, lambda _: inputs.stats, inputs.audio, seed, frames={"columns": columns, **frames}
+        )
+
+    def example(self, config: FactStageConfig, net: Fact, inputs: FactInputs, batch: int) -> Example:
+        frames, width = config.net.window_frames, len(inputs.data.layout.part(config.part))
+        return Example(
+            {
+                "motion": torch.empty(batch, frames, width),
+                "length": torch.full((batch,), frames),
+                "conditions": {"audio": MODALITIES["audio"].example(batch, frames, inputs.audio.dim)},
+            },
+            f"{config.net.motion_frames} frames of motion + {config.net.music_frames} of music",
+        )
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        return FactGenerator(self.load(stage, given, device), given["stats"].layout, stage.config.part, given)
+
+    def exported(self, config: FactStageConfig) -> tuple[str, ...]:
+        return ("stats", "audio")
+
+
+register(FactStage())

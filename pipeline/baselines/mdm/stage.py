@@ -1,0 +1,62 @@
+"""MDM's stage (HumanTOMATO Tables 1, 13 and 14; with `part: face` its second facial baseline, B.5.2)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from motionloom.models.diffusion.network import TextDenoiserConfig
+from motionloom.models.layers.transformer import name_in_torch
+from motionloom.pipeline.baselines.mdm.network import Mdm
+from motionloom.pipeline.contract.stage import register
+from motionloom.pipeline.stages.networks.captions import CaptionInputs, DenoiserStage, DenoiserStageConfig
+from motionloom.pipeline.store.weights import ModelFacts, Release
+
+if TYPE_CHECKING:
+    from motionloom.models.diffusion.module import TextDenoiserModule
+
+
+class MdmStage(DenoiserStage[DenoiserStageConfig, Mdm]):
+    """Trains MDM on whole clips and their captions."""
+
+    name = "mdm"
+    summary = "MDM: motion diffusion"
+    config = DenoiserStageConfig
+
+    def network(self, facts: ModelFacts, inputs: CaptionInputs) -> Mdm:
+        config = TextDenoiserConfig.parse(facts.config, facts.where)
+        return Mdm(config, facts.fact("motion_dim", int), facts.fact("text_dim", int))
+
+    def release(self, net: Mdm) -> Release:
+        """Return MDM's published names; text encoder and positions are not read."""
+        return Release(published_names(net), unread=("*.pe", "clip_model.*"))
+
+    def module(
+        self, config: DenoiserStageConfig, net: Mdm, inputs: CaptionInputs, seed: int
+    ) -> TextDenoiserModule:
+        from motionloom.models.diffusion.module import TextDenoiserModule
+
+        return TextDenoiserModule(net, config.optim, seed=seed, max_steps=config.train.steps)
+
+
+_AROUND = {
+    "enter": "input_process.poseEmbedding",
+    "leave": "output_process.poseFinal",
+    "text": "embed_text",
+    "time": "embed_timestep.time_embed",
+}
+
+
+def published_names(net: Mdm) -> dict[str, str]:
+    """Return the names of the network's tensors -> their names in MDM's release."""
+    names = {}
+    for name in net.state_dict():
+        first, _, rest = name.partition(".")
+        if first == "stack":
+            _, number, inner = rest.split(".", 2)
+            names[name] = f"seqTransEncoder.layers.{number}.{name_in_torch(inner)}"
+        else:
+            names[name] = f"{_AROUND[first]}.{rest}"
+    return names
+
+
+register(MdmStage())

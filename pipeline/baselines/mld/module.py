@@ -1,0 +1,79 @@
+"""The Lightning sides of MLD: first its auto-encoder, then the denoiser of the frozen one's latents."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.layers.transformer import length_mask
+from motionloom.models.tma.losses import kl_divergence, reconstruction_loss
+from motionloom.models.training.joints_module import JointsModule
+from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
+from motionloom.pipeline.baselines.mld.losses import MotionVaeLossConfig, smooth_l1_of_joints
+from motionloom.pipeline.baselines.mld.network import LatentDenoiser, MotionVae, seen
+
+
+class MotionVaeModule(JointsModule):
+    """Trains a `MotionVae` on whole clips."""
+
+    net: MotionVae
+    loss_config: MotionVaeLossConfig
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Loss of one batch: "motion" [B, T, D], "length" [B], "present" bool [B, D] (optional: all).
+
+        Latents are sampled in training and are the means in evaluation.
+        """
+        motion, present, config = batch["motion"], batch.get("present"), self.loss_config
+        mask = length_mask(batch["length"], motion.shape[1])
+        mu, logvar = self.net.encode(seen(motion, present), mask)
+        rebuilt = self.net.decode(drawn(mu, logvar) if self.training else mu, mask)
+        found, wanted = map(self.in_units, (rebuilt, motion))
+        zero = torch.zeros_like(mu)
+        losses = {
+            "features": reconstruction_loss(rebuilt, motion, mask, present),
+            "joints": smooth_l1_of_joints(found, wanted, self.layout, mask, present),
+            "kl": kl_divergence(mu, logvar, zero, zero),
+        }
+        loss = sum(getattr(config, name) * value for name, value in losses.items())
+        assert isinstance(loss, Tensor)
+        return {"loss": loss, **losses}
+
+
+class LatentDiffusionModule(StageModule):
+    """Trains a `LatentDenoiser` on captioned `ConditionBatches`; the auto-encoder is frozen, dropout off."""
+
+    net: LatentDenoiser
+
+    def __init__(
+        self, net: LatentDenoiser, optim: OptimConfig, *, seed: int, max_steps: int, vae: MotionVae
+    ) -> None:
+        super().__init__(net, optim, seed=seed, max_steps=max_steps)
+        self.noiser = net.config.schedule.noiser()
+        self.vae = Frozen(vae)
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Loss of one batch: as of the auto-encoder, and "conditions" with "text".
+
+        Time steps, noise and, in training, latents are drawn in each call; in evaluation no text is hidden.
+        """
+        motion, text = batch["motion"], batch["conditions"]["text"].pooled
+        config = self.net.config
+        with torch.no_grad():
+            mask = length_mask(batch["length"], motion.shape[1])
+            mu, logvar = self.vae.module.encode(seen(motion, batch.get("present")), mask)
+            z = drawn(mu, logvar) if self.training else mu
+        step = torch.randint(0, config.schedule.steps, (len(z),), device=z.device)
+        noise = torch.randn_like(z)
+        hidden = config.condition_dropout if self.training else 0.0
+        conditioned = torch.rand(len(z), device=z.device) >= hidden
+        found = self.net(self.noiser.add_noise(z, noise, step), step, text, conditioned)
+        target = z if config.schedule.predicts == "sample" else noise
+        return {"loss": F.mse_loss(found, target.float())}
+
+
+def drawn(mu: Tensor, logvar: Tensor) -> Tensor:
+    """A sample of the Gaussians."""
+    return mu + torch.randn_like(mu) * (0.5 * logvar).exp()

@@ -1,0 +1,1 @@
+"""MotionCLIP (Tevet et al. 2022)."""

@@ -1,0 +1,1 @@
+"""MotionDiffuse (Zhang et al. 2022)."""

@@ -1,0 +1,71 @@
+"""MotionDiffuse stage (HumanTOMATO Tables 1, 13 and 14)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.baselines.motiondiffuse.generator import MotionDiffuseMotion
+from motionloom.pipeline.baselines.motiondiffuse.network import MotionDiffuse, MotionDiffuseConfig
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.showing import Curve
+from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.stages.networks.captions import (
+    CaptionInputs,
+    CaptionStage,
+    CaptionStageConfig,
+    part_columns,
+    part_of,
+)
+from motionloom.pipeline.store.weights import ModelFacts, load_facts
+from motionloom.pipeline.training.config import TrainConfig
+
+if TYPE_CHECKING:
+    from motionloom.models.diffusion.module import DenoiserModule
+
+
+class MotionDiffuseStageConfig(CaptionStageConfig):
+    """A denoiser conditioned on the tokens of captions; the defaults are the paper's."""
+
+    net: MotionDiffuseConfig = MotionDiffuseConfig()
+    optim: OptimConfig = OptimConfig(optimizer="adam", lr=2e-4, betas=(0.9, 0.999), grad_clip=0.5)
+    train: TrainConfig = TrainConfig(steps=230_000, batch_size=1024)
+
+
+class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, MotionDiffuse]):
+    """A denoiser, trained on whole clips and the tokens of their captions."""
+
+    name = "motiondiffuse"
+    summary = "MotionDiffuse"
+    config = MotionDiffuseStageConfig
+    offers = frozenset({GENERATOR})
+    inputs = CaptionInputs
+    curves = (Curve("loss"),)
+
+    def facts(self, config: MotionDiffuseStageConfig, inputs: CaptionInputs) -> ModelFacts:
+        layout = inputs.data.layout
+        width = len(part_columns(layout, config.part))
+        extra = {"motion_dim": width, "text_dim": inputs.text.dim, "part": config.part}
+        return ModelFacts.of(self.name, config.net, layout, {**extra, "max_frames": config.max_frames})
+
+    def network(self, facts: ModelFacts, inputs: CaptionInputs) -> MotionDiffuse:
+        config = MotionDiffuseConfig.parse(facts.config, facts.where)
+        return MotionDiffuse(
+            config, *(facts.fact(key, int) for key in ("motion_dim", "text_dim", "max_frames"))
+        )
+
+    def module(
+        self, config: MotionDiffuseStageConfig, net: MotionDiffuse, inputs: CaptionInputs, seed: int
+    ) -> DenoiserModule:
+        from motionloom.models.diffusion.module import DenoiserModule
+
+        return DenoiserModule(net, config.optim, seed=seed, max_steps=config.train.steps)
+
+    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
+        return MotionDiffuseMotion(given["stats"].layout, part, given, net)
+
+
+register(MotionDiffuseStage())

@@ -1,0 +1,195 @@
+"""TM2T in use: sentences about motions by beam search (section 3.3), and motion of text (section 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import PRESENT_ALL, UserError
+from motionloom.models.gpt.drawing import Drawing
+from motionloom.models.gpt.tokens import interleave
+from motionloom.pipeline.baselines.tm2t.network import END, START, Captioner, Reading, Vocabulary
+from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, draw_tokens
+from motionloom.pipeline.contract.captioning import Sentence
+from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.inference.generators.of_tokens import OfTokens
+from motionloom.pipeline.store.networks import TrainedTokenizer, device_of
+from motionloom.pipeline.store.tokens import PresentTokens, present_table
+
+
+class Written(NamedTuple):
+    """One sentence."""
+
+    words: tuple[int, ...]
+    """Their numbers, without End."""
+    log_probability: float
+    """Log-probability of the whole sentence and its end."""
+
+
+@torch.no_grad()
+def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[list[Written]]:
+    """Return up to `count` sentences for each of B motions, likeliest first.
+
+    Args:
+        reading: Of the B motions, without a word yet.
+        beam: Unfinished sentences that are kept, at least `count`; the wider, the surer that no likelier one
+            is missed.
+    """
+    batch, beam = len(reading.mask), max(beam, count)
+    device = reading.mask.device
+    rows = torch.arange(batch, device=device)
+    reading = reading.take(rows.repeat_interleave(beam))
+    scores = torch.full((batch, beam), -torch.inf, device=device, dtype=torch.float64)
+    scores[:, 0] = 0.0  # the beams of a motion begin as one
+    last = torch.full((batch * beam,), START, device=device)
+    said = torch.empty(batch, beam, 0, dtype=torch.int64, device=device)
+    done: list[list[Written]] = [[] for _ in range(batch)]
+    for step in range(net.config.max_words + 1):
+        words = net.next(last, reading).double().view(batch, beam, -1)
+        if step == 0:
+            words[..., END] = -torch.inf  # a sentence is never empty
+        if step == net.config.max_words:
+            words[..., :END] = words[..., END + 1 :] = -torch.inf
+        total = (scores[..., None] + words).flatten(1)
+        best, at = total.topk(min(2 * beam, total.shape[1]), dim=1)
+        origin, word = at // words.shape[-1], at % words.shape[-1]
+        for row in range(batch):
+            for score, one, ended in zip(
+                best[row].tolist(), origin[row].tolist(), (word[row] == END).tolist(), strict=True
+            ):
+                if ended and score > -torch.inf:
+                    done[row].append(Written(tuple(said[row, one].tolist()), score))
+            done[row] = sorted(done[row], key=lambda found: -found.log_probability)[:count]
+        # Of those that go on, the first `beam`; at most `beam` of the 2 * beam end here.
+        going = torch.where(word == END, -torch.inf, best)
+        scores, kept = going.topk(beam, dim=1)
+        if all(_finished(found, count, float(left)) for found, left in zip(done, scores[:, 0], strict=True)):
+            break
+        origin, word = origin.gather(1, kept), word.gather(1, kept)
+        said = torch.cat([said.gather(1, origin[..., None].expand(-1, -1, step)), word[..., None]], dim=2)
+        reading = reading.take((rows[:, None] * beam + origin).flatten())
+        last = word.flatten()
+    return done
+
+
+def _finished(found: list[Written], count: int, left: float) -> bool:
+    """Whether no unfinished sentence can be among the best: words only make it less likely."""
+    return len(found) == count and found[-1].log_probability >= left
+
+
+_AT_ONCE = 32
+"""Motions that are read together."""
+
+
+@dataclass(frozen=True)
+class TokenCaptioner:
+    """TM2T's captioner: motion to tokens, tokens to words."""
+
+    net: Captioner
+    tokenizer: TrainedTokenizer
+    vocabulary: Vocabulary
+    beam: int = 4
+    """Unfinished sentences that the search keeps, at least."""
+
+    @property
+    def layout(self) -> MotionLayout:
+        return self.tokenizer.layout
+
+    @property
+    def part(self) -> Part:
+        return self.tokenizer.net.part
+
+    @property
+    def min_frames(self) -> int:
+        return self.tokenizer.net.group_frames
+
+    @property
+    def max_frames(self) -> int:
+        return self.net.max_groups * self.tokenizer.net.group_frames
+
+    def reads(self, present: int) -> bool:
+        return bool(present_table(self.tokenizer.net, self.layout).usable[present])
+
+    def caption(
+        self, motions: Sequence[NDArray[np.float32]], count: int, present: Sequence[int] | None = None
+    ) -> list[list[Sentence]]:
+        """As `MotionCaptioner` says; batches hold motions of about one length."""
+        bits = [PRESENT_ALL] * len(motions) if present is None else list(present)
+        order = np.argsort([len(motion) for motion in motions], kind="stable").tolist()
+        out: dict[int, list[Sentence]] = {}
+        for start in range(0, len(order), _AT_ONCE):
+            rows = order[start : start + _AT_ONCE]
+            made = self._batch([motions[row] for row in rows], count, [bits[row] for row in rows])
+            out.update(zip(rows, made, strict=True))
+        return [out[row] for row in range(len(motions))]
+
+    @torch.no_grad()
+    def _batch(
+        self, motions: Sequence[NDArray[np.float32]], count: int, bits: Sequence[int]
+    ) -> list[list[Sentence]]:
+        net, device = self.net, device_of(self.net)
+        codes = self.tokenizer.encode([motion[: self.max_frames] for motion in motions], bits)
+        closed = torch.tensor([len(motion) <= self.max_frames for motion in motions], device=device)
+        tokens = interleave(codes.codes, net.pattern, ends=net.num_codes, groups=codes.groups, closed=closed)
+        if not all(map(self.reads, bits)):
+            raise UserError(
+                "a motion lacks hands or a face, and this captioner's tokens say them and the body in one; "
+                "give motions that have them, or a captioner on tokens of the body alone"
+            )
+        table = present_table(self.tokenizer.net, self.layout)
+        present = PresentTokens(torch.tensor(bits), table.streams, table.columns)
+        near = tokens._replace(tokens=tokens.tokens.cpu(), kinds=tokens.kinds.cpu())
+        known = present.known(list(range(len(motions))), near, net.ends.cpu()).to(device)
+        embedded = net.embedded(tokens.tokens, tokens.kinds, known)
+        found = likeliest(net, net.begin(embedded, tokens.tokens >= 0), count, self.beam)
+        return [
+            [Sentence(self.vocabulary.decode(one.words), one.log_probability) for one in sentences]
+            for sentences in found
+        ]
+
+
+@dataclass(frozen=True)
+class Seq2SeqGenerator(OfTokens):
+    """Tokens drawn word by word, then decoded."""
+
+    net: Seq2Seq
+    given: Mapping[str, Any]
+    method = "seq2seq"
+    modalities = frozenset({"text"})
+    settings = frozenset({"temperature", "top_k", "top_p"})
+
+    @property
+    def tokenizer(self) -> TrainedTokenizer:
+        tokenizer: TrainedTokenizer = self.given["tokenizer"]
+        return tokenizer
+
+    @property
+    def prepared(self) -> Mapping[str, object]:
+        return {"text": self.given.get("text")}
+
+    @property
+    def max_frames(self) -> int:
+        return self.net.max_groups * self.unit_frames
+
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        """Lengths that are no whole groups are made of one group more, and cut."""
+        text, device, sampling = request.text("this model"), device_of(self.net), request.sampling
+        frames, unit = request.frames, self.unit_frames
+        codes = draw_tokens(
+            self.net,
+            text.features.to(device),
+            text.mask.to(device),
+            None if frames is None else torch.tensor([-(-count // unit) for count in frames]),
+            request.seeds,
+            Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
+        )
+        motions = self.tokenizer.decode(codes.codes, codes.groups.tolist())
+        if frames is None:
+            return motions
+        return [motion[:count] for motion, count in zip(motions, frames, strict=True)]

@@ -1,1 +1,0 @@
-"""The models that the papers compare themselves with: one file each."""
