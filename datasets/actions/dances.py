@@ -57,6 +57,7 @@ def kinetic_beats(joints: NDArray[np.floating], fps: float) -> Array:
 
     body = np.asarray(joints, dtype=np.float64)[:, :22]
     speed = np.linalg.norm(np.diff(body, axis=0), axis=-1).mean(1)
+    # Joints jitter more than they rest: without smoothing each frame would be a beat.
     speed = gaussian_filter1d(speed, max(0.04 * fps, 0.3), mode="nearest")
     found = find_peaks(-speed, prominence=0.1 * max(float(np.ptp(speed)), 1e-12))[0]
     # Speed t lies between frames t and t + 1.

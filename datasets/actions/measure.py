@@ -151,10 +151,13 @@ def _cuts(frames: int, fps: float) -> range:
 
 def _action(s: Signals) -> str:
     moved, turned = abs(float(s.travel[-1])), abs(_turned(s))
+    # From signs that no other action shows to those that several share, so that each test may assume that
+    # the ones before it failed. First who is on the floor.
     if np.percentile(s.drop, 10) > 0.3 and np.median(s.trunk) > 0.9:
         return "crawl"
     if s.drop.max() > LYING:
         return "lie"
+    # Then who leaves the floor: runners fly too, so their pace is asked before their hops and jumps.
     flights = len(_flights(s))
     if _pace(s) > 1.6 and (flights >= 2 or s.balls.max() > 0.13):
         return "run"
@@ -162,10 +165,12 @@ def _action(s: Signals) -> str:
         return "hop"
     if flights and s.drop.min() < -0.05:
         return "jump"
+    # A kick lifts a foot as high as no walker does.
     if moved > 0.3 and s.balls.max() < 0.4:
         return "turn" if TURN < turned < CIRCLE else "walk"
     if turned > TURN:
         return "turn"
+    # Whoever sinks reaches down where a hand is near the floor, and sits where the hips are behind the feet.
     if s.drop.max() > 0.23:
         low = int(np.argmax(s.drop))
         if s.wrist_height[:, low].min() < 0.42 and s.trunk[low] > 0.6:
@@ -207,6 +212,7 @@ def _arm_action(s: Signals) -> str:
         hand = int(np.argmax(tops))
         top = int(np.argmax(s.wrists[hand, :, 1]))
         return "raise" if s.wrists[hand, top, 2] < 0.28 else _reach_or_point(s)
+    # A punch is a reach forward that is not held.
     hand, direction = _reach(s)
     forward = s.wrists[hand, :, 2]
     if direction == "forward" and forward.max() > 0.78 and s.longest(forward > 0.85 * forward.max()) < 0.5:

@@ -81,14 +81,17 @@ def signals_of(joints: NDArray[np.floating], fps: float) -> Signals:
     if joints.ndim != 3 or joints.shape[0] < 4 or joints.shape[1] < 22 or joints.shape[2] != 3:
         raise UserError(f"joints of shape {list(joints.shape)}: expected [T >= 4, N >= 22, 3]")
     x = gaussian_filter1d(np.asarray(joints, dtype=np.float64), max(0.025 * fps, 0.3), axis=0, mode="nearest")
+    # Sizes and the floor are taken from the motion itself, so that thresholds hold for everybody.
     legs = [_length(x, 1 + s, 4 + s) + _length(x, 4 + s, 7 + s) for s in (0, 1)]
     x /= max(float(np.mean(legs)), 1e-3) / (THIGH + SHIN)
     x[..., 1] -= np.percentile(x[:, _BALLS, 1], 2)
+    # A chest that twists is no turn: the heading is that of the hips.
     hips = x[:, 1] - x[:, 2]
     heading = _smooth(np.unwrap(np.arctan2(-hips[:, 2], hips[:, 0])), 0.08, fps)
     forward = np.stack([np.sin(heading), np.cos(heading)], axis=-1)
     left = np.stack([np.cos(heading), -np.sin(heading)], axis=-1)
     root, feet = x[:, 0], x[:, _BALLS].mean(1)
+    # Steps are projected on the heading before they are summed: a circle goes forward all the way.
     step = np.diff(feet[:, [0, 2]], axis=0)
     travel = np.concatenate([[0.0], np.cumsum((step * 0.5 * (forward[1:] + forward[:-1])).sum(-1))])
     velocity = np.gradient(_smooth(root[:, [0, 2]], 0.15, fps), 1 / fps, axis=0)

@@ -77,8 +77,8 @@ class ClipTable:
                     return
                 if (meta := self._meta(row)).id != first.id:
                     continue  # two ids with one hash
-                here, there = self._split(row), self._split(rows[0])
-                kind = "also" if here == there else f"of split '{there}' also"
+                split, other = self._split(row), self._split(rows[0])
+                kind = "also" if split == other else f"of split '{other}' also"
                 message = f"id '{meta.id}' is {kind} {self._where(rows[0])}"
                 findings.error("repeated id", self._where(row), message)
 
@@ -114,10 +114,10 @@ class ClipTable:
                     return
                 apart = [other for other in rows[:at] if self._split(other) != self._split(row)]
                 other = apart[0] if apart else rows[0]
-                here, there = self._meta(row), self._meta(other)
-                if here.id == there.id or not np.array_equal(self._motion(row), self._motion(other)):
+                one, two = self._meta(row), self._meta(other)
+                if one.id == two.id or not np.array_equal(self._motion(row), self._motion(other)):
                     continue
-                message = f"'{here.id}' has the same motion as '{there.id}' ({self._where(other)})"
+                message = f"'{one.id}' has the same motion as '{two.id}' ({self._where(other)})"
                 if apart:
                     leak = f"{message}, which is in split '{self._split(other)}', not '{self._split(row)}'"
                     findings.error("same motion in two splits", self._where(row), leak)
@@ -155,8 +155,8 @@ class ClipTable:
         first, second = self._motion(a), self._motion(b)
         if first.shape != second.shape:
             return ""
-        here, there = (joints_of(motion, self.layout) for motion in (first, second))
-        return likeness(here, there, self.layout.skeleton)
+        pair = (joints_of(motion, self.layout) for motion in (first, second))
+        return likeness(*pair, self.layout.skeleton)
 
     def _height_hash(self, motion: NDArray[np.floating]) -> int:
         """0 when the heights could belong to any clip."""
@@ -187,11 +187,11 @@ class ClipTable:
             return read_motion(file, path, clip)
 
 
-def likeness(here: NDArray[np.float64], there: NDArray[np.float64], skeleton: Skeleton) -> str:
-    """Return how joints `there` [T, N, 3] repeat those `here`, as the beginning of a phrase, or ""."""
-    if _distance(here, there) < SAME_METRES:
+def likeness(first: NDArray[np.float64], second: NDArray[np.float64], skeleton: Skeleton) -> str:
+    """Return how joints `second` [T, N, 3] repeat those `first`, as the beginning of a phrase, or ""."""
+    if _distance(first, second) < SAME_METRES:
         return "the same recording as"
-    return "the mirror image of" if _distance(mirror(here, skeleton), there) < SAME_METRES else ""
+    return "the mirror image of" if _distance(mirror(first, skeleton), second) < SAME_METRES else ""
 
 
 def _runs(values: array[int]) -> Iterator[list[int]]:

@@ -31,9 +31,9 @@ def find_leaks(sets: Mapping[str, Splits]) -> list[str]:
     for at, name in enumerate(names):
         for other in names[at + 1 :]:
             for split in SPLITS:
-                for there in SPLITS:
-                    if split != there and split in sets[name] and there in sets[other]:
-                        _compare(name, sets[name][split], other, sets[other][there], found)
+                for other_split in SPLITS:
+                    if split != other_split and split in sets[name] and other_split in sets[other]:
+                        _compare(name, sets[name][split], other, sets[other][other_split], found)
     return list(found.values())
 
 

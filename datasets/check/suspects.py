@@ -3,6 +3,10 @@
 Motions by `faults.py`, and clips that are another one again, as they are or mirrored: by a signature that a
 mirror image shares, heights at eight moments, whose near neighbours are compared joint by joint. Mirror
 images that are declared (`mirror_of`) in the split of their original are meant.
+
+Decisions about them lie in `cleaned.json` beside the shards, so that they last when the set is converted
+again, and the manifest lists what is left out. Since the manifest's checksum is what a run knows a data set
+by, stages that have read other clips run again. No shard changes.
 """
 
 from __future__ import annotations
@@ -15,13 +19,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import write_json
+from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.check.duplicates import SAME_METRES, likeness
 from motionloom.datasets.check.faults import Fault, motion_faults
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import SPLITS, Split
+from motionloom.datasets.schema import (
+    CLEANED_FILE,
+    MANIFEST_FILE,
+    SPLITS,
+    Decisions,
+    Manifest,
+    Split,
+    UserError,
+)
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 
@@ -62,8 +76,8 @@ def open_splits(root: Path, *, every: bool = False) -> dict[Split, ShardDataset]
     """The splits of a data set, those that are tested on first: of two clips that are the same the later, the
     training's, is the one to go.
     """
-    there = {shard.split for shard in load_manifest(root).shards}
-    return {s: ShardDataset.open(root, s, every=every) for s in reversed(SPLITS) if s in there}
+    held = {shard.split for shard in load_manifest(root).shards}
+    return {s: ShardDataset.open(root, s, every=every) for s in reversed(SPLITS) if s in held}
 
 
 def find_suspects(
@@ -134,8 +148,8 @@ def _again(splits: Splits, one: Place, other: Place) -> Fault | None:
     """Return the fault of a clip `other` that repeats `one`; None where it does not, or is meant to."""
     first, second = splits[one.split], splits[other.split]
     original, copy = first.meta(one.clip), second.meta(other.clip)
-    said = (original.mirror_of or original.id) == (copy.mirror_of or copy.id)
-    if said and one.split == other.split:
+    declared = (original.mirror_of or original.id) == (copy.mirror_of or copy.id)
+    if declared and one.split == other.split:
         return None
     joints = floored_joints(first, one.clip), floored_joints(second, other.clip)
     how = likeness(*joints, first.layout.skeleton)
@@ -144,3 +158,32 @@ def _again(splits: Splits, one: Place, other: Place) -> Fault | None:
     kind = "mirrored twin" if "mirror" in how else "duplicate"
     where = f" of split {one.split}" if one.split != other.split else ""
     return Fault(kind, f"{how} '{original.id}'{where}", 2.0 + (one.split != other.split))
+
+
+def decide(root: Path, given: Decisions, where: str) -> Manifest:
+    """Add the decisions of the file `where` to a data set and return its manifest."""
+    with folder_lock(root):
+        manifest, decided = load_manifest(root), Decisions.of(root).then(given)
+        ids = {split: set(dataset.ids) for split, dataset in open_splits(root, every=True).items()}
+        unknown = sorted({*given.left_out, *given.kept}.difference(*ids.values()))
+        if unknown:
+            raise UserError(f"{where}: no clip '{unknown[0]}' in {root}; it is about another data set")
+        for split, own in ids.items():
+            if own <= decided.left_out.keys():
+                raise UserError(f"{where}: leaves out every clip of split '{split}' of {root}; keep some")
+        write_json(root / CLEANED_FILE, decided.dump())
+        return _written(root, manifest, decided.left_out)
+
+
+def undo(root: Path) -> Manifest:
+    """Forget all decisions about a data set and return its manifest."""
+    with folder_lock(root):
+        manifest = load_manifest(root)
+        (root / CLEANED_FILE).unlink(missing_ok=True)
+        return _written(root, manifest, {})
+
+
+def _written(root: Path, manifest: Manifest, excluded: dict[str, str]) -> Manifest:
+    manifest = manifest.model_copy(update={"excluded": excluded})
+    write_json(root / MANIFEST_FILE, manifest.dump())
+    return manifest

@@ -149,6 +149,7 @@ def _varied(truth: Truth, rng: np.random.Generator, hands: bool, bare: bool = Fa
     def inflected(verb: Callable[[str], str]) -> str:
         return link.join(verb(phrase) for phrase in phrases)
 
+    # Statements are likelier than headings, orders and "we see": people write them most.
     form, who = int(rng.integers(8)), _pick(rng, table.who)
     if form < 3:
         text = f"{who} {inflected(lambda phrase: _third_person(phrase, who))}"

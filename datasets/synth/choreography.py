@@ -257,6 +257,7 @@ def _places(plan: _Plan) -> tuple[Array, Array]:
             other = int(np.argmin(ways))
             places[other, k], moved[other] = before[other], False
         away = np.linalg.norm((places[:, k] - before) * [1, 1, 0, 0.12], axis=-1)
+        # Quick feet are lifted high, or they would slide; slow ones may shuffle.
         far = away > _SLOW * (plan.seconds[k] - plan.seconds[k - 1])
         grounded = (before[:, 2] == 0) & (places[:, k, 2] == 0)
         high = _LIFT * np.clip(0.5 + 0.5 * plan.size[k], 0.6, 1.1)

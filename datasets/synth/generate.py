@@ -194,6 +194,7 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         track.fingers = dancing_hands(planned.song, begin, track.t, shape)
     elif hands and not truth.parts:
         track.fingers = np.stack([shape_hand(truth.hand(side), track.t, shape) for side in (0, 1)])
+    # The shape's generator goes on after the hands: its order is part of what a seed means.
     solved = track.solve()
     size = float(np.clip(1 + config.size_spread * shape.standard_normal(), 0.8, 1.2))
     smpl = None

@@ -220,6 +220,7 @@ def _merge(
     encoder: TextEncoder,
 ) -> None:
     """Stream everything into the five files; they replace the old ones together, `cache.json` last."""
+    # Parts are ranges of ascending keys, so one pass over all keys takes each entry in its turn.
     keys, fresh = sorted(texts), set(new)
     # Row in the old cache, or -1: the next of the parts.
     rows = [-1 if old is None or key in fresh else cast(int, old.row(key)) for key in keys]
@@ -243,6 +244,7 @@ def _merge(
         packed = np.frombuffer(b"".join(keys), dtype=np.uint8).reshape(len(keys), 32)
         np.save(files["keys.npy"], packed, allow_pickle=False)
         np.save(files["offsets.npy"], offsets, allow_pickle=False)
+        # Without its description a half-replaced cache is none, and is made again.
         (folder / "cache.json").unlink(missing_ok=True)
     info = CacheInfo(encoder=encoder.name, dim=encoder.dim, count=len(keys))
     write_json(folder / "cache.json", info.dump())

@@ -248,13 +248,14 @@ def clean(
     """
     console, page = make_console(aside=as_json), out or root / "clean.html"
     if decisions is not None:
-        from motionloom.datasets.check import decisions as cleaning
+        from motionloom.datasets.check.suspects import decide
+        from motionloom.datasets.check.suspects import undo as forget
         from motionloom.datasets.schema import Decisions
 
         if decisions == Path("none"):
-            manifest = cleaning.undo(root)
+            manifest = forget(root)
         else:
-            manifest = cleaning.decide(root, Decisions.load_json(decisions), str(decisions))
+            manifest = decide(root, Decisions.load_json(decisions), str(decisions))
         say(
             console,
             f"{root}: {len(manifest.excluded)} clips are left out; stages that read this set run again",

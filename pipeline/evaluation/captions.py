@@ -72,14 +72,14 @@ class CaptionedClips:
         """Return the figures of one caption for each clip, against the clips' own or `references`."""
         known = self.references if references is None else references
         states = _states(self.text, [*captions, *(text for own in known for text in own)])
-        said = [words_of(caption) for caption in captions]
+        candidates = [words_of(caption) for caption in captions]
         by = [[words_of(one) for one in own] for own in known]
-        rarities = cider_d(said, by)
+        consensus = cider_d(candidates, by)
         rows = []
         for row, truth in enumerate(self.truths):
             found = {
-                "captions.rouge-l": rouge_l(said[row], by[row]),
-                "captions.cider-d": rarities[row],
+                "captions.rouge-l": rouge_l(candidates[row], by[row]),
+                "captions.cider-d": consensus[row],
                 "captions.bert": max(bert_score(states[captions[row]], states[one])[2] for one in known[row]),
             }
             if truth.truth is not None:
@@ -90,7 +90,9 @@ class CaptionedClips:
                 found |= weighted("captions.claims_hold", float(holds), float(bool(claims)))
             rows.append(found)
         out = row_estimates([rows])
-        out |= {f"captions.bleu-{n}": Estimate(value) for n, value in enumerate(bleu(said, by), start=1)}
+        out |= {
+            f"captions.bleu-{n}": Estimate(value) for n, value in enumerate(bleu(candidates, by), start=1)
+        }
         if self.tma is not None:
             latents = self.tma.embed_captions(list(captions), self.tma.given["text"])
             found_by = r_precision(_unit(latents), self.motions, batch=self.size, top=_TOP, seed=self.seed)

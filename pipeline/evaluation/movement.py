@@ -43,8 +43,8 @@ WIDTHS = {"k": 3 * BODY_JOINTS, "m": 32}
 """Columns of each kind."""
 _KINDS: tuple[tuple[str, str, Better], ...] = (("fid", "FID", "lower"), ("div", "Div", ""), ("mm", "MM", ""))
 METRICS = tuple(
-    Metric(f"movement.{name}_{kind}{suffix}", f"{title}_{kind}{said}", better)
-    for suffix, said in (("", ""), ("_test", ", to the test clips"))
+    Metric(f"movement.{name}_{kind}{suffix}", f"{title}_{kind}{reference}", better)
+    for suffix, reference in (("", ""), ("_test", ", to the test clips"))
     for name, title, better in _KINDS
     for kind in WIDTHS
     if not (suffix and name == "mm")

@@ -260,12 +260,14 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
         track.foot_pitch[foot] = pitch
         # Toes up means that the foot stands on its heel: the ball rises, the heel stays at the floor.
         track.ball[foot, :, 1] = lift[foot] + 0.125 * np.sin(np.maximum(-pitch, 0.0))
+    # The root follows the feet with the delay that smoothing gives it, so legs reach what they stand on.
     window = 0.42 * stride.step_seconds
     toe = np.array([toe_out, -toe_out])[:, None]
     track.yaw = smooth((track.foot_yaw - toe).mean(0), 1.6 * window, fps)
     back = np.stack([np.sin(track.yaw), np.cos(track.yaw)], axis=-1) * BALL[1]
     middle = track.ball[:, :, [0, 2]].mean(0) - back
     track.root[:, [0, 2]] = smooth(middle, window, fps)
+    # The foot that is ahead swings the arms and twists the spine the other way.
     gap = track.ball[0] - track.ball[1]
     ahead = gap[:, 0] * np.sin(track.yaw) + gap[:, 2] * np.cos(track.yaw)
     share = smooth(lift[0] - lift[1], 0.5 * window, fps) / max(stride.height, 0.03)

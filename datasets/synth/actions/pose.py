@@ -174,6 +174,7 @@ class Track:
     def _leg(self, local: Array, side: int, ankle: Array) -> None:
         """Two-bone IK: the knee stays in the plane through hip and ankle that faces the foot's way."""
         pelvis = local[:, 0]
+        # The hinge is turned into the plane across the leg's axis, so that the knee cannot bend sideways.
         reach = ankle - (self.root + pelvis @ OFFSETS[1 + side])
         distance = np.clip(np.linalg.norm(reach, axis=-1), 0.25, 0.995 * (THIGH + SHIN))
         axis = unit(reach)
@@ -198,6 +199,7 @@ class Track:
         axis = unit(arm.direction)
         lift = np.clip(axis[:, 1] + 0.2, 0.0, 1.2) * 0.32
         forward = np.clip(axis[:, 2], -0.3, 1.0) * np.clip(arm.reach - 0.55, 0.0, 0.45) * 0.45
+        # The collar takes a part of the way, so the wrist's goal is seen from the shoulder that it moved.
         collar = rot_y(-forward) @ rot_z(lift)
         shift = collar @ OFFSETS[16] - OFFSETS[16]
         distance = np.clip(arm.reach, 0.3, 0.985) * ARM

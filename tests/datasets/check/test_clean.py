@@ -12,9 +12,8 @@ import pytest
 from rich.console import Console
 
 from motionloom.datasets.check.dataset import examine
-from motionloom.datasets.check.decisions import decide, undo
 from motionloom.datasets.check.faults import motion_faults
-from motionloom.datasets.check.suspects import find_suspects, open_splits
+from motionloom.datasets.check.suspects import decide, find_suspects, open_splits, undo
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout

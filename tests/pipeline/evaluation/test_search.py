@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.datasets.check.decisions import decide
+from motionloom.datasets.check.suspects import decide
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Decisions, UserError
