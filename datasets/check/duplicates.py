@@ -155,8 +155,8 @@ class ClipTable:
         first, second = self._motion(a), self._motion(b)
         if first.shape != second.shape:
             return ""
-        pair = (joints_of(motion, self.layout) for motion in (first, second))
-        return likeness(*pair, self.layout.skeleton)
+        one, other = (joints_of(motion, self.layout) for motion in (first, second))
+        return likeness(one, other, self.layout.skeleton)
 
     def _height_hash(self, motion: NDArray[np.floating]) -> int:
         """0 when the heights could belong to any clip."""

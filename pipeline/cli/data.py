@@ -248,12 +248,11 @@ def clean(
     """
     console, page = make_console(aside=as_json), out or root / "clean.html"
     if decisions is not None:
-        from motionloom.datasets.check.suspects import decide
-        from motionloom.datasets.check.suspects import undo as forget
+        from motionloom.datasets.check.suspects import decide, undo
         from motionloom.datasets.schema import Decisions
 
         if decisions == Path("none"):
-            manifest = forget(root)
+            manifest = undo(root)
         else:
             manifest = decide(root, Decisions.load_json(decisions), str(decisions))
         say(
