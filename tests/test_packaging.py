@@ -175,14 +175,13 @@ def test_the_sdist_is_the_tree(sdist: Path) -> None:
 
 
 def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
-    """Recipes, the papers' tables, skeletons, models, the pages' css, js and html, the marks of typed
-    packages."""
+    """Recipes, the papers' tables, skeletons, models, READMEs, the pages' css, js and html."""
     with zipfile.ZipFile(wheel) as archive:
         inside = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert inside == {f"motionloom/{name}" for name in files_of(*FOLDERS)}
-    kinds = {".py", ".yaml", ".json", ".css", ".js", ".html", ".npz", ".typed"}
+    kinds = {".py", ".yaml", ".json", ".css", ".js", ".html", ".npz", ".typed", ".md"}
     if any((ROOT / "models" / "pretrained").glob("*/bundle.json")):
-        kinds |= {".safetensors", ".md"}  # a trained model and its card
+        kinds |= {".safetensors"}
     assert {Path(name).suffix or Path(name).name for name in inside} == kinds
 
 
