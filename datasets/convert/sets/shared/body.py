@@ -1,19 +1,27 @@
-"""`BodyRelease`: sets of SMPL-H or SMPL-X parameters, with the sound that people dance or speak to."""
+"""`BodyRelease`: sets of SMPL, SMPL-H or SMPL-X parameters, with the sound that people dance or speak to.
+
+Audio features are made once for a whole piece and cut to the motion; row 0 belongs to frame 0. Beats and
+loudness are then the piece's, not the cut's.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar, Literal, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from motionloom.datasets.audio.features import VERSION, AudioSettings
-from motionloom.datasets.audio.sound import sound_seconds
+from motionloom.datasets.audio.align_features import rows_at
+from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features
+from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
+from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import (
     body_of,
@@ -23,7 +31,6 @@ from motionloom.datasets.convert.common.features import (
     upright,
 )
 from motionloom.datasets.convert.common.files import inside
-from motionloom.datasets.convert.common.music import SoundConfig, cut_of
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.sets.shared.release import (
     Entry,
@@ -38,6 +45,34 @@ from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
+
+SOUND_SUFFIXES = (".wav", ".flac", ".mp3", ".ogg")
+_KEPT_PIECES = 64
+"""AIST++ has 60 pieces of music: with their features and sound about 0.3 GB in each worker."""
+
+Wav = tuple[NDArray[np.float32], int]
+"""Samples and their rate."""
+
+
+class SoundConfig(ConvertConfig):
+    """Options of converters whose clips have sound."""
+
+    max_music_gap: float = Field(default=1.0, ge=0)
+    """Seconds of motion that may be cut where the sound ends first; beyond that the clip is left out."""
+    audio_features: bool = True
+    """Store the 438 audio features."""
+    audio_fps: float | None = Field(default=None, gt=0)
+    """Rows of audio features a second that the music is analysed at, each stored for all motion frames
+    nearest to it; default: one for every motion frame. Bailando's release hears 7.5."""
+    sound_rate: int = Field(default=16_000, ge=0, le=192_000)
+    """Sample rate at which the sound itself is stored; 0 leaves it out."""
+
+    def audio_settings(self) -> AudioSettings | None:
+        """Settings of the features; None where none are wanted."""
+        if not self.audio_features:
+            return None
+        return AudioSettings.parse({"fps": self.audio_fps or self.fps}, "audio features")
+
 
 SOURCE_FPS = 30.0
 """Frame rate of all these sets, where a file states none."""
@@ -189,3 +224,43 @@ class BodyRelease(Release[Cfg]):
             rows, wav = cut_of(self.config, self.sound_folder, clip.entry.sound, start, seconds)
         meta = meta.model_copy(update={"song": self.song(clip)})
         return Sample(meta, motion, texts=list(clip.entry.texts), audio=rows, wav=wav)
+
+
+def cut_of(
+    config: SoundConfig, folder: Path, sound: str, start: float, seconds: float
+) -> tuple[NDArray[np.float32] | None, Wav | None]:
+    """The part of a piece from second `start` on that is `seconds` long.
+
+    Audio features [T, 438], a row for each frame of the motion, and the sound itself.
+    """
+    settings = config.audio_settings()
+    features, samples = piece_of_music(folder, sound, settings, config.fps, config.sound_rate)
+    rows: NDArray[np.float32] | None = None
+    if features is not None:
+        first, count = round(start * config.fps), max(1, round(seconds * config.fps))
+        # The last frame may lie at the very end of the music, past the last row by a rounding.
+        rows = features[np.minimum(np.arange(first, first + count), len(features) - 1)]
+    if samples is None:
+        return rows, None
+    begin = round(start * config.sound_rate)
+    return rows, (samples[begin : begin + round(seconds * config.sound_rate)], config.sound_rate)
+
+
+@lru_cache(maxsize=_KEPT_PIECES)
+def piece_of_music(
+    folder: Path, sound: str, settings: AudioSettings | None, fps: float, rate: int
+) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+    """Features of a whole music file at `fps` (where settings are given), samples at `rate` (unless 0)."""
+    if settings is None and not rate:
+        return None, None
+    label = f"{folder.name}/{sound}"
+    samples, found = read_sound(inside(folder, sound, label), label)
+    features = None
+    if settings is not None:
+        analysed = audio_features(samples, found, settings)
+        features = rows_at(analysed, settings.fps, fps, round(len(analysed) * fps / settings.fps))
+    kept = resample_sound(samples, found, rate) if rate else None
+    for shared in (features, kept):
+        if shared is not None:
+            shared.setflags(write=False)  # every clip of the piece gets the same array
+    return features, kept
