@@ -1,7 +1,7 @@
 """What a model of synthetic clips knows, measured: the card of its exported folder, and its figures again.
 
     motionloom run humantomato-synthetic
-    motionloom export runs/humantomato-synthetic -o model --half --sampling cfg_scale=1.5
+    motionloom export runs/humantomato-synthetic -o model --half --set cfg_scale=1.5
     python benchmarks/model_card.py model --write
 
 The test clips are made here, from the data settings and the seed of the recipe, so nothing is needed but the
@@ -334,7 +334,7 @@ def card_of(
     head = ["right, %", *(f"{title}: {kind}" for title, kind in columns_of(shares))]
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
     options = "".join(
-        f" --sampling {name}" + (f".{key}={part}" if key else f"={part}")
+        f" --set {name}" + (f".{key}={part}" if key else f"={part}")
         for name, value in sampling.items()
         for key, part in (value.items() if isinstance(value, dict) else [("", value)])
     )
@@ -343,7 +343,7 @@ def card_of(
     settings = "".join(f" --set '{one}'" for one in figures["settings"])
     heard = "audio" in bundle.generator.modalities
     words = '"a person waves with the left hand"'
-    uses = [f'{words} --face "a person looks happy"' if bundle.faces else words]
+    uses = [f'{words} --set face="a person looks happy"' if bundle.faces else words]
     uses = ["--audio song.mp3", f"{words} --audio song.mp3@0:30-1:00", *uses] if heard else uses
     asked = "" if sampling == recommended else options
     return CARD.read_text(encoding="utf-8").format(

@@ -31,11 +31,10 @@ from motionloom.pipeline.cli.options import (
     Device,
     ModelFolder,
     RunFolder,
-    Sampling,
     Sets,
+    Settings,
     fields_of,
     print_json,
-    sampling_of,
     set_option,
 )
 from motionloom.pipeline.cli.search import search
@@ -309,19 +308,21 @@ def export(
     run_folder: RunFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="New folder.")] = Path("exported"),
     half: Annotated[bool, typer.Option("--half", help="Weights in half precision: half the size.")] = False,
-    sampling: Sampling = None,
+    settings: Settings = None,
 ) -> None:
     """One folder with all that generate needs: weights (safetensors), configs, statistics.
 
-    `--sampling` settings go with it: generation takes them where nobody says otherwise.
+    Settings of `--set`, such as cfg_scale, go with it: generation takes them where nobody says otherwise.
 
     Example: `motionloom export runs/humantomato-tiny -o model && motionloom generate model "a person jumps"`
 
-    Example: `motionloom export runs/humantomato-tiny -o model --half --sampling top_p=0.9`
+    Example: `motionloom export runs/humantomato-tiny -o model --half --set top_p=0.9`
     """
+    from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.runs.api import export_run
 
-    export_run(run_folder, out, half=half, sampling=sampling_of(sampling), console=make_console())
+    sampling = SamplingConfig.parse(fields_of(settings, "--set"), "--set")
+    export_run(run_folder, out, half=half, sampling=sampling, console=make_console())
 
 
 def main() -> None:

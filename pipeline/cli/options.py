@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from pydantic_core import to_jsonable_python
 
 from motionloom.datasets.schema import UserError
-
-if TYPE_CHECKING:
-    from motionloom.pipeline.contract.sampling import SamplingConfig
-
 
 ModelFolder = Annotated[
     Path,
@@ -32,21 +28,20 @@ Device = Annotated[
 ]
 Workers = Annotated[int, typer.Option(help="Processes; the shards are the same bytes for any number.")]
 
-Sampling = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--sampling",
-        help="How motions are drawn, KEY=VALUE; may be repeated. Keys: temperature (0: the likeliest), "
-        "top_k, top_p, candidates (keep the nearest of so many), cfg_scale, guidance.audio, face_cfg_scale, "
-        "face_model (gpt, vae, diffusion), sampler (ddpm, ddim, dpm++), denoising_steps. "
-        "Default: as the model recommends.",
-    ),
-]
-
 
 def set_option(help: str) -> Any:
     """`--set KEY=VALUE`, for the fields of a config."""
     return typer.Option("--set", "-s", metavar="KEY=VALUE", help=f"{help} May be repeated.")
+
+
+Settings = Annotated[
+    list[str] | None,
+    set_option(
+        "How motions are drawn: temperature (0: the likeliest), top_k, top_p, candidates (keep the nearest "
+        "of so many), cfg_scale, guidance.audio, face_cfg_scale, face_model (gpt, vae, diffusion), sampler "
+        "(ddpm, ddim, dpm++), denoising_steps; default: as the model recommends."
+    ),
+]
 
 
 def fields_of(words: Sequence[str] | None, option: str) -> dict[str, Any]:
@@ -65,11 +60,17 @@ def fields_of(words: Sequence[str] | None, option: str) -> dict[str, Any]:
     return fields
 
 
-def sampling_of(words: Sequence[str] | None) -> SamplingConfig:
-    """The sampling settings of `--sampling` options."""
-    from motionloom.pipeline.contract.sampling import SamplingConfig
+def settings_of(words: Sequence[str] | None, *groups: Iterable[str]) -> list[dict[str, object]]:
+    """The fields of `--set` options, one mapping for each group of keys; a key of no group is refused."""
+    from motionloom.pipeline.runs.resolve import nearest
 
-    return SamplingConfig.parse(fields_of(words, "--sampling"), "--sampling")
+    fields, known = fields_of(words, "--set"), [list(group) for group in groups]
+    for key in fields:
+        if not any(key in group for group in known):
+            raise UserError(
+                f"--set {key}: no such key{nearest(key, [name for keys in known for name in keys])}"
+            )
+    return [{key: fields[key] for key in group if key in fields} for group in known]
 
 
 AsJson = Annotated[

@@ -1,4 +1,4 @@
-"""`EditTask`: what is to be done to a clip; one config for the command line, Python and the page's JSON.
+"""A clip, and `EditTask`: what is to be done to it, for the command line, Python and the page's JSON.
 
 Times are seconds of the clip: 0 is its first frame, what is made before it (`lead`) has negative ones.
 Positions are metres in the clip's world, Y up, the floor at height 0.
@@ -10,27 +10,46 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Protocol, Self, runtime_checkable
+from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.motion.figure_parts import FigurePart
+from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Config
-from motionloom.pipeline.contract.generation import MotionGenerator
-from motionloom.pipeline.contract.sampling import SamplingConfig
 
-FASTEST = 12.0
-"""Metres a second; nobody runs faster."""
-CEILING = 3.0
-"""Metres; no joint of a standing or jumping person comes higher."""
+MAX_SPEED = 12.0
+"""Metres a second of a root; the fastest sprint that was measured (Bolt, Berlin 2009) reached 12.4."""
+MAX_HEIGHT = 3.0
+"""Metres of a joint above the floor; a tall person's raised hand in a jump comes to about as much."""
 
 Seconds = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1000, le=1000)]
+
+
+@dataclass(frozen=True)
+class RecordedClip:
+    """A clip as it was recorded or made."""
+
+    name: str
+    joints: NDArray[np.float64]
+    """Metres, Y up: [T, 22, 3], or [T, 52, 3] where it has hands."""
+    fps: float
+    face: NDArray[np.float32] | None = None
+    """Expression [T, 50]."""
+    caption: str = ""
+
+    @property
+    def has_hands(self) -> bool:
+        return int(self.joints.shape[1]) > BODY_JOINTS
+
+    @property
+    def seconds(self) -> float:
+        return len(self.joints) / self.fps
 
 
 class Kept(Config):
@@ -71,10 +90,10 @@ class Pin(Config):
     @model_validator(mode="after")
     def _within_reach(self) -> Self:
         height = self.position[1]
-        if not -0.5 <= height <= CEILING:
+        if not -0.5 <= height <= MAX_HEIGHT:
             raise ValueError(
                 f"{self.joint} is pinned {height:g} m above the floor; nobody reaches that, "
-                f"take -0.5 to {CEILING:g} m"
+                f"take -0.5 to {MAX_HEIGHT:g} m"
             )
         return self
 
@@ -126,12 +145,12 @@ class EditTask(Config):
         _in_order("path", [point.at for point in self.path])
         for one, two in pairwise(self.path):
             speed = math.hypot(two.x - one.x, two.z - one.z) / (two.at - one.at)
-            if speed > FASTEST:
+            if speed > MAX_SPEED:
                 raise ValueError(
                     f"path: {speed:.0f} m/s between {one.at:g} s and {two.at:g} s; nobody runs faster than "
-                    f"{FASTEST:g} m/s, give the points more time"
+                    f"{MAX_SPEED:g} m/s, give the points more time"
                 )
-        _in_order("words", [said.start for said in self.words])
+        _in_order("words", [words.start for words in self.words])
         for first, second in pairwise(self.words):
             if second.start < first.end:
                 raise ValueError(f"words: two stretches overlap at {second.start:g} s")
@@ -146,69 +165,6 @@ def _in_order(name: str, times: Sequence[float]) -> None:
     for one, two in pairwise(times):
         if two <= one:
             raise ValueError(f"{name}: {two:g} s comes after {one:g} s; give them in order of time")
-
-
-@dataclass(frozen=True)
-class KnownWay:
-    """Where the root is in some of T frames, seen from frame `anchor`: there it stands at the origin, facing
-    +Z.
-    """
-
-    anchor: int
-    heading: NDArray[np.float64]
-    """Radians [T]."""
-    place: NDArray[np.float64]
-    """z and x in metres [T, 2]."""
-    heading_known: NDArray[np.bool_]
-    place_known: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class FramePin:
-    """A joint that must be somewhere in one frame: metres, seen from the way's anchor."""
-
-    frame: int
-    joint: int
-    position: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Said:
-    """Words and the frames that they are about."""
-
-    conditions: Conditions
-    """Encoded, one row; empty without words."""
-    share: NDArray[np.float64]
-    """[T]; those of all words sum to 1 in each frame."""
-
-
-@dataclass(frozen=True)
-class EditRequest:
-    """A motion of T frames that is partly given, and what is asked of the rest."""
-
-    features: NDArray[np.float32]
-    """Columns of the generator's part [T, C], in their own units."""
-    pieces: NDArray[np.bool_]
-    """Which `figure_parts.PIECES` are given in each frame [T, P]."""
-    words: Sequence[Said]
-    seeds: Sequence[int]
-    """One for each motion to make."""
-    way: KnownWay | None = None
-    """None for a generator without the root."""
-    pins: Sequence[FramePin] = ()
-    strength: float = 1.0
-    likeness: float = 0.0
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
-
-
-@runtime_checkable
-class EditingGenerator(MotionGenerator, Protocol):
-    """A generator that fills in what is not given."""
-
-    def edit(self, request: EditRequest) -> list[NDArray[np.float32]]:
-        """Motions [T, C] in their own units, one a seed; what is given in them is so to the bit, and the rest
-        near what is asked for.
-        """
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ modalities it can be conditioned on and which sampling settings it takes notice 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
@@ -24,6 +24,9 @@ from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
+
+Motion = NDArray[np.float32]
+"""Features [T, C] of the generator's part, in their own units."""
 
 
 _JUDGED = 3.0
@@ -68,15 +71,15 @@ class Prompt:
         return self.sound is not None and self.sound.silent
 
     @property
-    def stands(self) -> bool:
-        """Whether nothing drives it but silence."""
+    def idle(self) -> bool:
+        """Whether nothing drives it but silence, in which the figure stands."""
         return self.modalities == {"audio"} and not self.conditions and self.silent
 
     @property
     def remark(self) -> str:
         """One sentence on a sound that is silent, or has hardly a beat; else empty."""
         if self.silent:
-            return f"nothing is heard: {'the figure stands' if self.stands else 'its words drive the motion'}"
+            return f"nothing is heard: {'the figure stands' if self.idle else 'its words drive the motion'}"
         if self.sound is None or self.sound.seconds < _JUDGED:
             return ""
         from motionloom.datasets.audio.tracker import NO_BEAT, track
@@ -106,9 +109,9 @@ class GenerationRequest:
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     noise_seeds: Sequence[int] | None = None
     """Of the noise of a diffusion decoder; None takes `seeds`. Others take no notice of it."""
-    seed_motions: Sequence[NDArray[np.float32]] | None = None
-    """What a `SeededGenerator` goes on from, its `seed_frames` long: the generator's columns [T0, C] in their
-    own units; None takes motions of its own. Others take no notice of it."""
+    seed_motions: Sequence[Motion] | None = None
+    """What a generator with `seed_frames` goes on from, as long as these: its columns [T0, C] in their own
+    units; None takes motions of its own. Others take no notice of it."""
 
     def text(self, who: str) -> Condition:
         """The encoded texts; `who` is conditioned on them, for the message where there are none."""
@@ -142,6 +145,59 @@ class Stretch:
     """As of a request; timed modalities begin with the stretch."""
     frames: Sequence[int] | None
     """Length of each row, or None where the model decides (only where it is the one stretch)."""
+
+
+class TokenFlow(Protocol):
+    """Tokens of one motion without an end, under conditions that may change."""
+
+    def condition(self, conditions: Conditions) -> None:
+        """Conditions, one row, of all that is drawn from now on; timed ones begin with the next group."""
+
+    def draw(self, left: int | None) -> Mapping[str, Tensor]:
+        """Some groups, one or more and at most `left` (None = there will be another condition, some day).
+
+        Per stream int64 [1, G * per_group].
+        """
+
+
+class FrameFlow(Protocol):
+    """Frames of tokens as they come."""
+
+    def push(self, codes: Mapping[str, Tensor]) -> Motion | None:
+        """More tokens -> the features [T, C] that are final now, in their own units; None = none yet."""
+
+    def finish(self) -> Motion | None:
+        """No more tokens follow: the rest."""
+
+
+@dataclass(frozen=True)
+class Streaming:
+    """How a generator of tokens makes one motion without an end."""
+
+    group_tokens: Mapping[str, int]
+    """Tokens of a group, by stream."""
+    tokens: Callable[[int, SamplingConfig, StreamConfig], TokenFlow]
+    """Start the tokens of a motion, by its seed. Of one caption they are those of `generate` by the same
+    seed, as long as the network's block holds them."""
+    frames: Callable[[int, SamplingConfig, StreamConfig], FrameFlow]
+    """Start the decoder of these tokens, by the same seed."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What a generator can do besides `generate`; the default of each field says that it cannot."""
+
+    streaming: Streaming | None = None
+    drive: Callable[[Sequence[Stretch], Sequence[int], SamplingConfig], list[Motion]] | None = None
+    """As `generate`, of several stretches one after another, a seed for each motion; [T, C] each."""
+    edit: Callable[..., list[Motion]] | None = None
+    """Fills in what an edit leaves free: an `Editor` (`inference/edits/frames.py`)."""
+    denoising: Callable[[SamplingConfig], tuple[Sampler, int]] | None = None
+    """Sampler and number of steps of its diffusion model: as asked for, or else the model's own."""
+    seed_frames: int = 0
+    """Frames of the motion that it goes on from, and with which what it makes begins."""
+    note: str = ""
+    """A few words that its figures must say."""
 
 
 class MotionGenerator(Protocol):
@@ -183,81 +239,9 @@ class MotionGenerator(Protocol):
     def decides_length(self) -> bool:
         """Whether it can be asked for a motion without a length."""
 
-    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+    @property
+    def capabilities(self) -> Capabilities:
+        """What it can do besides `generate`."""
+
+    def generate(self, request: GenerationRequest) -> list[Motion]:
         """Features of the part in their own units, [T, C] each, in the order of the rows."""
-
-
-@runtime_checkable
-class DenoisingGenerator(MotionGenerator, Protocol):
-    """A generator in which a diffusion model makes motion."""
-
-    def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
-        """Sampler and number of steps: as asked for, or else the model's own."""
-
-
-@runtime_checkable
-class SeededGenerator(MotionGenerator, Protocol):
-    """A generator that goes on from a motion, with which what it makes begins."""
-
-    @property
-    def seed_frames(self) -> int:
-        """Frames of it."""
-
-
-@runtime_checkable
-class NotedGenerator(MotionGenerator, Protocol):
-    """A generator of which there is something that its figures must say."""
-
-    @property
-    def note(self) -> str:
-        """A few words; empty where there is nothing."""
-
-
-@runtime_checkable
-class DrivenGenerator(MotionGenerator, Protocol):
-    """A generator whose conditions may change on the way: one motion, conditioned stretch by stretch."""
-
-    def drive(
-        self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig
-    ) -> list[NDArray[np.float32]]:
-        """As `generate`, of several stretches one after another; [T, C] each."""
-
-
-class TokenFlow(Protocol):
-    """Tokens of one motion without an end, under conditions that may change."""
-
-    def condition(self, conditions: Conditions) -> None:
-        """Conditions, one row, of all that is drawn from now on; timed ones begin with the next group."""
-
-    def draw(self, left: int | None) -> Mapping[str, Tensor]:
-        """Some groups, one or more and at most `left` (None = there will be another condition, some day).
-
-        Per stream int64 [1, G * per_group].
-        """
-
-
-class FrameFlow(Protocol):
-    """Frames of tokens as they come."""
-
-    def push(self, codes: Mapping[str, Tensor]) -> NDArray[np.float32] | None:
-        """More tokens -> the features [T, C] that are final now, in their own units; None = none yet."""
-
-    def finish(self) -> NDArray[np.float32] | None:
-        """No more tokens follow: the rest."""
-
-
-@runtime_checkable
-class StreamingGenerator(MotionGenerator, Protocol):
-    """A generator of tokens that can be decoded as they come."""
-
-    @property
-    def group_tokens(self) -> Mapping[str, int]:
-        """Tokens of a group, by stream."""
-
-    def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
-        """The tokens of a new motion. Of one caption they are those of `generate` by the same seed, as long
-        as the network's block holds them.
-        """
-
-    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
-        """What makes frames of them."""

@@ -16,7 +16,6 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.pipeline.contract.generation import SeededGenerator
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.render.sound import Score, Segment
@@ -170,7 +169,7 @@ def dances_for(
 
 def seed_frames(bundle: Bundle) -> int:
     """Frames of a recording that a model's dance begins with."""
-    return bundle.generator.seed_frames if isinstance(bundle.generator, SeededGenerator) else 0
+    return bundle.generator.capabilities.seed_frames
 
 
 def dance_to(bundle: Bundle, clips: Sequence[DanceClip], **drawn: Any) -> list[GeneratedMotion]:

@@ -23,19 +23,12 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.captioning import MotionCaptioner
-from motionloom.pipeline.contract.generation import (
-    DenoisingGenerator,
-    DrivenGenerator,
-    GenerationRequest,
-    MotionGenerator,
-    Prompt,
-    Stretch,
-)
+from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator, Prompt, Stretch
 from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CAPTIONER, CPU, Finished, StageCache
 from motionloom.pipeline.inference.checks import find_mismatches, unknown_captions
-from motionloom.pipeline.inference.generators.standing import stood
+from motionloom.pipeline.inference.generators.idle_pose import blend_to_idle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
     PromptEncoder,
@@ -209,8 +202,8 @@ class Bundle:
         noticed = frozenset[str]().union(*(generator.settings for generator in used))
         out: dict[str, object] = {name: value for name, value in sampling.dump().items() if name in noticed}
         for generator, prefix in zip(used, ("", "face_"), strict=False):
-            if isinstance(generator, DenoisingGenerator) and "sampler" in generator.settings:
-                sampler, steps = generator.denoising(sampling)
+            if (denoising := generator.capabilities.denoising) is not None:
+                sampler, steps = denoising(sampling)
                 out |= {f"{prefix}sampler": sampler, f"{prefix}denoising_steps": steps}
         return {name: value for name, value in out.items() if value not in (None, {})}
 
@@ -234,8 +227,8 @@ class Bundle:
         As `MotionModel.generate`. `conditions` are more of what motions are conditioned on, by modality: of
         "audio" the sounds' features [T, 438], where they are known, such as those that a data set stores.
         `noise_seed` decodes the same tokens with other noise, where a diffusion model decodes. `seed_motions`
-        are the layout's columns [T0, D] of motions that a `SeededGenerator` goes on from, one for each or one
-        for all. With `strict`, empty captions and options without effect are refused.
+        are the layout's columns [T0, D] of motions that a generator with `seed_frames` goes on from, one for
+        each or one for all. With `strict`, empty captions and options without effect are refused.
         """
         require_seed(seed)
         texts = None if captions is None else caption_list(captions)
@@ -286,7 +279,8 @@ class Bundle:
         """One motion driven by segments of text and music in turn, and other samples of it (`script.py`)."""
         sampling, generator, fps = self.drawing(sampling), self.generator, self.layout.fps
         require_seed(seed)
-        if not isinstance(generator, DrivenGenerator):
+        drive = generator.capabilities.drive
+        if drive is None:
             raise UserError(
                 f"this model ({generator.method}) makes a motion of one prompt; scripts need a UDE model"
             )
@@ -299,10 +293,10 @@ class Bundle:
             )
             for segment, count in zip(segments, frames, strict=True)
         ]
-        stands = [segment.prompt.stands for segment in segments]
+        idle = [segment.prompt.idle for segment in segments]
         body = [
-            stood(motion, stands, frames, self.layout, generator.part)
-            for motion in generator.drive(stretches, seeds[:samples], sampling)
+            blend_to_idle(motion, idle, frames, self.layout, generator.part)
+            for motion in drive(stretches, seeds[:samples], sampling)
         ]
         faces = self._faces(segments, frames, seeds[samples:], sampling)
         starts = np.concatenate([[0], np.cumsum(frames)]) / fps
@@ -319,7 +313,7 @@ class Bundle:
             float(start + tick)
             for segment, stretch, start, count in zip(segments, stretches, starts, frames, strict=False)
             for tick in ticks_of(segment.prompt, stretch.conditions, 0, fps)
-            if tick < count / fps and not segment.prompt.stands
+            if tick < count / fps and not segment.prompt.idle
         )
         sound = sound_of(list(zip(segments, frames, strict=True)), fps)
         whole = Prompt(text="; ".join(segment.label for segment in segments), sound=sound)
@@ -388,12 +382,12 @@ class Bundle:
             # The face takes the body's length, so that both share one time line.
             face = maker.generate(GenerationRequest(words, [len(m) for m in body], seeds[1], sampling))
         body = [
-            stood(motion, [prompt.stands], [len(motion)], layout, generator.part)
+            blend_to_idle(motion, [prompt.idle], [len(motion)], layout, generator.part)
             for motion, prompt in zip(body, prompts, strict=True)
         ]
         made = [self._motion(*row) for row in zip(prompts, body, face, strict=True)]
         ticks = [ticks_of(prompt, conditions, row, layout.fps) for row, prompt in enumerate(prompts)]
         return [
-            replace(one, beats=() if one.prompt.stands else tuple(t for t in own if t < one.seconds))
+            replace(one, beats=() if one.prompt.idle else tuple(t for t in own if t < one.seconds))
             for one, own in zip(made, ticks, strict=True)
         ]

@@ -16,8 +16,7 @@ from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import HANDS, PRESENT_ALL, Dropped, UserError
 from motionloom.pipeline.contract.captioning import MotionCaptioner, Sentence
-from motionloom.pipeline.inference.edits.clips import features_for, read_clip
-from motionloom.pipeline.inference.edits.recorded import LEAST_FRAMES
+from motionloom.pipeline.inference.edits.clip_file import LEAST_FRAMES, features_for, read_clip
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 

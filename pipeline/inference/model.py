@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,15 +25,15 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.editing import EditTask
-from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
+from motionloom.models.gpt.drawing import sample_seeds
+from motionloom.pipeline.contract.editing import EditTask, RecordedClip
+from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.clips import read_clip, read_seed_motion, require_clip
-from motionloom.pipeline.inference.edits.edit import edited, require_editor
-from motionloom.pipeline.inference.edits.frames import EditFrames
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
+from motionloom.pipeline.inference.edits.clip_file import read_clip, read_seed_motion, require_clip
+from motionloom.pipeline.inference.edits.edit import finish, require_editor, require_work, word_shares
+from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
@@ -283,36 +283,67 @@ def _warn(unknown: Unknown | str) -> None:
 def edit_clip(
     bundle: Bundle, clip: RecordedClip, task: EditTask, *, samples: int, seed: int, sampling: SamplingConfig
 ) -> list[EditedMotion]:
-    """As `MotionModel.edit`."""
+    """Edit a clip as `MotionModel.edit`."""
     require_seed(seed)
     layout, sampling = bundle.layout, bundle.drawing(sampling)
-    asked = EditFrames.of(task, clip, layout)
-    asked.require_work()
+    frames = edit_frames(task, clip, layout)
+    require_work(frames)
+    editor, generator = require_editor(bundle.generator), bundle.generator
+    # Body and face draw from seeds of their own, so that one does not depend on whether the other is made.
+    seeds = sample_seeds(seed, 2 * samples)
+    shares = word_shares(frames)
+    words = [(_encoded(bundle, bundle.main, text), share) for text, share in shares]
+    columns = layout.part(generator.part)
+    whole = np.zeros((samples, frames.frames, layout.dim), dtype=np.float32)
+    whole[..., columns] = np.stack(editor(frames, words, seeds[:samples], sampling))
+    faces = _faces(bundle, frames, whole, seeds[samples:], sampling)
+    original, texts = original_of(frames, clip.caption), [text for text, _ in shares if text.strip()]
+    prompt, kept = Prompt("; ".join(dict.fromkeys(texts)), task.face), np.all(frames.kept_joints, axis=1)
+    out = []
+    for body, face in zip(whole[..., layout.part("bodyhand")], faces, strict=True):
+        features, joints, report = finish(frames, body)
+        out.append(
+            EditedMotion(
+                prompt, features, joints, face, layout, seed=seed, kept=kept, original=original,
+                report=report, remarks=frames.remarks,
+            )
+        )  # fmt: skip
+    return out
 
-    def encoded(stage: Finished) -> tuple[MotionGenerator, Callable[[str], Conditions]]:
-        generator, encoder = bundle.of(stage), bundle.encoder(stage)
-        modalities = generator.modalities & {"text"}
-        return generator, lambda text: encoder.encode([Prompt(text)], [text], modalities, layout.fps)
 
-    face_stage = bundle.choose_face(sampling.face_model)
-    face = None if face_stage is None else encoded(face_stage)
-    results = edited(asked, *encoded(bundle.main), face, samples=samples, seed=seed, sampling=sampling)
-    shared: dict[str, Any] = {"layout": layout, "seed": seed}
-    original = original_of(asked, clip.caption)
-    words = "; ".join(dict.fromkeys(text for text, _ in asked.shares() if text.strip()))
-    return [
-        EditedMotion(
-            Prompt(words, task.face), one.features, one.joints, one.face, kept=asked.whole,
-            original=original, report=one.report, remarks=asked.remarks, **shared,
-        )
-        for one in results
-    ]  # fmt: skip
-
-
-def original_of(asked: EditFrames, caption: str) -> GeneratedMotion:
+def original_of(frames: EditFrames, caption: str) -> GeneratedMotion:
     """The clip of a task as the model reads it: at its frame rate, on the floor."""
-    own, layout = asked.features[asked.inside], asked.layout
+    features, layout = frames.features[frames.inside], frames.layout
     return GeneratedMotion(
-        Prompt(caption), own[:, layout.part("bodyhand")], asked.to_world(asked.joints), asked.face,
-        kept=np.ones(len(own), dtype=np.bool_), layout=layout,
+        Prompt(caption), features[:, layout.part("bodyhand")], frames.to_world(frames.joints), frames.face,
+        kept=np.ones(len(features), dtype=np.bool_), layout=layout,
     )  # fmt: skip
+
+
+def _encoded(bundle: Bundle, stage: Finished, text: str) -> Conditions:
+    """A text as one row of a stage's conditions; none for an empty one."""
+    if not text.strip():
+        return {}
+    modalities = bundle.of(stage).modalities & {"text"}
+    return bundle.encoder(stage).encode([Prompt(text)], [text], modalities, bundle.layout.fps)
+
+
+def _faces(
+    bundle: Bundle,
+    frames: EditFrames,
+    whole: NDArray[np.float32],
+    seeds: Sequence[int],
+    sampling: SamplingConfig,
+) -> Sequence[NDArray[np.float32] | None]:
+    """The expressions [T, 50] beside motions [n, T, D]; None where the layout or the clip has none."""
+    layout, task, stage = frames.layout, frames.task, bundle.choose_face(sampling.face_model)
+    if not layout.has("face"):
+        return [None] * len(whole)
+    columns = layout.part("face")
+    if bundle.generator.part == "all":
+        return list(whole[..., columns])
+    editor = None if stage is None else bundle.of(stage).capabilities.edit
+    if stage is not None and editor is not None:
+        words = [(_encoded(bundle, stage, task.face or task.caption), np.ones(frames.frames))]
+        return editor(frames, words, seeds, sampling)
+    return [None if frames.face is None else frames.features[:, columns]] * len(whole)

@@ -15,12 +15,7 @@ from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.generation import (
-    MotionGenerator,
-    Prompt,
-    SeededGenerator,
-    StreamingGenerator,
-)
+from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.store.text import TextSource
@@ -119,7 +114,7 @@ def require_used(model: _Chooses, face_captions: Iterable[str] | None, sampling:
     """Refuse settings that were given, and that no generator in use takes notice of."""
     face = model.choose_face(sampling.face_model)
     if face is None and face_captions is not None:
-        raise UserError("this model makes no face: leave the face captions (--face) out")
+        raise UserError("this model makes no face: leave the face captions out")
     body, expression = model.generator, None if face is None else model.of(face)
     used = body.settings | (frozenset() if expression is None else expression.settings)
     given = {name for name in sampling.model_fields_set if getattr(sampling, name) not in (None, {})}
@@ -143,6 +138,7 @@ def frames_of(
         seconds: One length for all, one for each, or None: as long as what the prompt brings, such as music.
     """
     fps, unit, most = generator.layout.fps, generator.unit_frames, generator.max_frames
+    seed_frames, streaming = generator.capabilities.seed_frames, generator.capabilities.streaming
     if seconds is None:
         wanted: list[float | None] = [prompt.seconds for prompt in prompts]
     else:
@@ -160,16 +156,16 @@ def frames_of(
                 f"many seconds"
             )
         units = round(length * fps / unit) if math.isfinite(length) else 0
-        if isinstance(generator, SeededGenerator) and 0 < units * unit <= generator.seed_frames:
+        if 0 < units * unit <= seed_frames:
             raise UserError(
-                f"{length:g} s were asked for, and the first {generator.seed_frames / fps:g} s are what this "
+                f"{length:g} s were asked for, and the first {seed_frames / fps:g} s are what this "
                 f"model goes on from; ask for more"
             )
         if units < 1 or (most is not None and units * unit > most):
             least = unit / fps
             span = f"any length from {least:.1f} s" if most is None else f"{least:.2g} to {most / fps:.1f} s"
-            longer = most is not None and length * fps > most and isinstance(generator, StreamingGenerator)
-            more = "; a stream of it goes on as long as you like: --stream, or MotionModel.stream"
+            longer = most is not None and length * fps > most and streaming is not None
+            more = "; a stream of it goes on as long as you like: --format jsonl, or MotionModel.stream"
             raise UserError(f"{length:g} s is out of reach: this model makes {span}{more if longer else ''}")
         out.append(units * unit)
     return out
@@ -191,9 +187,9 @@ def seeds_of(
     """
     if given is None:
         return None
-    if not isinstance(generator, SeededGenerator):
+    layout, frames = generator.layout, generator.capabilities.seed_frames
+    if not frames:
         raise UserError(f"this model ({generator.method}) goes on from no motion: leave the seed motion out")
-    layout, frames = generator.layout, generator.seed_frames
     if len(given) not in (1, count):
         raise UserError(f"{count} motions but {len(given)} seed motions; give one, or one for each")
     for motion in given:

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from motionloom.datasets.motion.features.joints import JointFlow
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
-from motionloom.pipeline.contract.generation import Prompt, StreamingGenerator
+from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import Finished
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.generators.standing import Standing
+from motionloom.pipeline.inference.generators.idle_pose import IdleBlend
 from motionloom.pipeline.inference.motion import MotionChunk
 from motionloom.pipeline.inference.requests import (
     require_driven,
@@ -87,7 +87,7 @@ class MotionStream(Iterator[MotionChunk]):
         self._body = _Maker(bundle, bundle.main, seeds[0], sampling, config)
         face = _streaming_face(bundle, sampling)
         self._face = None if face is None else _Maker(bundle, face, seeds[1], sampling, config)
-        self._standing = Standing(bundle.layout, self._body.generator.part)
+        self._idle = IdleBlend(bundle.layout, self._body.generator.part)
         self._joints = JointFlow(bundle.layout)
         self._least = config.chunk_frames
         self._bounds: deque[tuple[int, Prompt]] = deque()
@@ -131,7 +131,7 @@ class MotionStream(Iterator[MotionChunk]):
             self._bounds.popleft()
         if len(self._bounds) > 1:
             count = min(count, self._bounds[1][0] - self._given)
-        body = self._standing(self._body.take(count), self._bounds[0][1].stands)
+        body = self._idle(self._body.take(count), self._bounds[0][1].idle)
         features, with_it = split_columns(body, self._body.generator, self.layout)
         face = with_it if self._face is None else self._face.take(count)
         chunk = MotionChunk(
@@ -210,14 +210,16 @@ class _Maker:
         self, bundle: Bundle, stage: Finished, seed: int, sampling: SamplingConfig, config: StreamConfig
     ) -> None:
         generator = bundle.of(stage)
-        if not isinstance(generator, StreamingGenerator):
+        streaming = generator.capabilities.streaming
+        if streaming is None:
             raise UserError(
                 f"this model ({generator.method}) makes a motion as a whole; streams need a GPT or a UDE"
             )
         self.generator = generator
+        self._stream, self._per_group = next(iter(streaming.group_tokens.items()))
         self._encoder, self._fps = bundle.encoder(stage), bundle.layout.fps
-        self._flow = generator.flow(seed, sampling, config)
-        self._decoder = generator.decoding(seed, sampling, config)
+        self._flow = streaming.tokens(seed, sampling, config)
+        self._decoder = streaming.frames(seed, sampling, config)
         self._frames: NDArray[np.float32] = np.zeros(
             (0, len(generator.layout.part(generator.part))), np.float32
         )
@@ -234,8 +236,7 @@ class _Maker:
 
     def draw(self, left: int | None) -> None:
         codes = self._flow.draw(left)
-        stream, per_group = next(iter(self.generator.group_tokens.items()))
-        self.groups += codes[stream].shape[1] // per_group
+        self.groups += codes[self._stream].shape[1] // self._per_group
         made = self._decoder.push(codes)
         if made is not None:
             self._add(made)
@@ -257,7 +258,7 @@ def _streaming_face(bundle: Bundle, sampling: SamplingConfig) -> Finished | None
     """The face generator that was asked for, or the first that can stream; None where there is none."""
     if sampling.face_model is not None:
         return bundle.choose_face(sampling.face_model)
-    found = (stage for stage in bundle.faces.values() if isinstance(bundle.of(stage), StreamingGenerator))
+    found = (stage for stage in bundle.faces.values() if bundle.of(stage).capabilities.streaming)
     return next(found, None)
 
 

@@ -1,4 +1,4 @@
-"""`motionloom generate`: motions from captions, music or a script, written to files, or streamed as lines."""
+"""`motionloom generate` and `motionloom edit`: motions written to files, or streamed as JSON lines."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console
 
@@ -23,7 +23,9 @@ from motionloom.pipeline.runs.resolve import nearest
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
+    from motionloom.pipeline.contract.editing import EditTask
     from motionloom.pipeline.inference.bundle import Bundle
+    from motionloom.pipeline.inference.motion import GeneratedMotion
     from motionloom.pipeline.inference.stream import MotionStream
 
 STDIN = "-"
@@ -31,7 +33,7 @@ STDIN = "-"
 
 
 @contextmanager
-def film_progress(console: Console) -> Iterator[Callable[[int, int], None]]:
+def _film_progress(console: Console) -> Iterator[Callable[[int, int], None]]:
     """A bar of frames done, which appears with a film's first one; give what it yields to `write_motions`."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -52,17 +54,25 @@ def _require_driver(
     if not captions and not audio and script is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
     if script is not None and (captions or audio or seconds is not None or face):
-        raise UserError("--script says everything: leave captions, --face, --audio and --seconds out")
+        raise UserError(
+            f"{script}: a script says everything: leave captions, face, --audio and --seconds out"
+        )
 
 
 def _open(folder: Path, device: str, console: Console) -> Bundle:
     from motionloom.pipeline.inference.bundle import Bundle
-    from motionloom.pipeline.inference.shipped_models import say_model
 
     bundle = Bundle.open(folder, choose_device(device))
+    _print_model(folder, console)
+    return bundle
+
+
+def _print_model(folder: Path, console: Console) -> None:
+    """Say which model is taken, where a name could mean a folder or one that comes with the package."""
+    from motionloom.pipeline.inference.shipped_models import say_model
+
     if (taken := say_model(folder)) is not None:
         console.print(taken, markup=False, highlight=False, soft_wrap=True)
-    return bundle
 
 
 def _print_note(console: Console, note: object) -> None:
@@ -107,8 +117,7 @@ def generate_motions(
     of `FigureOptions`.
     """
     from motionloom.datasets.audio.sound import Excerpt
-    from motionloom.pipeline.contract.generation import SeededGenerator
-    from motionloom.pipeline.inference.outputs import page_note, page_title, write_motions
+    from motionloom.pipeline.inference.outputs import page_note, page_title
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
 
@@ -116,7 +125,7 @@ def generate_motions(
     if samples < 1:
         raise UserError(f"--samples {samples}: take 1 or more")
     if script is not None and seed_motion is not None:
-        raise UserError("a script's motion goes on from no other: leave --seed-motion out")
+        raise UserError("a script's motion goes on from no other: leave seed_motion out")
     wanted = formats_of(formats)
     # All that needs no model is checked before one is opened.
     require_words(caption_list(captions))
@@ -125,9 +134,9 @@ def generate_motions(
     sampling = sampling or SamplingConfig()
     posing = FigureOptions.parse(figure or {}, "figure")
     if posing.body_model is not None and "smplx" not in wanted:
-        raise UserError("--body-model is what --format smplx is made for: name that format too")
+        raise UserError("body_model is what --format smplx is made for: name that format too")
     if posing.arkit_bases is not None and "arkit" not in wanted:
-        raise UserError("--arkit-bases is what --format arkit is made by: name that format too")
+        raise UserError("arkit_bases is what --format arkit is made by: name that format too")
     segments = None if script is None else Script.read(script).open(script.parent, str(script))
     sounds = [read_music(path) for path in audio]
     with threads_for(samples * max(len(captions), len(audio), 1)):
@@ -138,7 +147,7 @@ def generate_motions(
         else:
             begun = None
             if seed_motion is not None:
-                from motionloom.pipeline.inference.edits.clips import read_seed_motion
+                from motionloom.pipeline.inference.edits.clip_file import read_seed_motion
 
                 begun = [read_seed_motion(seed_motion, bundle.layout)]
             motions = bundle.generate(
@@ -151,11 +160,11 @@ def generate_motions(
                 seed_motions=begun,
                 strict=True,
             )
-            if seed_motion is None and isinstance(bundle.generator, SeededGenerator):
-                start = bundle.generator.seed_frames / bundle.layout.fps
+            if seed_motion is None and (seed_frames := bundle.generator.capabilities.seed_frames):
+                start = seed_frames / bundle.layout.fps
                 _print_note(
                     aside,
-                    f"the first {start:.2g} s are of a training dance; --seed-motion takes a clip of yours",
+                    f"the first {start:.2g} s are of a training dance; --set seed_motion=FILE takes yours",
                 )
         said = captions if segments is None else [segment.prompt.text for segment in segments]
         notes = [
@@ -170,25 +179,88 @@ def generate_motions(
         title = page_title([motion.caption for motion in motions], [path.name for path in audio], script)
         note = page_note(len(motions), folder.resolve().name, seed, notes)
         named = [Excerpt.named(path).path.stem for path in audio for _ in range(samples)]
-        with film_progress(aside) as progress:
-            paths = write_motions(
-                out,
-                motions,
-                wanted,
-                title=title,
-                note=note,
-                seed=seed,
-                names=None if captions or not named else named,
-                figure=posing,
-                say=lambda line: aside.print(line, soft_wrap=True, markup=False),
-                progress=progress,
-            )
-        for path in paths:
-            console.print(str(path), markup=False, soft_wrap=True)
-        if "html" in wanted:
-            place = (out / "index.html").resolve()
-            aside.print(f"watch it in a browser: {place}", markup=False, highlight=False, soft_wrap=True)
-        return paths
+        return _write(
+            out,
+            motions,
+            wanted,
+            title=title,
+            note=note,
+            seed=seed,
+            names=None if captions or not named else named,
+            figure=posing,
+            say=lambda line: aside.print(line, soft_wrap=True, markup=False),
+            console=console,
+            aside=aside,
+        )
+
+
+def edit_clip_file(
+    folder: Path,
+    clip: Path,
+    task: EditTask,
+    *,
+    samples: int,
+    out: Path,
+    formats: str | None,
+    seed: int,
+    sampling: SamplingConfig,
+    figure: Mapping[str, object],
+    device: str,
+    console: Console,
+) -> list[Path]:
+    """Edit as `MotionModel.edit` and write, the clip first; returns the paths. `formats` as `--format`."""
+    from motionloom.pipeline.inference.model import MotionModel
+    from motionloom.pipeline.inference.outputs import page_note
+    from motionloom.pipeline.inference.shown import FigureOptions
+
+    wanted = formats_of(formats)
+    require_folder(out)
+    posing = FigureOptions.parse(figure, "figure")
+    aside = make_console(aside=True)  # standard output is the list of files
+    model = MotionModel(folder, device)
+    _print_model(folder, aside)
+    motions = model.edit(clip, task, samples=samples, seed=seed, sampling=sampling)
+    for remark in motions[0].remarks:
+        _print_note(aside, remark)
+    for number, motion in enumerate(motions, start=1):
+        for line in motion.report.lines():
+            prefix = f"{number}: " if samples > 1 else ""
+            aside.print(f"{prefix}{line}", markup=False, highlight=False, soft_wrap=True)
+    return _write(
+        out,
+        [motions[0].original, *motions],
+        wanted,
+        title=f"{clip.name}, edited",
+        note=page_note(len(motions), folder.resolve().name, seed, motions[0].remarks),
+        seed=seed,
+        names=[clip.stem, *[f"{clip.stem} edited" for _ in motions]],
+        labels=["the clip", *["edited" for _ in motions]],
+        figure=posing,
+        console=console,
+        aside=aside,
+    )
+
+
+def _write(
+    out: Path,
+    motions: Sequence[GeneratedMotion],
+    formats: Sequence[str],
+    *,
+    console: Console,
+    aside: Console,
+    **options: Any,
+) -> list[Path]:
+    """Write motions as `write_motions` does, list the files on `console`, and say where the page is."""
+    from motionloom.pipeline.inference.outputs import write_motions
+
+    with _film_progress(aside) as progress:
+        paths = write_motions(out, motions, formats, progress=progress, **options)
+    for path in paths:
+        console.print(str(path), markup=False, soft_wrap=True)
+    if "html" in formats:
+        place = (out / "index.html").resolve()
+        aside.print(f"watch it in a browser: {place}", markup=False, highlight=False, soft_wrap=True)
+    return paths
 
 
 def stream_motion(
@@ -221,10 +293,10 @@ def stream_motion(
     if len(captions) > 1 and (seconds is None or STDIN in captions or audio or face):
         raise UserError(
             "a stream of several captions makes one motion: give --seconds, the length of each, and neither "
-            "--audio nor --face; with --script each has its own"
+            "--audio nor face; in a script each has its own"
         )
     if len(audio) > 1 or (face and len(face) > 1):
-        raise UserError("a stream makes one motion: give one --audio and one --face")
+        raise UserError("a stream makes one motion: give one --audio and one face")
     require_seed(seed)
     out = None if out is not None and str(out) == STDIN else out
     if out is not None:

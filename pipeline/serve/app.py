@@ -23,6 +23,7 @@ from starlette.types import ASGIApp
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.editing import MAX_HEIGHT, MAX_SPEED
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, change, received, why_not
@@ -105,7 +106,12 @@ class Site:
                 "joint_names": list(skeleton.joints),
                 "parents": [int(parent) for parent in skeleton.parents],
                 "settings": sorted(bundle.generator.settings),
-                "edit": {"possible": why is None, "why": why or ""},
+                "edit": {
+                    "possible": why is None,
+                    "why": why or "",
+                    "max_speed": MAX_SPEED,
+                    "max_height": MAX_HEIGHT,
+                },
                 "sampling": bundle.recommended.model_dump(mode="json", exclude_unset=True),
                 "limits": {
                     "seconds": longest,

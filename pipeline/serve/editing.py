@@ -14,9 +14,9 @@ from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.contract.editing import EditingGenerator, EditTask
-from motionloom.pipeline.inference.edits.clips import read_clip
-from motionloom.pipeline.inference.edits.frames import EditFrames
+from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.inference.edits.clip_file import read_clip
+from motionloom.pipeline.inference.edits.frames import edit_frames
 from motionloom.pipeline.inference.model import MotionModel, original_of
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of
@@ -81,7 +81,7 @@ class ChangeRequest(Config):
 
 def why_not(model: MotionModel) -> str | None:
     """Why a model edits no clips, and which one does; None where it does."""
-    if isinstance(model.bundle.generator, EditingGenerator):
+    if model.bundle.generator.capabilities.edit is not None:
         return None
     other = f"; motionloom serve {_EDITOR} changes them" if _EDITOR in shipped_models() else ""
     return f"this model makes motions and changes none{other}"
@@ -112,9 +112,9 @@ class Clips:
             raise UserError(
                 f"{CLIP} lasts {clip.seconds:.0f} s; this server takes at most {self._config.max_seconds:g} s"
             )
-        seen = EditFrames.of(EditTask(), clip, self._model.bundle.layout)
-        motion = original_of(seen, clip.caption)
-        return self._kept.keep(_name(data), motion), motion, list(seen.remarks)
+        frames = edit_frames(EditTask(), clip, self._model.bundle.layout)
+        motion = original_of(frames, clip.caption)
+        return self._kept.keep(_name(data), motion), motion, list(frames.remarks)
 
     def get(self, name: str) -> GeneratedMotion:
         """The clip of a name; `UserError` where it is not here any more."""

@@ -19,7 +19,6 @@ from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
@@ -178,7 +177,7 @@ def motion_of(
 ) -> GeneratedMotion:
     """The motion that is asked for."""
     seconds = asked.seconds
-    if seconds is None and isinstance(model.bundle.generator, WholeMotion):
+    if seconds is None and sound is None and not model.bundle.generator.decides_length:
         seconds = min(_USUAL, limits.max_seconds)
     if sound is not None:
         longest = min(sound.seconds, limits.max_seconds)

@@ -14,7 +14,6 @@ from rich.console import Console
 
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.generation import StreamingGenerator
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import model_folder, say_model
 from motionloom.pipeline.serve.app import Site
@@ -108,7 +107,7 @@ def warm(model: MotionModel) -> None:
     generator = model.bundle.generator
     if "text" in generator.modalities:
         caption = (model.examples(1) or ["a person stands"])[0]  # a known one: a note here would be nobody's
-        if isinstance(generator, StreamingGenerator):
+        if generator.capabilities.streaming is not None:
             next(model.stream(caption, seconds=1.0))
         else:
             model.generate([caption], seconds=1.0)

@@ -17,7 +17,7 @@ from motionloom.datasets.motion.features.smpl75 import fit_smpl75
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.pipeline.baselines.bailando.codes import DanceVq
 from motionloom.pipeline.baselines.bailando.network import CrossGpt
-from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.stages.networks.dances import music_of
 from motionloom.pipeline.store.networks import device_of
 
@@ -49,8 +49,8 @@ class BailandoGenerator:
         return self.vq.config.code_frames
 
     @property
-    def seed_frames(self) -> int:
-        return self.unit_frames
+    def capabilities(self) -> Capabilities:
+        return Capabilities(seed_frames=self.unit_frames, note=self.note)
 
     @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:

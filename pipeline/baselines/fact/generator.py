@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.pipeline.baselines.fact.network import Fact
-from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.stages.networks.dances import music_of
 from motionloom.pipeline.store.networks import device_of
 
@@ -38,8 +38,8 @@ class FactGenerator:
         return {"audio": self.given.get("audio")}
 
     @property
-    def seed_frames(self) -> int:
-        return self.net.config.motion_frames
+    def capabilities(self) -> Capabilities:
+        return Capabilities(seed_frames=self.net.config.motion_frames)
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """Features in their own units; without seed motions each goes on from a kept one, by its seed."""

@@ -12,7 +12,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.schedule import Sampler, by_length
 from motionloom.models.layers.transformer import length_mask
 from motionloom.pipeline.baselines.mld.network import LatentDenoiser, LoadedMotionVae
-from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.store.networks import device_of
@@ -68,6 +68,10 @@ class LatentMotion(WholeMotion):
     def max_frames(self) -> int | None:
         """Return the longest motion of the decoder's training."""
         return self.vae.max_frames
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(denoising=self.denoising)
 
     def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
         """As asked for, or else DDIM in 50 steps, as published, or the training's where those are fewer."""

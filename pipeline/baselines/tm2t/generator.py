@@ -17,7 +17,7 @@ from motionloom.models.gpt.tokens import interleave
 from motionloom.pipeline.baselines.tm2t.network import END, START, Captioner, Reading, Vocabulary
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, draw_tokens
 from motionloom.pipeline.contract.captioning import Sentence
-from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.inference.generators.of_tokens import OfTokens
 from motionloom.pipeline.store.networks import TrainedTokenizer, device_of
 from motionloom.pipeline.store.tokens import PresentTokens, present_table
@@ -163,6 +163,7 @@ class Seq2SeqGenerator(OfTokens):
     method = "seq2seq"
     modalities = frozenset({"text"})
     settings = frozenset({"temperature", "top_k", "top_p"})
+    capabilities = Capabilities()
 
     @property
     def tokenizer(self) -> TrainedTokenizer:

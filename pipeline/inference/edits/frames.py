@@ -1,55 +1,53 @@
-"""A task in frames: what is known of the result's frames, and what is asked of them.
+"""`EditFrames`: a task in frames, as generators take it.
 
-All of it is seen from the clip's first frame: its root above the origin, facing +Z, the floor at height 0.
 Clips of other proportions than the layout's figure are posed on that figure for the model, and what it makes
 is put back on the clip's bones.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.torch_joints import torch_way
-from motionloom.datasets.motion.figure_parts import (
-    LOWER,
-    PIECES,
-    piece_columns,
-    piece_joints,
-    pieces_of,
-    step_columns,
-)
+from motionloom.datasets.motion.figure_parts import LOWER, PIECES, piece_joints, pieces_of, step_columns
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.editing import FASTEST, EditTask, FramePin, KnownWay
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
+from motionloom.models.diffusion.observed import Places
+from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask, RecordedClip
+from motionloom.pipeline.contract.sampling import SamplingConfig
 
 SAME_BONES = 0.05
-"""Mean difference of bone lengths up to which a clip's figure counts as the layout's."""
-
-WORDS_EASE = 0.3
-"""Seconds in which one stretch of words takes over from another."""
+"""Mean difference of bone lengths up to which a clip's figure counts as the layout's [ours]."""
 
 
 @dataclass(frozen=True)
-class Way:
-    """The root's way in every frame of the result, in metres and radians."""
+class RootPath:
+    """Where the root is in each of T frames, on the floor."""
 
     heading: NDArray[np.float64]
+    """Radians [T]."""
     place: NDArray[np.complex128]
-    """z + i x."""
+    """Metres [T], z + i x."""
 
 
 @dataclass(frozen=True)
 class EditFrames:
-    """T frames of a result, n of them the clip's."""
+    """A task in frames: T frames of a result, n of them the clip's.
+
+    All positions are seen from the clip's first frame: its root above the origin, facing +Z, the floor at
+    height 0. `features`, `places` and `model_pins` are on the model's figure, the rest in the clip's size.
+    """
 
     task: EditTask
     layout: MotionLayout
@@ -58,27 +56,29 @@ class EditFrames:
     joints: NDArray[np.float64]
     """The clip's [n, N, 3] on its own bones."""
     face: NDArray[np.float32] | None
-    """[n, 50]."""
-    clip_way: Way
+    """The clip's [n, 50]."""
+    clip_root: RootPath
     """The clip's, n frames."""
     features: NDArray[np.float32]
-    """[T, D]: the clip's on the model's figure, held before and after it."""
+    """[T, D]: the clip's, held before and after it."""
     pieces: NDArray[np.bool_]
-    """What is kept [T, P]."""
-    anchor: Way
-    """Of one frame: the one that the model's way is seen from."""
-    way: KnownWay
-    """On the model's figure."""
+    """Which `figure_parts.PIECES` are kept [T, P]."""
+    anchor: RootPath
+    """Of one frame: the one that `places` and `model_pins` are seen from."""
+    places: Places
+    """What is known of the root, one row."""
     path: NDArray[np.complex128]
     """Where the root must be [T], z + i x; NaN elsewhere."""
     pins: dict[tuple[int, int], tuple[float, float, float]]
+    """Where joints must be, by frame and joint."""
     scale: float
     """Size of the model's figure in that of the clip's."""
     lift: float
     """By how much the model's figure, in the clip's size, stands too low for the clip's feet, in metres."""
     origin: complex
-    """Where the clip's first root stands in the clip's world, z + i x, and how it is turned there."""
+    """Where the clip's first root is in the clip's world, z + i x."""
     turn: float
+    """The heading of the clip's first root there, in radians."""
     remarks: tuple[str, ...]
 
     @property
@@ -101,111 +101,112 @@ class EditFrames:
         kept: NDArray[np.bool_] = self.pieces[:, piece_joints(self.layout)] & self.rooted[:, None]
         return kept
 
-    @property
-    def whole(self) -> NDArray[np.bool_]:
-        """Frames all of whose joints are kept [T]."""
-        whole: NDArray[np.bool_] = np.all(self.kept_joints, axis=1)
-        return whole
-
     def to_world(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
         """Joints [T, N, 3] in the clip's world, the floor at height 0."""
         plane = ground(joints) * np.exp(1j * self.turn) + self.origin
         return np.stack([plane.imag, joints[..., 1], plane.real], axis=-1)
 
-    def require_work(self) -> None:
-        """Refuse a task that leaves nothing to make, and one that takes nothing from the clip."""
-        there = np.isin(np.arange(len(PIECES)), piece_columns(self.layout))
-        if self.pieces[:, there].all():
-            raise UserError(
-                "everything of the clip is kept, so there is nothing to make: keep less of it, or give "
-                "seconds or lead for more"
-            )
-        if not (self.pieces.any() or self.pins or np.isfinite(self.path).any() or self.task.likeness):
-            raise UserError(
-                "nothing of the clip is kept and nothing else is asked: say what to keep, draw a path, pin "
-                "a joint, or set likeness"
-            )
-
-    @staticmethod
-    def of(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> EditFrames:
-        """`UserError` for a task that cannot be done with the clip."""
-        remarks = []
-        if abs(clip.fps - layout.fps) > 1e-6:
-            remarks.append(f"read at {clip.fps:g} frames/s, edited at the model's {layout.fps:g}")
-        joints = resample(clip.joints, clip.fps, layout.fps)
-        face = None if clip.face is None else resample(clip.face, clip.fps, layout.fps)
-        hands = layout.num_joints > BODY_JOINTS
-        if not hands:
-            joints = joints[:, :BODY_JOINTS]
-        elif not clip.has_hands:
-            joints = with_resting_hands(joints)
-            remarks.append("the clip has no hands, so the model makes them")
-        origin, turned = complex(ground(joints[0, 0])), float(facing(joints[:1])[0])
-        own = canonicalize(joints)
-        off = _differs(own, layout.skeleton)
-        work, scale, lift = own, 1.0, 0.0
-        if off > SAME_BONES:
-            posed = retarget(own, layout.skeleton)
-            work = canonicalize(posed)
-            scale = float(posed[0, 0, 1] / own[0, 0, 1])
-            lift = float(posed[0, 0, 1] - work[0, 0, 1]) / scale
-            remarks.append(
-                f"its bones differ from the model's by {off:.0%}: the model moves its own figure, and what "
-                f"it makes is put back on the clip's bones"
-            )
-        features = encode(work, layout, face if layout.has("face") else None)
-        own = own[: len(features)]
-        face = None if face is None else face[: len(features)]
-        if layout.has("face") and face is None:
-            remarks.append("the clip has no face, so the model makes it")
-        has = np.array([True] * 4 + [clip.has_hands or not hands] * 2 + [face is not None])
-        first, clip_end = round(task.lead * layout.fps), len(own)
-        total = first + (clip_end if task.seconds is None else max(1, round(task.seconds * layout.fps)))
-        own = own[: total - first]
-        clip_way = _way_of(features[: len(own)], layout, scale)
-        maker = _Frames(task, layout, first, total, clip.seconds)
-        pieces = maker.pieces(len(own)) & has
-        path = maker.path(origin, turned)
-        maker.require_free(path, pieces[:, LOWER], clip_way)
-        pins = maker.pins(pieces, origin, turned)
-        way, anchor = _known_way(clip_way, first, pieces[:, LOWER], path, scale)
-        return EditFrames(
-            task, layout, first, own, face if face is None else np.asarray(face[: len(own)], np.float32),
-            clip_way, _held(features[: len(own)], layout, first, total), pieces, anchor, way, path, pins,
-            scale, lift, origin, turned, tuple(remarks),
-        )  # fmt: skip
-
-    def model_pins(self) -> list[FramePin]:
-        """The pins on the model's figure, seen from the anchor."""
+    @property
+    def model_pins(self) -> list[tuple[float, float, float]]:
+        """The positions of `pins` on the model's figure, seen from the anchor."""
         out = []
-        for (frame, joint), (x, y, z) in self.pins.items():
+        for x, y, z in self.pins.values():
             away = (complex(z, x) - self.anchor.place[0]) * np.exp(-1j * self.anchor.heading[0]) * self.scale
-            height = (y - self.lift) * self.scale
-            out.append(FramePin(frame, joint, (float(away.imag), height, float(away.real))))
+            out.append((float(away.imag), (y - self.lift) * self.scale, float(away.real)))
         return out
 
-    def shares(self) -> list[tuple[str, NDArray[np.float64]]]:
-        """Each stretch of words and its share of every frame [T]; the shares of a frame sum to 1."""
-        fps, frames = self.layout.fps, np.arange(self.frames)
-        ease = max(1.0, WORDS_EASE * fps)
-        out = []
-        for said in self.task.words:
-            start, end = ((at * fps) + self.lead for at in (said.start, said.end))
-            out.append((said.text, np.clip(np.minimum(frames - start, end - frames) / ease + 0.5, 0.0, 1.0)))
-        rest = 1 - sum((share for _, share in out), np.zeros(self.frames))
-        out.append((self.task.caption, np.clip(rest, 0.0, 1.0)))
-        total = np.sum([share for _, share in out], axis=0)
-        return [(text, share / total) for text, share in out if share.any()]
+
+class Editor(Protocol):
+    """The capability of a generator to fill in what a task leaves free."""
+
+    def __call__(
+        self,
+        frames: EditFrames,
+        words: Sequence[tuple[Conditions, NDArray[np.float64]]],
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+    ) -> list[NDArray[np.float32]]:
+        """Motions [T, C] of the generator's part in their own units, one a seed; what is kept in them is so
+        to the bit, and the rest near what is asked for.
+
+        `words` are encoded, one row each and empty for no words, each with its share of every frame [T];
+        those of all sum to 1 in each frame.
+        """
 
 
-class _Frames:
+def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> EditFrames:
+    """The task in frames of a layout. `UserError` where it cannot be done with the clip."""
+    remarks = []
+    if abs(clip.fps - layout.fps) > 1e-6:
+        remarks.append(f"read at {clip.fps:g} frames/s, edited at the model's {layout.fps:g}")
+    joints = resample(clip.joints, clip.fps, layout.fps)
+    face = None if clip.face is None else resample(clip.face, clip.fps, layout.fps)
+    hands = layout.num_joints > BODY_JOINTS
+    if not hands:
+        joints = joints[:, :BODY_JOINTS]
+    elif not clip.has_hands:
+        joints = with_resting_hands(joints)
+        remarks.append("the clip has no hands, so the model makes them")
+    origin, turn = complex(ground(joints[0, 0])), float(facing(joints[:1])[0])
+    own = canonicalize(joints)
+    difference = _bone_difference(own, layout.skeleton)
+    posed, scale, lift = own, 1.0, 0.0
+    if difference > SAME_BONES:
+        # The features must be of the figure that the model knows; `scale` and `lift` lead back to the clip's.
+        retargeted = retarget(own, layout.skeleton)
+        posed = canonicalize(retargeted)
+        scale = float(retargeted[0, 0, 1] / own[0, 0, 1])
+        lift = float(retargeted[0, 0, 1] - posed[0, 0, 1]) / scale
+        remarks.append(
+            f"its bones differ from the model's by {difference:.0%}: the model moves its own figure, and "
+            f"what it makes is put back on the clip's bones"
+        )
+    features = encode(posed, layout, face if layout.has("face") else None)
+    # Features of steps have one frame less than the joints.
+    own = own[: len(features)]
+    face = None if face is None else face[: len(features)]
+    if layout.has("face") and face is None:
+        remarks.append("the clip has no face, so the model makes it")
+    lead, clip_frames = round(task.lead * layout.fps), len(own)
+    total = lead + (clip_frames if task.seconds is None else max(1, round(task.seconds * layout.fps)))
+    # A result that is shorter than the clip takes no notice of what the clip does later.
+    own = own[: total - lead]
+    features = features[: len(own)]
+    clip_root = _root_path(features, layout, scale)
+    timed = _TimedTask(task, layout, lead, total)
+    # What the clip does not have cannot be kept: fingers and face are made where it has none.
+    has = np.array([True] * 4 + [clip.has_hands or not hands] * 2 + [face is not None])
+    pieces = timed.pieces(len(own)) & has
+    path = timed.path(origin, turn)
+    timed.require_free(path, pieces[:, LOWER], clip_root)
+    pins = timed.pins(pieces, origin, turn)
+    places, anchor = _known_places(clip_root, lead, pieces[:, LOWER], path, scale)
+    return EditFrames(
+        task=task,
+        layout=layout,
+        lead=lead,
+        joints=own,
+        face=None if face is None else np.asarray(face[: len(own)], np.float32),
+        clip_root=clip_root,
+        features=_held(features, layout, lead, total),
+        pieces=pieces,
+        anchor=anchor,
+        places=places,
+        path=path,
+        pins=pins,
+        scale=scale,
+        lift=lift,
+        origin=origin,
+        turn=turn,
+        remarks=tuple(remarks),
+    )
+
+
+class _TimedTask:
     """The times of a task as frames of the result."""
 
-    def __init__(
-        self, task: EditTask, layout: MotionLayout, lead: int, frames: int, clip_seconds: float
-    ) -> None:
+    def __init__(self, task: EditTask, layout: MotionLayout, lead: int, frames: int) -> None:
         self.task, self.layout, self.lead, self.frames = task, layout, lead, frames
-        self.clip_seconds = clip_seconds
 
     def at(self, what: str, seconds: float) -> int:
         """The frame at a time, which the result must have."""
@@ -231,12 +232,12 @@ class _Frames:
             out[start:end] |= pieces_of(kept.parts, kept.but)
         if not task.keep and (task.words or self.frames > clip_frames):
             out[self.lead : clip_end] = True
-            for said in task.words:
-                start, end = (max(0, round(time * fps) + self.lead) for time in (said.start, said.end))
+            for words in task.words:
+                start, end = (max(0, round(time * fps) + self.lead) for time in (words.start, words.end))
                 out[start:end] = False
         return out
 
-    def path(self, origin: complex, turned: float) -> NDArray[np.complex128]:
+    def path(self, origin: complex, turn: float) -> NDArray[np.complex128]:
         """Where the root must be [T]; NaN elsewhere."""
         from scipy.interpolate import PchipInterpolator
 
@@ -245,7 +246,7 @@ class _Frames:
             return out
         frames = [self.at("path", point.at) for point in self.task.path]
         places = np.array([complex(point.z, point.x) for point in self.task.path])
-        places = (places - origin) * np.exp(-1j * turned)
+        places = (places - origin) * np.exp(-1j * turn)
         if len(set(frames)) < len(frames):
             raise UserError(f"path: two of its points are in one frame of {1 / self.layout.fps:.3g} s")
         if len(frames) == 1:
@@ -256,7 +257,7 @@ class _Frames:
         out[inside] += 1j * PchipInterpolator(frames, places.imag)(inside)
         return out
 
-    def require_free(self, path: NDArray[np.complex128], rooted: NDArray[np.bool_], way: Way) -> None:
+    def require_free(self, path: NDArray[np.complex128], rooted: NDArray[np.bool_], clip: RootPath) -> None:
         """Refuse a path where the root is kept, or that nobody gets to from where it is kept."""
         asked = np.flatnonzero(~np.isnan(path))
         if not len(asked):
@@ -267,16 +268,16 @@ class _Frames:
         for frame in np.flatnonzero(rooted):
             near = asked[np.abs(asked - frame).argmin()]
             seconds = abs(int(near) - int(frame)) / self.layout.fps
-            speed = abs(path[near] - way.place[frame - self.lead]) / seconds
-            if speed > FASTEST:
+            speed = abs(path[near] - clip.place[frame - self.lead]) / seconds
+            if speed > MAX_SPEED:
                 raise UserError(
                     f"path: {speed:.0f} m/s between where the root is kept and "
                     f"{(int(near) - self.lead) / self.layout.fps:g} s; nobody runs faster than "
-                    f"{FASTEST:g} m/s"
+                    f"{MAX_SPEED:g} m/s"
                 )
 
     def pins(
-        self, pieces: NDArray[np.bool_], origin: complex, turned: float
+        self, pieces: NDArray[np.bool_], origin: complex, turn: float
     ) -> dict[tuple[int, int], tuple[float, float, float]]:
         """Pinned joints by frame and joint."""
         out = {}
@@ -292,56 +293,60 @@ class _Frames:
             if (frame, joint) in out:
                 raise UserError(f"pins: {pin.joint} is pinned twice in the frame at {pin.at:g} s")
             x, y, z = pin.position
-            place = (complex(z, x) - origin) * np.exp(-1j * turned)
+            place = (complex(z, x) - origin) * np.exp(-1j * turn)
             out[frame, joint] = (float(place.imag), y, float(place.real))
         return out
 
 
-def _differs(joints: NDArray[np.float64], skeleton: Skeleton) -> float:
+def _bone_difference(joints: NDArray[np.float64], skeleton: Skeleton) -> float:
     """Mean difference of the body's bone lengths from a skeleton's, as a share of these."""
     own = np.linalg.norm(skeleton.with_lengths_of(joints).offsets, axis=-1)[1:BODY_JOINTS]
     usual = np.linalg.norm(skeleton.offsets, axis=-1)[1:BODY_JOINTS]
     return float(np.abs(own - usual).sum() / usual.sum())
 
 
-def _way_of(features: NDArray[np.float32], layout: MotionLayout, scale: float) -> Way:
-    """The way that features [T, D] go, on the clip's own size."""
+def _root_path(features: NDArray[np.float32], layout: MotionLayout, scale: float) -> RootPath:
+    """The path of the root in features [T, D], in the clip's size."""
     heading, x, z = (one.numpy() for one in torch_way(torch.from_numpy(features).double(), layout))
-    return Way(heading, (z + 1j * x) / scale)
+    return RootPath(heading, (z + 1j * x) / scale)
 
 
-def _known_way(
-    clip: Way, lead: int, rooted: NDArray[np.bool_], path: NDArray[np.complex128], scale: float
-) -> tuple[KnownWay, Way]:
-    """What is known of the way, on the model's figure and seen from an anchor; and that anchor, on the
-    clip's.
+def _known_places(
+    clip: RootPath, lead: int, rooted: NDArray[np.bool_], path: NDArray[np.complex128], scale: float
+) -> tuple[Places, RootPath]:
+    """What is known of the root, on the model's figure and seen from an anchor; and that anchor's frame, in
+    the clip's size.
 
     The anchor is the first frame whose root is kept. Without one it is where the path begins, facing along
     it, and without a path the clip's first frame.
     """
-    frames = len(rooted)
-    heading, place = np.zeros(frames), np.zeros(frames, dtype=np.complex128)
+    heading, place = np.zeros(len(rooted)), np.zeros(len(rooted), dtype=np.complex128)
     inside = slice(lead, lead + len(clip.heading))
     heading[inside], place[inside] = clip.heading, clip.place
-    asked = ~np.isnan(path)
-    place[asked] = path[asked]
-    turned, stood = rooted.copy(), rooted | asked
+    on_path = ~np.isnan(path)
+    place[on_path] = path[on_path]
+    heading_known, place_known = rooted.copy(), rooted | on_path
     if rooted.any():
         first = int(np.flatnonzero(rooted)[0])
-    elif asked.any():
-        points = np.flatnonzero(asked)
+    elif on_path.any():
+        points = np.flatnonzero(on_path)
         first = int(points[0])
         away = path[points] - path[first]
+        # Nearer points say little of a direction: a step to the side is a few decimetres.
         far = np.flatnonzero(np.abs(away) > 0.5)
         heading[first] = np.angle(away[far[0] if len(far) else -1]) if np.abs(away[-1]) > 0 else 0.0
-        turned[first] = True
+        heading_known[first] = True
     else:
         first = lead
-        turned[first] = stood[first] = True
-    anchor = Way(heading[first : first + 1], place[first : first + 1])
+        heading_known[first] = place_known[first] = True
+    anchor = RootPath(heading[first : first + 1], place[first : first + 1])
     seen = (place - anchor.place) * np.exp(-1j * anchor.heading) * scale
-    known = KnownWay(
-        first, heading - anchor.heading, np.stack([seen.real, seen.imag], axis=-1), turned, stood
+    known = Places(
+        torch.tensor([first]),
+        torch.from_numpy(heading - anchor.heading)[None].float(),
+        torch.from_numpy(np.stack([seen.real, seen.imag], axis=-1))[None].float(),
+        torch.from_numpy(heading_known)[None],
+        torch.from_numpy(place_known)[None],
     )
     return known, anchor
 

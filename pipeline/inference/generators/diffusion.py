@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.conditions import Conditions
 from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
-from motionloom.pipeline.contract.editing import EditRequest
-from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.edits.frames import EditFrames
 from motionloom.pipeline.inference.generators.filling import fill_in
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.store.networks import device_of
@@ -32,6 +33,10 @@ class DenoisedMotion(WholeMotion):
     @abstractmethod
     def schedule(self) -> ScheduleConfig:
         """Of the training."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(denoising=self.denoising)
 
     def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
         """As asked for, or else DDPM in 50 steps, or the training's where those are fewer."""
@@ -63,12 +68,22 @@ class DiffusionMotion(DenoisedMotion):
             guidance=self._guidance(sampling),
         )  # fmt: skip
 
-    def edit(self, request: EditRequest) -> list[NDArray[np.float32]]:
-        """`EditingGenerator`."""
-        sampler, steps = self.denoising(request.sampling)
+    @property
+    def capabilities(self) -> Capabilities:  # type: ignore[override]
+        return Capabilities(denoising=self.denoising, edit=self.edit)
+
+    def edit(
+        self,
+        frames: EditFrames,
+        words: Sequence[tuple[Conditions, NDArray[np.float64]]],
+        seeds: Sequence[int],
+        sampling: SamplingConfig,
+    ) -> list[NDArray[np.float32]]:
+        """Fill in what an edit leaves free (`Editor`)."""
+        sampler, steps = self.denoising(sampling)
         return fill_in(
-            self.net, self.given["stats"], self.part, request, window=self.window, sampler=sampler,
-            steps=steps, guidance=self._guidance(request.sampling),
+            self.net, self.given["stats"], self.part, frames, words, seeds, window=self.window,
+            sampler=sampler, steps=steps, guidance=self._guidance(sampling),
         )  # fmt: skip
 
     def _guidance(self, sampling: SamplingConfig) -> float:

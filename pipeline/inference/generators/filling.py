@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import UserError
@@ -15,7 +17,7 @@ from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.observed import Places, known_columns
 from motionloom.models.diffusion.recovery import Recovery
 from motionloom.models.diffusion.schedule import Sampler
-from motionloom.pipeline.contract.editing import EditRequest, Said
+from motionloom.pipeline.inference.edits.frames import EditFrames
 from motionloom.pipeline.store.networks import device_of
 
 
@@ -23,14 +25,16 @@ def fill_in(
     net: TextDenoiser,
     stats: FeatureStats,
     part: Part,
-    request: EditRequest,
+    frames: EditFrames,
+    words: Sequence[tuple[Conditions, NDArray[np.float64]]],
+    seeds: Sequence[int],
     *,
     window: int,
     sampler: Sampler,
     steps: int,
     guidance: float,
 ) -> list[NDArray[np.float32]]:
-    """Motions [T, C] of the part's columns in their own units, one for each seed of the request.
+    """Motions [T, C] of the part's columns in their own units, one for each seed (`Editor`).
 
     `window` is the longest motion that the network was trained on.
     """
@@ -39,52 +43,41 @@ def fill_in(
             "guidance needs a diffusion model trained with condition_dropout > 0; set cfg_scale to 1"
         )
     layout, columns, device = stats.layout, stats.layout.part(part), device_of(net)
-
-    def tensor(values: NDArray[np.generic] | list[object]) -> Tensor:
-        made = torch.as_tensor(np.asarray(values), device=device)
-        return made.float() if made.dtype == torch.float64 else made
-
-    pieces = torch.from_numpy(request.pieces)
-    known = known_columns(pieces[None], layout, columns)[0]
+    features = torch.from_numpy(frames.features[:, columns])
+    known = known_columns(torch.from_numpy(frames.pieces)[None], layout, columns)[0]
     if known.all():
-        return [request.features.copy() for _ in request.seeds]
-    motion = stats.normalize(torch.from_numpy(request.features), columns)
-    rooted = Recovery.possible(layout, columns)
-    recovery = Recovery(layout, columns, stats.mean, stats.std) if rooted else None
-    places = pins = None
-    if recovery is not None and request.way is not None:
-        way = request.way
-        places = Places(
-            tensor([way.anchor]),
-            *(tensor(one[None]) for one in (way.heading, way.place, way.heading_known, way.place_known)),
-        )
-        if request.pins:
-            pins = Pins(
-                *(
-                    tensor([getattr(pin, name) for pin in request.pins])
-                    for name in ("frame", "joint", "position")
-                )
-            )
+        return [features.numpy().copy() for _ in seeds]
+    recovery = places = pins = None
+    if Recovery.possible(layout, columns):
+        recovery = Recovery(layout, columns, stats.mean, stats.std)
+        row = frames.places
+        known_places = (row.anchor, row.heading, row.place, row.heading_known, row.place_known)
+        places = Places(*(values.to(device) for values in known_places))
+        if frames.pins:
+            at, joints = torch.tensor(list(frames.pins), device=device).T
+            pins = Pins(at, joints, torch.tensor(frames.model_pins, device=device))
     filling = Filling(
         net,
-        KnownMotion(motion.to(device), known.to(device), places, pins),
-        [_worded(said, net, device) for said in request.words],
+        KnownMotion(stats.normalize(features, columns).to(device), known.to(device), places, pins),
+        [_caption_span(*pair, net, device) for pair in words],
         recovery,
         window=window,
         overlap=window // 4,
         guidance=guidance,
-        strength=request.strength,
-        likeness=request.likeness,
+        strength=frames.task.strength,
+        likeness=frames.task.likeness,
     )
-    made = filling(request.seeds, sampler, steps).cpu()
-    # What is given is taken from where it came from: normalising there and back rounds.
-    own = torch.where(known, torch.from_numpy(request.features), stats.denormalize(made, columns))
+    made = filling(seeds, sampler, steps).cpu()
+    # What is kept is taken from where it came from: normalising there and back rounds.
+    own = torch.where(known, features, stats.denormalize(made, columns))
     return [np.asarray(one, dtype=np.float32) for one in own.numpy()]
 
 
-def _worded(said: Said, net: TextDenoiser, device: torch.device) -> CaptionSpan:
-    text = said.conditions.get("text")
-    share = torch.from_numpy(said.share).float().to(device)
+def _caption_span(
+    conditions: Conditions, share: NDArray[np.float64], net: TextDenoiser, device: torch.device
+) -> CaptionSpan:
+    """The sentence embedding of encoded words, and zeros without any."""
+    text, of = conditions.get("text"), torch.from_numpy(share).float().to(device)
     if text is None or text.pooled is None:
-        return CaptionSpan(torch.zeros(net.text_dim, device=device), False, share)
-    return CaptionSpan(text.pooled[0].float().to(device), True, share)
+        return CaptionSpan(torch.zeros(net.text_dim, device=device), False, of)
+    return CaptionSpan(text.pooled[0].float().to(device), True, of)

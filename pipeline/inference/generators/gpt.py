@@ -18,7 +18,13 @@ from motionloom.models.gpt.drawing import Drawing, sample_seeds
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.streaming import TokenStream
 from motionloom.models.gpt.tokens import as_codes
-from motionloom.pipeline.contract.generation import FrameFlow, GenerationRequest, TokenFlow
+from motionloom.pipeline.contract.generation import (
+    Capabilities,
+    FrameFlow,
+    GenerationRequest,
+    Streaming,
+    TokenFlow,
+)
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.inference.generators.frames import Frames
 from motionloom.pipeline.inference.generators.of_tokens import OfTokens
@@ -67,6 +73,10 @@ class GptGenerator(OfTokens):
         """TMA used to rank candidates: the one behind the text prior, if it models the same body part."""
         tma: LoadedTma | None = self.given.get("tma") if self.gpt.prior == "tma" else None
         return tma if tma is not None and tma.part == self.part else None
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(streaming=Streaming(self.group_tokens, self.flow, self.decoding))
 
     @property
     def max_frames(self) -> int:

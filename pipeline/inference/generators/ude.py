@@ -19,7 +19,14 @@ from motionloom.models.diffusion.sampling import decode_motions
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
-from motionloom.pipeline.contract.generation import FrameFlow, GenerationRequest, Stretch, TokenFlow
+from motionloom.pipeline.contract.generation import (
+    Capabilities,
+    FrameFlow,
+    GenerationRequest,
+    Streaming,
+    Stretch,
+    TokenFlow,
+)
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import StageConfig
 from motionloom.pipeline.inference.generators.frames import Frames
@@ -72,6 +79,14 @@ class UdeGenerator(OfTokens):
     def settings(self) -> frozenset[str]:
         more = {"sampler", "denoising_steps"} if self.dmd is not None else set()
         return frozenset({"temperature", "top_k", "top_p", "cfg_scale", "guidance"} | more)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(
+            streaming=Streaming(self.group_tokens, self.flow, self.decoding),
+            drive=self.drive,
+            denoising=None if self.dmd is None else self.denoising,
+        )
 
     @cached_property
     def timeline(self) -> TokenTimeline:

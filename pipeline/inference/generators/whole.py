@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,10 @@ class WholeMotion(ABC):
     @property
     def max_frames(self) -> int | None:
         return None
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities()
 
     @property
     def prepared(self) -> Mapping[str, object]:

@@ -22,7 +22,7 @@ export function makeEditor(page) {
     return { accent: of("color"), card: of("background-color"), ink: of("border-left-color") };
   };
   const tools = figureTools({
-    names: info.joint_names, parents: info.parents, state, style,
+    names: info.joint_names, parents: info.parents, maxHeight: info.edit.max_height, state, style,
     active: () => history !== null,
     hold: () => { viewer.play(false); viewer.setFrame(viewer.frame); },
     drag: (joint, frame, position, done) => change((next) => pin(next, joint, frame, position, fps), done),
@@ -55,7 +55,7 @@ export function makeEditor(page) {
   }
 
   function update() {
-    const now = state(), lack = missing(now, rows, fps), said = now.words.find(({ from }) => from === chosen), result = results.get(history.now);
+    const now = state(), lack = missing(now, rows, fps, info.edit.max_speed), said = now.words.find(({ from }) => from === chosen), result = results.get(history.now);
     mount(result ? result.answer.viewer : clipOf(now).viewer);
     lanes.show(now, chosen, viewer.frame);
     viewer.refresh();

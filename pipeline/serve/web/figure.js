@@ -3,7 +3,6 @@
 import { HANDLES, placeAt } from "./task.js";
 
 const DOT = 7, GRASP = { mouse: 14, touch: 26 }; // pixels: a dot's radius, and how near to it a pointer takes hold
-const CEILING = 2.9;
 
 /* Where the middle joint of a limb goes when its end is drawn to `goal`, by the lengths of its two bones. */
 function bend(start, middle, end, goal) {
@@ -18,7 +17,7 @@ function bend(start, middle, end, goal) {
 
 /* Tools on the first figure of a viewer.
 
-   `host` gives `state()`, `names` and `parents` of the joints, and takes `drag(joint, frame, position, done)`,
+   `host` gives `state()`, `names` and `parents` of the joints and `maxHeight` in metres, and takes `drag(joint, frame, position, done)`,
    `drew(points, done)` and `hold()`, which stops the motion. */
 export function figureTools(host) {
   const joint = (name) => host.names.indexOf(name), handles = Object.keys(HANDLES).filter((name) => joint(name) >= 0);
@@ -33,7 +32,7 @@ export function figureTools(host) {
   const pointAt = (lens, [x, y], depth) => viewer.rayThrough(lens, x, y).map((v, i) => lens.eye[i] + depth * v);
   const reached = (at, depth) => {
     const [x, y, z] = pointAt(viewer.lens(0), at, depth);
-    return [x, Math.min(Math.max(y, viewer.floor(0)), CEILING), z];
+    return [x, Math.min(Math.max(y, viewer.floor(0)), host.maxHeight), z];
   };
   /* Moves a joint at the frame that is shown by pixels, as dragging does. */
   const nudge = (name, right, down) => {

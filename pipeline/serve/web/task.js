@@ -19,7 +19,6 @@ export const HANDLES = {
 };
 
 const AROUND = 0.5; // seconds on either side of a dragged joint that are made anew with it
-const FASTEST = 7; // metres a second of a path that is drawn; faster is a slip of the hand
 const POINTS = 60; // of a path in a task, at most
 const STEP = 0.12; // metres between two points of a path
 
@@ -126,13 +125,13 @@ export function paceOf(state, fps) {
 }
 
 /* Why nothing can be made of it yet, in one sentence; empty where it can. */
-export function missing(state, rows, fps) {
+export function missing(state, rows, fps, maxSpeed) {
   const silent = state.words.find(({ text }) => !text.trim());
   if (silent) return `Say what happens from ${time(silent.from, fps)} to ${time(silent.to, fps)} s, or remove these words.`;
   const stuck = state.pins.find(({ joint, frame }) => HANDLES[joint].rows.some((name) => state.kept[name][frame]));
   if (stuck) return `The ${HANDLES[stuck.joint].label} cannot move at ${time(stuck.frame, fps)} s while that stays as it is: drag over its row there.`;
   if (state.path && state.kept.lower.subarray(state.path.from + 1).some(Boolean)) return "The legs cannot follow the path where they stay as they are: drag over their row there.";
-  if (state.path && paceOf(state, fps).speed > FASTEST) return "The path is too long for the time: draw a shorter one, or make the motion longer.";
+  if (state.path && paceOf(state, fps).speed > maxSpeed) return "The path is too long for the time: draw a shorter one, or make the motion longer.";
   const changed = state.frames !== state.clip || rows.some(({ name }) => state.kept[name].some((kept) => !kept));
   return changed ? "" : "Nothing would change yet: do one of the four things above.";
 }

@@ -10,7 +10,6 @@ from pydantic import Field
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.pipeline.contract.generation import NotedGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, even_slices
@@ -158,7 +157,7 @@ class _DanceEvaluation(Evaluation):
             "shuffles": config.shuffles,
             "feature_fps": config.feature_fps,
             **({"seed_motion": f"the first {self.begun} frames of each recording"} if self.begun else {}),
-            **({"note": maker.note} if isinstance(maker, NotedGenerator) and maker.note else {}),
+            **({"note": maker.capabilities.note} if maker.capabilities.note else {}),
             **self.drawn_as(self.bundle),
         }
 

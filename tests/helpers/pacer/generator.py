@@ -12,7 +12,7 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from pacer.network import PART, Pacer
 
 
@@ -31,6 +31,7 @@ class PacerGenerator:
     unit_frames = 1
     max_frames = None
     decides_length = False
+    capabilities = Capabilities()
 
     @property
     def prepared(self) -> dict[str, object]:

@@ -15,12 +15,11 @@ from rich.console import Console
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.generation import SeededGenerator
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import dances_for, dances_of
 from motionloom.pipeline.evaluation.figures import MODEL, FigureFile
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.clips import read_seed_motion
+from motionloom.pipeline.inference.edits.clip_file import read_seed_motion
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.store.data import Data
 
@@ -102,22 +101,21 @@ def test_an_export_dances_from_its_own_seeds_or_given_ones(
     [only] = [one for one in Bundle.open(tmp_path / "model").stages if one.name == stage]
     bundle = Bundle([only], StageCache())
     maker = bundle.generator
-    assert isinstance(maker, SeededGenerator)
     own = bundle.generate(sounds=[song(3.0)] * 2, seed=1)
     assert [len(motion.joints) for motion in own] == [60, 60]
     [clip] = dances_for(bundle, Data(run / "stages/data").split("test"), 1, seconds=3.0, least=8)
     [made] = bundle.generate(sounds=[clip.sound], seconds=clip.seconds, seed_motions=[clip.motion])
     assert made.features.shape == (len(clip.motion), len(bundle.layout.part(maker.part)))
     if stage == "fact":
-        begun = maker.seed_frames
+        begun = maker.capabilities.seed_frames
         np.testing.assert_allclose(
             made.features[:begun], clip.motion[-begun:][:, bundle.layout.part(maker.part)], atol=1e-4
         )
-    short = clip.motion[: maker.seed_frames - 1]
+    short = clip.motion[: maker.capabilities.seed_frames - 1]
     with pytest.raises(UserError, match=f"{len(short)} frames"):
         bundle.generate(sounds=[clip.sound], seed_motions=[short])
     with pytest.raises(UserError, match="ask for more"):
-        bundle.generate(sounds=[clip.sound], seconds=maker.seed_frames / 20)
+        bundle.generate(sounds=[clip.sound], seconds=maker.capabilities.seed_frames / 20)
 
 
 def test_a_clip_of_a_file_is_gone_on_from(run: Path, call: Callable[..., Any], tmp_path: Path) -> None:
@@ -127,18 +125,19 @@ def test_a_clip_of_a_file_is_gone_on_from(run: Path, call: Callable[..., Any], t
     for name in ("ude", "cross_gpt", "actor_critic", "of_fact", "of_bailando"):
         shutil.rmtree(model / "stages" / name)
     soundfile.write(tmp_path / "song.wav", song(2.0).samples, 8000)
-    asked = ["generate", model, "--audio", tmp_path / "song.wav", "--format", "npz,bvh", "--no-plant-feet"]
+    shown = ["--format", "npz,bvh", "--set", "plant_feet=false"]
+    asked = ["generate", model, "--audio", tmp_path / "song.wav", *shown]
     done = call(*asked, "--out", tmp_path / "first")
     assert done.code == 0, done.err
     assert "training dance" in done.err
     for clip in sorted((tmp_path / "first").glob("*.[nb][pv][zh]")):
-        done = call(*asked, "--out", tmp_path / "next", "--seed-motion", clip)
+        done = call(*asked, "--out", tmp_path / "next", "--set", f"seed_motion={clip}")
         assert done.code == 0 and "training dance" not in done.err, done.err
         motion = read_seed_motion(clip, Bundle.open(model).layout)
         with np.load(next((tmp_path / "next").glob("*.npz")), allow_pickle=False) as file:
             begun = file["features"][:12]
         np.testing.assert_allclose(begun, motion[-12:, : begun.shape[1]], atol=1e-4)
-    done = call(*asked, "--out", tmp_path / "next", "--seed-motion", tmp_path / "song.wav")
+    done = call(*asked, "--out", tmp_path / "next", "--set", f"seed_motion={tmp_path / 'song.wav'}")
     assert done.code == 2 and "song.wav" in done.err
 
 

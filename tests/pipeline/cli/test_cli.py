@@ -27,6 +27,9 @@ from motionloom.datasets.schema import Manifest
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.cli.options import plain
+from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.shown import FigureOptions
 from motionloom.pipeline.serve.requests import ServeConfig
 
 Call = Callable[..., Any]
@@ -65,7 +68,8 @@ def test_every_option_and_setting_that_a_string_of_the_sources_names_exists() ->
         known |= {option for each in command.params for option in (*each.opts, *each.secondary_opts)}
     known |= {option for each in typer.main.get_command(app).params for option in each.opts}
     configs = [kind.config_class for kind in converters()] + [SynthConfig, FileRules, ServeConfig]
-    settings = {key for config in configs for key in config.model_fields}
+    configs += [SamplingConfig, FigureOptions, EditTask]
+    settings = {"seed_motion", *(key for config in configs for key in config.model_fields)}
     for path in (path for top in ("pipeline", "datasets", "models") for path in (ROOT / top).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
@@ -118,14 +122,8 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "unknown format": (["generate", "nowhere", "a person walks", "-f", "npz,bhv"], "'bvh'"),
     "edit what is not there": (["edit", "nowhere", "walk.bvh", "--keep", ":1"], "nowhere: no such folder"),
     "a stretch": (["edit", "nowhere", "walk.bvh", "--keep", "x"], "--keep x: write it as START:END=PARTS"),
-    "words without an end": (["edit", "nowhere", "walk.bvh", "--words", "1:=jumps"], "needs an end"),
-    "a point": (["edit", "nowhere", "walk.bvh", "--path", "1=2"], "--path 1=2: write it as SECONDS=X,Z"),
-    "a pin": (["edit", "nowhere", "walk.bvh", "--pin", "head=1"], "--pin head=1: write it as JOINT@SECONDS"),
-    "a path too fast": (
-        ["edit", "nowhere", "walk.bvh", "--path", "0=0,0", "--path", "0.1=9,0"],
-        "nobody runs faster than 12 m/s",
-    ),
-    "a pin too high": (["edit", "nowhere", "walk.bvh", "--pin", "head@1=0,7,0"], "7 m above the floor"),
+    "an unknown setting": (["edit", "nowhere", "walk.bvh", "--set", "likenes=0.5"], "'likeness'"),
+    "a setting of nothing": (["generate", "nowhere", "a person walks", "--set", "colour=1"], "temperature"),
     "a task of nothing": (["edit", "nowhere", "walk.bvh", "--task", "no.yaml"], "no.yaml: cannot be read"),
     "convert nothing": (
         ["data", "convert", "bvh", "nowhere", "out", "--set", "joint_map=map.json", "--licence", "CC0"],

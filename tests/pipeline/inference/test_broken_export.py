@@ -262,7 +262,7 @@ def test_a_network_is_no_larger_than_its_weights(stage: str, key: str, value: in
 def test_an_export_draws_as_it_recommends(small_run: Any, call: Any, tmp_path: Path) -> None:
     """What is asked for goes first, field by field."""
     folder = tmp_path / "own"
-    options = ("--sampling", "cfg_scale=1.5", "--sampling", "temperature=0")
+    options = ("--set", "cfg_scale=1.5", "--set", "temperature=0")
     assert call("export", small_run.folder, "-o", folder, *options).code == 0
     model = MotionModel.from_pretrained(folder, device="cpu")
     assert model.bundle.recommended.model_dump(exclude_unset=True) == {"cfg_scale": 1.5, "temperature": 0.0}

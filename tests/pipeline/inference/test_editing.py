@@ -22,16 +22,16 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import EncodedText
 from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
-from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.contract.editing import EditTask, RecordedClip
+from motionloom.pipeline.contract.generation import Capabilities
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.clips import read_clip, require_clip
-from motionloom.pipeline.inference.edits.frames import EditFrames
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
-from motionloom.pipeline.inference.edits.result import finish
+from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
+from motionloom.pipeline.inference.edits.edit import finish
+from motionloom.pipeline.inference.edits.frames import edit_frames
 from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
-from motionloom.pipeline.inference.model import edit_clip
+from motionloom.pipeline.inference.model import edit_clip, original_of
 from motionloom.pipeline.inference.motion import EditedMotion
 from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.store.artifact import Artifact
@@ -101,10 +101,8 @@ def test_kept_frames_are_the_clips_to_the_bit(walk: Walk, name: str) -> None:
     )
     # The features decode to these joints, from the first frame on.
     local = joints_of(made.features, made.layout)
-    moved = np.abs(ground(local)[:, :1] - ground(local)[:1, :1]) - np.abs(
-        ground(made.joints)[:, :1] - ground(made.joints)[:1, :1]
-    )
-    assert np.abs(moved).max() < 0.05
+    decoded, shown = (np.abs(ground(one)[:, :1] - ground(one)[:1, :1]) for one in (local, made.joints))
+    assert np.abs(decoded - shown).max() < 0.05
     if name == "wholebody363":
         np.testing.assert_array_equal(made.features[kept][:, 4:157], original.features[kept][:, 4:157])
         assert made.face is not None and original.face is not None
@@ -194,11 +192,10 @@ def test_a_figure_on_other_bones_stands_where_the_clip_does(walk: Walk) -> None:
         long[:, below] += 0.5 * shin[:, None]
     long[..., 1] -= long[..., 1].min()
     layout = MotionLayout.named("wholebody363", fps=20.0)
-    asked = EditFrames.of(EditTask.parse({"keep": ENDS}, "task"), RecordedClip("long", long, 20.0), layout)
-    assert asked.scale != 1.0
-    same = finish(asked, asked.features[:, layout.part("bodyhand")], None)
-    free = slice(20, 40)
-    off = np.linalg.norm(same.joints[free] - asked.to_world(asked.joints)[free], axis=-1)
+    frames = edit_frames(EditTask.parse({"keep": ENDS}, "task"), RecordedClip("long", long, 20.0), layout)
+    assert frames.scale != 1.0
+    joints = finish(frames, frames.features[:, layout.part("bodyhand")])[1]
+    off = np.linalg.norm(joints[20:40] - original_of(frames, "").joints[20:40], axis=-1)
     assert off.max() < 0.01
 
 
@@ -264,7 +261,8 @@ def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:
 
 def test_models_that_do_not_denoise_say_which_to_take(walk: Walk) -> None:
     layout = MotionLayout.named("body133")
-    other = SimpleNamespace(part="bodyhand", method="gpt", layout=layout, modalities={"text"}, prepared={})
+    known: dict[str, Any] = {"modalities": {"text"}, "prepared": {}, "capabilities": Capabilities()}
+    other = SimpleNamespace(part="bodyhand", method="gpt", layout=layout, **known)
     with pytest.raises(UserError, match=r"\(gpt\).*`inbetween`"):
         edit(Bundle([stage(other)], StageCache()), clip(walk), keep=ENDS)
 

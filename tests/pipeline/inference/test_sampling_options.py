@@ -24,7 +24,7 @@ from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.single import RvqConfig
 from motionloom.pipeline.baselines.mdm.network import Mdm
-from motionloom.pipeline.contract.generation import GenerationRequest, Prompt
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Finished, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
@@ -231,19 +231,19 @@ def test_the_commands_settings_reach_the_sampling(
     seen: dict[str, Any] = {}
     watching = SimpleNamespace(
         generate=lambda captions, **options: seen.update(options) or [],
-        generator=None,
+        generator=SimpleNamespace(capabilities=Capabilities()),
         unknown_captions=lambda *_: [],
         find_mismatches=lambda _: [],
     )
     monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: watching)
     asked = {"sampler": "dpm++", "denoising_steps": 7, "cfg_scale": 3.0, "temperature": 0.0}
-    words = [word for name, value in asked.items() for word in ("--sampling", f"{name}={value}")]
-    words += ["--sampling", "guidance.audio=1.2"]
+    words = [word for name, value in asked.items() for word in ("--set", f"{name}={value}")]
+    words += ["--set", "guidance.audio=1.2"]
     assert call("generate", "somewhere", "a person walks", *words, "-o", tmp_path, "-f", "npz").code == 0
     assert seen["strict"]
     assert seen["sampling"].model_dump(exclude_unset=True) == {**asked, "guidance": {"audio": 1.2}}
     for wrong in ("sampler=euler", "smapler=ddim", "top_p"):
-        made = call("generate", "somewhere", "a person walks", "--sampling", wrong)
+        made = call("generate", "somewhere", "a person walks", "--set", wrong)
         assert made.code == 2 and wrong.partition("=")[0] in made.err
 
 
@@ -371,5 +371,5 @@ def test_an_export_recommends_it(call: Any, tmp_path: Path, model: MotionModel) 
     said = json.loads((shipped_models()["synthetic"].folder / "bundle.json").read_text())["sampling"]
     assert said["candidates"] == model.bundle.drawing().candidates == 4
     assert model.bundle.drawing(SamplingConfig(candidates=1)).candidates == 1
-    made = call("generate", "synthetic", "a person walks", "--sampling", "candidates=0")
+    made = call("generate", "synthetic", "a person walks", "--set", "candidates=0")
     assert made.code != 0 and "candidates" in made.err

@@ -212,7 +212,7 @@ def test_json_lines_of_the_command(
 ) -> None:
     out = tmp_path / "made.jsonl"
     words = ["a person waves", "a person walks", "--seconds", "1.2", "--seed", "3"]
-    done = call("generate", small_run.folder, "--stream", *words, "-o", out)
+    done = call("generate", small_run.folder, *words, "-f", "jsonl", "-o", out)
     assert done.code == 0 and not done.out and "48 frames, 2.4 s of motion" in done.err
     head, frames = read(out.read_text())
     assert head["fps"] == 20.0 and len(head["joint_names"]) == len(head["parents"]) == 52
@@ -234,12 +234,12 @@ def test_captions_from_standard_input(small_run: Any, capsys: pytest.CaptureFixt
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ((), "caption"),
-        (("a", "b"), "give --seconds, the length of each"),
-        (("a", "--samples", "2"), "leave --samples, --format"),
-        (("a", "--format", "npz"), "leave --samples, --format"),
+        (("-f", "jsonl"), "caption"),
+        (("a", "b", "-f", "jsonl"), "--seconds"),
+        (("a", "--samples", "2", "-f", "jsonl"), "--samples"),
+        (("a", "--format", "npz,jsonl"), "--format"),
     ],
 )
 def test_what_a_stream_is_not(words: tuple[str, ...], sentence: str, call: Callable[..., Any]) -> None:
-    done = call("generate", "nowhere", "--stream", *words)
+    done = call("generate", "nowhere", *words)
     assert done.code == 2 and sentence in done.err

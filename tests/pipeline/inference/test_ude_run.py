@@ -92,7 +92,7 @@ def test_a_script_becomes_films_files_and_a_page(
     ude_run: Any, folder: Path, tmp_path: Path, call: Call
 ) -> None:
     out = tmp_path / "out"
-    words = ("--script", folder / "show.yaml", "--samples", 2, "-f", "npz,bvh,mp4,html")
+    words = (folder / "show.yaml", "--samples", 2, "-f", "npz,bvh,mp4,html")
     done = call("generate", ude_run.folder, *words, "-o", out)
     assert done.code == 0, done.err
     stem = "a-person-walks-forward-slow-a-person-waves-fast"
@@ -193,7 +193,7 @@ def test_models_of_one_modality_refuse_the_other(
 ) -> None:
     words = ("generate", small_run.folder, "-o", tmp_path / "out")
     assert "conditioned on text only" in refused(call(*words, "--audio", folder / "slow.wav"))
-    assert "scripts need a UDE model" in refused(call(*words, "--script", folder / "show.yaml"))
+    assert "scripts need a UDE model" in refused(call(*words, folder / "show.yaml"))
     run = tmp_path / "run"
     shutil.copytree(ude_run.folder, run)
     shutil.rmtree(run / "stages/utt")
@@ -202,7 +202,7 @@ def test_models_of_one_modality_refuse_the_other(
     assert done.code == 0, done.err
     words = ("generate", run, "-o", tmp_path / "out", "-f", "npz")
     assert "conditioned on audio only" in refused(call(*words, "a person walks"))
-    assert "conditioned on audio only" in refused(call(*words, "--script", folder / "show.yaml"))
+    assert "conditioned on audio only" in refused(call(*words, folder / "show.yaml"))
     assert not (tmp_path / "out").exists()
     assert call(*words, "--audio", folder / "slow.wav").code == 0
 
@@ -213,7 +213,7 @@ def test_models_of_one_modality_refuse_the_other(
         (("--audio", "nothing.wav"), "nothing.wav: no such sound file"),
         (("--audio", "slow.wav", "--seconds", "9"), "9 s were asked for and the music lasts 5.0 s"),
         (("a", "b", "--audio", "slow.wav"), "2 captions but 1 sounds"),
-        (("--script", "nothing.yaml"), "nothing.yaml"),
+        (("nothing.yaml",), "nothing.yaml"),
     ],
 )
 def test_mistakes_of_the_call(

@@ -28,7 +28,7 @@ STAGES = [
     *("data", "stats", "text", "tokenizer", "face_tokenizer", "tma", "tokens", "face_tokens", "gpt"),
     *("face_gpt", "face_vae", "face_diffusion", "generate", "evaluate", "report"),
 ]
-WAVE = ("a person waves with the left hand", "--face", "a happy face", "--seconds", "2")
+WAVE = ("a person waves with the left hand", "--set", "face=a happy face", "--seconds", "2")
 
 
 def arrays(path: Path) -> dict[str, Any]:
@@ -142,7 +142,7 @@ def test_bvh_film_and_page_show_the_same_motion(motions: Path) -> None:
 
 def test_same_seed_same_motion(copy: Path, motions: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
     """And the face is that of the generator that is asked for."""
-    faces = [("--sampling", f"face_model={kind}") for kind in ("vae", "diffusion")]
+    faces = [("--set", f"face_model={kind}") for kind in ("vae", "diffusion")]
     first = arrays(only(motions, ".npz"))
     for seed, more, body, face in (
         (5, (), True, True), (6, (), False, False), (5, faces[0], True, False), (5, faces[1], True, False),

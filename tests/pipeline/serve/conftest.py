@@ -18,7 +18,7 @@ import pytest
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.editing import EditTask
-from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.contract.generation import Capabilities, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
@@ -37,13 +37,17 @@ class QuickGenerator:
     modalities, settings = frozenset({"text", "audio"}), frozenset({"cfg_scale"})
     prepared: ClassVar[dict[str, object]] = {}
     layout, part, method, unit_frames, max_frames = LAYOUT, "bodyhand", "quick", 1, None
-    decides_length = False
+    decides_length = True
 
     def generate(self, request: Any) -> list[Any]:
         raise NotImplementedError
 
-    def edit(self, request: Any) -> list[Any]:
-        return [request.features for _ in request.seeds]
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(edit=self.edit)
+
+    def edit(self, frames: Any, words: Any, seeds: Any, sampling: Any) -> list[Any]:
+        return [frames.features[:, LAYOUT.part("bodyhand")] for _ in seeds]
 
 
 class QuickModel:

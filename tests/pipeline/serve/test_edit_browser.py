@@ -78,13 +78,8 @@ def test_a_motion_is_changed(page: Any, until: Any, quick: Any) -> None:
     until(page, "document.querySelectorAll('.mlv-cell').length === 2")
     [task] = quick.edited
     [pin], [said] = task.pins, task.words
-    assert (pin.joint, pin.at, said.text, said.start, said.end) == (
-        "left_wrist",
-        1.0,
-        "a person bows",
-        1.6,
-        2.0,
-    )
+    assert (pin.joint, pin.at) == ("left_wrist", 1.0)
+    assert (said.text, said.start, said.end) == ("a person bows", 1.6, 2.0)
     assert task.keep[0].model_dump() == {"start": 0.0, "end": 0.5, "parts": ("all",), "but": ()}
     assert why(page).startswith("Made in") and "the left hand is there" in why(page)
     assert page.locator(".mlv-label").all_text_contents() == ["before", "after"]

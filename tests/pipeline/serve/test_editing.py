@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from motionloom.pipeline.contract.generation import Capabilities
+
 WALK = {"caption": "a person walks", "seconds": 2.0, "seed": 4}
 ARM = {
     "keep": [{"parts": ["all"], "but": ["left_arm", "left_hand"]}],
@@ -34,9 +36,7 @@ def test_a_motion_that_was_generated_is_changed(served: Any, quick: Any) -> None
     said = served.post("/api/edit", {"clip": WALK, "task": ARM, "request": "mine"}).json
     joints, wrist = np.array(said["joints"]), said["joint_names"].index("left_wrist")
     assert said["request"] == "mine" and said["frames"] == len(joints) == 40
-    assert np.linalg.norm(joints[20, wrist] - [0.75, 1.2, 1.1]) < 0.03, (
-        "the shown figure is there, within its fit"
-    )
+    assert np.linalg.norm(joints[20, wrist] - [0.75, 1.2, 1.1]) < 0.03, "the figure fits within 3 cm"
     assert said["report"]["pins_cm"] == {"left_wrist at 1.00 s": pytest.approx(0.0, abs=0.01)}
     assert said["report"]["path_cm"] is None, "nothing was asked of it"
     cells = served.post("/api/edit", {"clip": WALK, "task": ARM, "format": "viewer"}).json["viewer"][
@@ -106,7 +106,9 @@ def test_a_clip_that_is_too_long(served: Any, walk: Callable[..., Any]) -> None:
 
 
 def test_a_model_that_makes_whole_motions_says_so(run_server: Callable[..., Any], quick: Any) -> None:
-    quick.bundle.generator = SimpleNamespace(modalities=quick.modalities, settings=frozenset())
+    quick.bundle.generator = SimpleNamespace(
+        modalities=quick.modalities, settings=frozenset(), capabilities=Capabilities()
+    )
     with run_server(quick) as served:
         edit = served.ask("GET", "/api/info").json["edit"]
         assert edit["possible"] is False and "makes motions and changes none" in edit["why"]

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ import soundfile
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.serve import guard, server
 from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.server import listen
@@ -70,7 +68,7 @@ def test_the_viewers_data_and_files(served: Any, tmp_path: Path) -> None:
 
 
 def test_a_model_that_must_be_told_a_length_is_told_one(served: Any, quick: Any) -> None:
-    quick.bundle.generator = mock.MagicMock(spec=WholeMotion)
+    quick.bundle.generator.decides_length = False
     assert served.post("/api/generate", {"caption": "a person waves"}).json["seconds"] == 4.0
 
 
@@ -79,6 +77,7 @@ def test_info_and_page(served: Any) -> None:
     assert info["model"] == "quick" and info["modalities"] == ["audio", "text"] and info["face"] is True
     assert info["sampling"] == {"cfg_scale": 1.25, "top_p": 0.9}
     assert info["limits"]["seconds"] == 5.0 and info["limits"]["waiting"] == 32
+    assert info["edit"] == {"possible": True, "why": "", "max_speed": 12.0, "max_height": 3.0}
     page = served.ask("GET", "/")
     assert page.status == 200 and page.headers["content-type"].startswith("text/html")
     for name in ("serve.css", "viewer.js", "serve.js", "edit.js", "lanes.js", "figure.js", "task.js"):

@@ -147,7 +147,7 @@ def test_a_motion_without_what_is_said_is_noted(
 def test_a_stream_says_so_when_the_captions_turn_comes(small_run: Any, call: Any, tmp_path: Path) -> None:
     """By the command, from Python, and of a caption that comes on the way; each caption once."""
     known, strange = "a person walks forward", "a person plays the violin"
-    options = ["--stream", "--seconds", "0.8", "-o", tmp_path / "made.jsonl"]
+    options = ["-f", "jsonl", "--seconds", "0.8", "-o", tmp_path / "made.jsonl"]
     said = call("generate", small_run.folder, known, strange, known, strange, *options).err
     assert said.count("note: ") == 1 and f"note: '{strange}' is unlike all captions" in said
     model = MotionModel.from_pretrained(small_run.folder, device="cpu")

@@ -1,4 +1,4 @@
-"""A clip in one file: BVH of any human skeleton, and the npz and GLB files that are written here."""
+"""Read a clip from one file: BVH of any human skeleton, and the npz and GLB files that are written here."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayo
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import FACE, HANDS, UserError
-from motionloom.pipeline.inference.edits.recorded import LEAST_FRAMES, RecordedClip
+from motionloom.pipeline.contract.editing import RecordedClip
 
 ENDINGS = (".bvh", ".npz", ".glb")
+LEAST_FRAMES = 4
+"""Fewer have no motion in them."""
 
 
 def read_clip(path: Path) -> RecordedClip:
@@ -31,9 +33,9 @@ def read_clip(path: Path) -> RecordedClip:
     if not path.is_file():
         raise UserError(f"{path}: no such file")
     if ending == ".bvh":
-        return require_clip(_of_bvh(path))
+        return require_clip(_read_bvh(path))
     if ending == ".npz":
-        return require_clip(_of_npz(path))
+        return require_clip(_read_npz(path))
     from motionloom.pipeline.render.body.glb import read_glb
 
     joints, fps, name = read_glb(path)
@@ -54,10 +56,8 @@ def require_clip(clip: RecordedClip) -> RecordedClip:
 
 
 def read_seed_motion(path: Path, layout: MotionLayout) -> NDArray[np.float32]:
-    """The layout's columns [T, D] of a clip that `read_clip` reads, at the layout's frame rate: what a
-    `SeededGenerator` goes on from.
-
-    Hands that the clip does not have are at rest, and so is its face.
+    """The layout's columns [T, D] of a clip that `read_clip` reads, at the layout's frame rate, for a
+    generator with `seed_frames`. Hands that the clip does not have are at rest, and so is its face.
     """
     clip = read_clip(path)
     if layout.family == "raw":
@@ -81,8 +81,8 @@ def features_for(
     return features_of(joints, fps, layout, face=face if has_face else None), present
 
 
-def _of_bvh(path: Path) -> RecordedClip:
-    """Its joints by the names that they have; hands only where all fingers are found."""
+def _read_bvh(path: Path) -> RecordedClip:
+    """The joints that are known by their names; hands only where all fingers are found."""
     motion = read_bvh(path)
     guesses = [guess_joint_map(motion, Skeleton.named(name)) for name in ("smplx52", "smpl22")]
     guess = next((one for one in guesses if one.certain), None)
@@ -97,7 +97,7 @@ def _of_bvh(path: Path) -> RecordedClip:
     return RecordedClip(str(path), joints[added_frames(joints) :], motion.fps)
 
 
-def _of_npz(path: Path) -> RecordedClip:
+def _read_npz(path: Path) -> RecordedClip:
     with NpzFile(path) as stored:
         joints = stored.numbers("joints")
         face = stored.numbers("face").astype(np.float32) if "face" in stored.names else None

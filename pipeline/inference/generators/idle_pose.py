@@ -1,4 +1,4 @@
-"""A calm stand: what the figure does while nothing is heard, and no words say what to do [ours].
+"""An idle pose: what the figure does in silence, where no words say what to do [ours].
 
 No network knows how to do nothing. So the frames of such a stretch are those of a person who stands with
 lowered arms and breathes, in the layout's own columns; what is before and after it is blended in.
@@ -17,15 +17,15 @@ from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout, Part
 
 EASE = 1.0
-"""Seconds from moving to standing, and back."""
+"""Seconds from moving to the idle pose, and back."""
 BREATH = 4.0
-"""Seconds of a breath."""
+"""Seconds of a breath: 15 a minute, as of adults at rest."""
 _ARMS = 1.25
 """Radians by which the rest pose's arms are lowered."""
 
 
-class Standing:
-    """Puts the stand into a motion that comes piece by piece.
+class IdleBlend:
+    """Blends the idle pose into a motion that comes piece by piece.
 
     Args:
         layout: Layout of whole frames.
@@ -34,85 +34,87 @@ class Standing:
 
     def __init__(self, layout: MotionLayout, part: Part) -> None:
         self._fps, columns = layout.fps, layout.part(part)
-        self._breath, stands, stays = (values[..., columns] for values in _breath(layout))
-        self._stands, self._stays = np.flatnonzero(stands), np.flatnonzero(stays)
+        self._breath, posed, held = (values[..., columns] for values in _breath(layout))
+        self._posed, self._held = np.flatnonzero(posed), np.flatnonzero(held)
         self._level: float | None = None
-        """How far it stands, 0..1, before the next frame."""
+        """Share of the idle pose, 0..1, before the next frame."""
         self._number = 0
         self._place: NDArray[np.float32] | None = None
-        """The columns that stay, as they were when the stand began."""
+        """The held columns, as they were when the idle stretch began."""
 
-    def __call__(self, motion: NDArray[np.float32], stand: bool) -> NDArray[np.float32]:
-        """The next frames [T, C] in their own units, which stand (from the first frame on, if they are the
-        first) or do not; what does not and is not near a stand is returned as it is.
+    def __call__(self, motion: NDArray[np.float32], idle: bool) -> NDArray[np.float32]:
+        """The next frames [T, C] in their own units, towards the idle pose or away from it.
+
+        Idle frames at the very start are so from the first one on; frames that are neither idle nor near an
+        idle stretch are returned as they are.
         """
-        level = float(stand) if self._level is None else self._level
+        level = float(idle) if self._level is None else self._level
         change = np.arange(1, len(motion) + 1) / (EASE * self._fps)
-        levels = np.clip(level + (change if stand else -change), 0.0, 1.0)
+        levels = np.clip(level + (change if idle else -change), 0.0, 1.0)
         if len(motion):
             self._level = float(levels[-1])
         if not levels.any():
             self._place = None
             return motion
         if self._place is None:
-            self._place = motion[0, self._stays].copy()
+            # The figure must not wander off or turn while it is idle.
+            self._place = motion[0, self._held].copy()
+        # A smooth step leaves and arrives at speed 0, so that neither end of the blend jerks.
         weight = (levels * levels * (3 - 2 * levels))[:, None]
+        frames = (self._number + np.arange(len(motion))) % len(self._breath)
         goal = motion.copy()
-        goal[:, self._stands] = self._breath[(self._number + np.arange(len(motion))) % len(self._breath)][
-            :, self._stands
-        ]
-        goal[:, self._stays] = self._place
+        goal[:, self._posed] = self._breath[frames][:, self._posed]
+        goal[:, self._held] = self._place
         self._number += len(motion)
         return np.asarray(motion + weight * (goal - motion), dtype=np.float32)
 
 
-def stood(
-    motion: NDArray[np.float32],
-    stands: Sequence[bool],
-    frames: Sequence[int],
-    layout: MotionLayout,
-    part: Part,
+def blend_to_idle(
+    motion: NDArray[np.float32], idle: Sequence[bool], frames: Sequence[int], layout: MotionLayout, part: Part
 ) -> NDArray[np.float32]:
-    """A motion [T, C] of a part that stands where its stretches, so many frames each, say so."""
-    if not any(stands):
+    """A motion [T, C] of a part, idle in those of its stretches, so many frames each, that `idle` says."""
+    if not any(idle):
         return motion
-    standing = Standing(layout, part)
+    blend = IdleBlend(layout, part)
     pieces = np.split(motion, np.cumsum(frames)[:-1])
-    return np.concatenate([standing(piece, calm) for piece, calm in zip(pieces, stands, strict=True)])
+    return np.concatenate([blend(piece, calm) for piece, calm in zip(pieces, idle, strict=True)])
 
 
 def _breath(layout: MotionLayout) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """A breath [T, D]; which columns [D] it gives, and which stay as they were where a stand begins."""
+    """A breath [T, D]; which columns [D] it poses, and which are held as they were where a stretch begins."""
+    from scipy.spatial.transform import Rotation
+
     frames, skeleton = round(BREATH * layout.fps), layout.skeleton
     turns = _turns(layout, np.sin(2 * np.pi * np.arange(2 * frames + 1) / frames))
-    gives, stays = np.ones(layout.dim, dtype=bool), np.zeros(layout.dim, dtype=bool)
     if layout.family == "raw":
         return _raw_breath(layout, turns[:frames])
-    local = np.array([_matrices(frame) for frame in turns])
+    local = np.array([Rotation.from_rotvec(frame).as_matrix() for frame in turns])
     joints, _ = forward_kinematics(local, np.zeros(3), skeleton.offsets, skeleton.parents)
     joints[..., 1] -= joints[..., 1].min()
-    return encode(joints, layout)[frames - 1 : 2 * frames - 1], gives, stays
+    # Of two breaths the middle: steps and contacts at a cycle's end go on into the next.
+    posed, held = np.ones(layout.dim, dtype=bool), np.zeros(layout.dim, dtype=bool)
+    return encode(joints, layout)[frames - 1 : 2 * frames - 1], posed, held
 
 
 def _raw_breath(
     layout: MotionLayout, turns: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """SMPL parameters say where the figure is and how it is turned: that stays; shape and face go on."""
+    """As `_breath`, of SMPL parameters: place and turn of the figure are held; shape and face go on."""
     out = np.zeros((len(turns), layout.dim), dtype=np.float32)
-    gives, stays = np.zeros((2, layout.dim), dtype=bool)
+    posed, held = np.zeros((2, layout.dim), dtype=bool)
     pose = turns[:, 1:].reshape(len(turns), -1)
-    stays[layout.slice("trans")] = True
+    held[layout.slice("trans")] = True
     if layout.has("pose"):
         first = layout.slice("pose").start
-        stays[first : first + 3] = True
+        held[first : first + 3] = True
         fields = [(slice(first + 3, first + 3 + pose.shape[1]), pose)]
     else:
-        stays[layout.slice("root_orient")] = True
+        held[layout.slice("root_orient")] = True
         body = 3 * (BODY_JOINTS - 1)
         fields = [(layout.slice("pose_body"), pose[:, :body]), (layout.slice("pose_hand"), pose[:, body:])]
     for columns, values in fields:
-        out[:, columns], gives[columns] = values, True
-    return out, gives, stays
+        out[:, columns], posed[columns] = values, True
+    return out, posed, held
 
 
 def _turns(layout: MotionLayout, air: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -138,9 +140,3 @@ def _turns(layout: MotionLayout, air: NDArray[np.float64]) -> NDArray[np.float64
         out[:, BODY_JOINTS : BODY_JOINTS + len(fingers)] = fingers
         out[:, BODY_JOINTS + len(fingers) :] = fingers * [1.0, -1.0, -1.0]
     return out
-
-
-def _matrices(turns: NDArray[np.float64]) -> NDArray[np.float64]:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_rotvec(turns).as_matrix())
