@@ -44,7 +44,7 @@ _RUN_OPTIONS: dict[str, tuple[object, object]] = {
         False,
     ),
     "workers": (Workers, 2),
-    "sets": (Annotated[list[str] | None, set_option("A setting below.")], None),
+    "sets": (Annotated[list[str] | None, set_option("A setting, as listed above.")], None),
     "as_json": (AsJson, False),
 }
 
@@ -131,7 +131,7 @@ def _settings(config: type[ConvertConfig]) -> list[str]:
 def _require_known(keys: Iterable[str], config: type[ConvertConfig], where: str) -> None:
     """`UserError` with the nearest setting and its help, and all settings, for a key that is none."""
     for key in keys:
-        if key not in config.model_fields:
+        if key == "source" or key not in config.model_fields:
             known = sorted(_settings(config))
             near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
             hint = f"did you mean '{near[0]}' ({_help(config, near[0]).rstrip('.')})? " if near else ""
