@@ -17,7 +17,7 @@ from bench import arguments, command_line
 from model_card import noted, synthetic_data
 from safetensors.numpy import load_file
 
-from motionloom.datasets.actions.mismatch import actions_of
+from motionloom.datasets.actions.measure import actions_of
 from motionloom.datasets.synth.generate import captions_of, split_of, truth_of
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.datasets.text.vocabulary import word_counts

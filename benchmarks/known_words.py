@@ -25,8 +25,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.multiclass import OneVsRestClassifier
 from torch.nn import functional as F
 
-from motionloom.datasets.actions.measure import agrees, measure
-from motionloom.datasets.actions.mismatch import actions_of, find_mismatch
+from motionloom.datasets.actions.measure import actions_of, agrees, find_mismatch, measure
 from motionloom.datasets.synth.generate import captions_of, split_of, truth_of
 from motionloom.datasets.synth.requests import attributes_of
 from motionloom.pipeline.inference.bundle import Bundle

@@ -3,7 +3,7 @@
 `measure` recognises the action by a cascade of physical signs (who flies, who travels, who turns, who sinks,
 whose foot or hand leaves its place) and then reads direction, side, count and speed. `agrees` compares with a
 truth record, reading each attribute as the *claimed* action defines it, so one wrong action does not hide a
-right limb.
+right limb. `find_mismatch` compares with requests: truth records that state only what was asked for.
 
 Thresholds were set between the measured values of the synthetic source's clips (`datasets/synth`), of which
 99 % are recognised in every attribute (`tests/datasets/synth/test_synth.py`).
@@ -11,7 +11,7 @@ Thresholds were set between the measured values of the synthetic source's clips 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,7 @@ STILL = 0.5
 """Metres per second below which every joint is of somebody who stands still."""
 UPRIGHT = 0.055
 """Change of lean to the side (radians) below which somebody stands upright all the time; twice forward."""
+_NOUNS = {"lie": "lying down", "sit": "sitting"}
 _ATTRIBUTES = ("direction", "side", "count", "speed", "bpm")
 
 
@@ -124,6 +125,39 @@ def agrees(
             if truth.get(f"{name}_hand") is not None:
                 out[f"{name}_hand"] = hand_shape(joints, side, fps) == truth[f"{name}_hand"]
     return out | _face(truth, face)
+
+
+def actions_of(truth: Record | None) -> tuple[str, ...]:
+    """Return the actions of a truth record in their order; none where it states none."""
+    if truth is None or "action" not in truth:
+        return ()
+    return tuple(part["action"] for part in truth.get("parts") or [truth])
+
+
+def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps: float) -> str | None:
+    """Return in words what joints [T, N >= 22, 3], T >= 4, do not show of a request; None where all is shown.
+
+    Of several requests, which a caption may mean, one has to be shown.
+    """
+    shown = [request for request in requests if _shows_actions(request, joints, fps)]
+    if not shown:
+        wanted = (" and then ".join(_NOUNS.get(act, act) for act in actions_of(one)) for one in requests)
+        return f"the motion shows no {' nor '.join(wanted)}"
+    if len(actions_of(shown[0])) > 1:
+        return None  # which part of two shows a side or a count is not known
+    seen = described(joints, fps, shown[0]["action"])
+    for name, wanted in shown[0].items():
+        if name != "action" and seen.get(name) != wanted:
+            return f"the {name} is {seen.get(name) or 'another'}, not {wanted}"
+    return None
+
+
+def _shows_actions(request: Record, joints: NDArray[np.floating], fps: float) -> bool:
+    """Whether joints show the actions of a request, whatever its attributes are."""
+    bare = {"action": request["action"]}
+    if request.get("parts"):
+        bare["parts"] = [{"action": part["action"]} for part in request["parts"]]
+    return agrees(bare, joints, None, fps)["action"]
 
 
 def _face(truth: Mapping[str, Any], face: NDArray[np.floating] | None) -> dict[str, bool]:

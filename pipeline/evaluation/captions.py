@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from motionloom.datasets.actions.mismatch import find_mismatch
+from motionloom.datasets.actions.measure import find_mismatch
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.synth.requests import parse_requests
 from motionloom.models.metrics.captions import bert_score, bleu, cider_d, rouge_l, words_of

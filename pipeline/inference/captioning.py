@@ -132,8 +132,8 @@ def caption_clips(
             yield clip
             continue
         frames = len(clip.features)
-        if frames < max(captioner.min_frames, LEAST_FRAMES):
-            least = max(captioner.min_frames, LEAST_FRAMES)
+        least = max(captioner.min_frames, LEAST_FRAMES)
+        if frames < least:
             yield Dropped(
                 source=clip.file,
                 reason=f"{frames} frames at {layout.fps:g} a second; a captioner reads {least} or more",

@@ -14,7 +14,7 @@ from textwrap import shorten
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.actions.mismatch import actions_of, find_mismatch
+from motionloom.datasets.actions.measure import actions_of, find_mismatch
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.synth.requests import CaptionRequest, parse_requests
 from motionloom.pipeline.store.known_captions import Unknown

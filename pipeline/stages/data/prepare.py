@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from pydantic import Field, model_validator
 
-from motionloom.datasets.actions.mismatch import actions_of
+from motionloom.datasets.actions.measure import actions_of
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.schema import Split, UserError

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from motionloom.datasets.actions.measure import described
-from motionloom.datasets.actions.mismatch import actions_of, find_mismatch
+from motionloom.datasets.actions.measure import actions_of, described, find_mismatch
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.synth.generate import Clip, SynthConfig, make_clip
 from motionloom.datasets.synth.requests import CaptionRequest, parse_actions, parse_requests
