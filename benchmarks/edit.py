@@ -16,14 +16,15 @@ Seeds are those of the drawing; of the training there is one. `--card` writes th
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from bench import Column, arguments, command_line, report, table_of
+from bench import Column, arguments, command_line, report
 from model_card import digests, test_clips, truth_from
 from numpy.typing import NDArray
-from results import read_records
+from results import page, read_records
 from rich.console import Console
 
 from motionloom.datasets.actions.measure import agrees
@@ -53,7 +54,7 @@ GAP = (0.3, 0.7)
 SEEDS = (0, 1, 2)
 STRENGTHS = (0.0, 1.0, 5.0)
 OTHER_WORDS = "other words from the gap on"
-CARD = Path(__file__).with_name("edit_card.md")
+CARD = model_folder(Path("inbetween")) / "README.md"
 COLUMNS = (
     Column("from the recording, cm", "away"),
     Column("acceleration at the seams, m/s²", "seams"),
@@ -230,24 +231,19 @@ def training_of(config: SynthConfig, count: int) -> list[Joints]:
 
 
 def write_card(model: Path, title: str, description: str, config: SynthConfig) -> None:
-    """The card of a shipped model, from the records."""
+    """The card of the shipped model: tables of the records, size and sums of these weights."""
     records = read_records()
-    size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
-    shown = [records[name] for name in ("edit", "edit_real") if name in records]
-    for record, pulls in zip(shown, (("pull 1",), ("pull 0", "pull 1", "pull 5")), strict=False):
+    for name, pulls in {"edit": ("pull 1",), "edit_real": ("pull 0", "pull 1", "pull 5")}.items():
         # The first table shows what the strength of the pull does; the second repeats the ends alone.
-        record["rows"] = [row for row in record["rows"] if not row["title"].endswith(pulls)]
-    tables = "\n\n".join(table_of(record) for record in shown)
-    sums = "\n".join(f"    {value}  {name}" for name, value in digests(model).items())
-    description = (
-        f"{description}; it knows {', '.join(name for name in config.action_names if name != 'then')}"
-    )
-    text = CARD.read_text(encoding="utf-8").format(
-        description=description, bytes=size, tables=tables, recipe=RECIPE, clips=config.clips,
-        digests=sums,
-    )  # fmt: skip
+        records[name]["rows"] = [row for row in records[name]["rows"] if not row["title"].endswith(pulls)]
+    size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
+    sums = "".join(f"    {value}  {name}\n" for name, value in digests(model).items())
+    text = page(CARD.read_text(encoding="utf-8"), records)
+    text = re.sub(r"[\d.]+ MB", f"{size:.1f} MB", text)
+    text = re.sub(r"( {4}[0-9a-f]{64} .*\n)+", sums, text)
     (model / "README.md").write_text(text, encoding="utf-8")
-    facts = {"name": title, "description": description, "recipe": RECIPE}
+    actions = ", ".join(name for name in config.action_names if name != "then")
+    facts = {"name": title, "description": f"{description}; it knows {actions}", "recipe": RECIPE}
     (model / CARD_FIGURES).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
