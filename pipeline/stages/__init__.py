@@ -1,1 +1,1 @@
-"""One file per kind of stage."""
+"""The kinds of stages: data, networks of the papers, results; the baselines' are in `pipeline.baselines`."""
