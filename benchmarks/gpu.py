@@ -39,7 +39,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished, StageCache
+from motionloom.pipeline.contract.stage import CompletedStage, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.runs.dry_run import estimate
@@ -95,7 +95,7 @@ def recipe(size: str, steps: int, device: str, profile: int) -> dict[str, Any]:
     return {"name": "gpu", "extends": f"humantomato-{size}", "hardware": hardware, "stages": stages}
 
 
-def flops(stage: Finished) -> int:
+def flops(stage: CompletedStage) -> int:
     """Of a step: forward and backward pass over the first batch that it trained on."""
     stage_cache, kind, config = StageCache(), stage.kind, stage.config
     dry: Any = kind
@@ -140,7 +140,7 @@ def peak(device: torch.device, precision: str, given: float | None) -> float | N
 
 
 def trainings(
-    run: Path, stages: Mapping[str, Finished], device: torch.device, tflops: float | None
+    run: Path, stages: Mapping[str, CompletedStage], device: torch.device, tflops: float | None
 ) -> Iterator[Record]:
     """Rows of the table of trainings."""
     cards = estimate(load_recipe(run / "recipe.yaml", strict=False))

@@ -178,6 +178,7 @@ def dmd_loss(
     target = motion if net.config.schedule.predicts == "sample" else noise
     error = found - target.to(found.dtype)
     loss = masked_mean(error.square(), length_mask(length, motion.shape[1]), present)
+    # A difference of frames counts where both of them are real.
     weight = net.config.velocity_weight
     if weight:
         between = length_mask(length - 1, motion.shape[1] - 1)

@@ -53,6 +53,7 @@ def sample_motions(
 
     def denoised(rows: list[int], x: Tensor, noise: list[torch.Generator]) -> Tensor:
         count = len(rows)
+        # Rows with their text first, then the same rows without, in one forward pass.
         both = text[rows].repeat(1 + guided, 1)
         conditioned = torch.arange(len(both), device=text.device) < count
         mask = torch.ones(len(both), x.shape[1], dtype=torch.bool, device=text.device)

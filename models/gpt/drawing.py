@@ -188,11 +188,13 @@ def decode(
     for step in range(int(before.min()) * size if batch else 0, total):
         group, slot = divmod(step, size)
         new = group >= before
+        # Rows that only read their start are not alive yet, and those behind their End not any more.
         alive = new & (group < before + limit) & ~ended
         if slot == 0 and not bool((alive | ~new).any()):
             break
         # A motion is never empty, so its first group cannot be End.
         may_end = alive & (group > before) if free and slot == 0 else no
+        # Numbers count from a row's first new token, whatever it starts from.
         index = (step - before * size).clamp(0, uniform.shape[1] - 1)
         own = uniform.gather(1, index[:, None])[:, 0]
         token = next_token(

@@ -68,10 +68,12 @@ def rewards(
     frames = codes.groups * tokenizer.group_frames
     columns = None if present is None else present.repeat_interleave(count, dim=0)
     latent, _ = tma.encode_motion(tokenizer.decode(codes.codes, frames, columns), frames, columns)
+    # A caption competes with those of all ranks, as in the training of TMA.
     captions = F.normalize(gather_rows(text_latent.float()), dim=-1)
     logits = F.normalize(latent.float(), dim=-1) @ captions.T / temperature
     own = rank() * len(text_latent) + torch.arange(len(text_latent), device=logits.device)
     if sentence is not None and threshold is not None:
+        # Captions that mean the same are no wrong answers.
         same = false_negatives(gather_rows(sentence), threshold)[own]
         logits = logits.masked_fill(same.repeat_interleave(count, dim=0), -torch.inf)
     chosen = own.repeat_interleave(count)[:, None]

@@ -60,6 +60,7 @@ def generate(
     how = Drawing(temperature, top_k, top_p)
     gpt.require_guidance(cfg_scale)
     size, most = len(gpt.pattern), int(limit.max()) if batch else 0
+    # All numbers are drawn before the loop, so that a row does not depend on the others' lengths.
     uniform = uniform_numbers(seeds_of(seed, batch, "texts"), most * size, device)
     scale = torch.full((batch,), cfg_scale, device=device) if cfg_scale != 1 else None
     cache = gpt.stack.cache(max(1, most * size))
@@ -67,6 +68,7 @@ def generate(
     def hidden(step: int, tokens: Tensor) -> Tensor:
         if step:
             x = gpt.embed(tokens[:, step - 1 : step], gpt.slots[(step - 1) % size].expand(batch, 1))
+            # Both passes of guidance read the tokens that were drawn under guidance.
             x = x if scale is None else torch.cat([x, x])
         else:
             x = gpt.embed_text(text)

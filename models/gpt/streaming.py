@@ -77,6 +77,7 @@ class TokenStream:
             hidden = gpt.hidden(self._inputs, self._cache)[:, -1:]
             scale = hidden.new_full((1,), self._scale) if len(hidden) == 2 else None
             draw = uniform[slot : slot + 1]
+            # A stream goes on where a clip would end: the network begins a new clip of the same text.
             if slot == 0 and self._drawn and self._is_over(hidden, draw, scale):
                 self._begin(0)
                 hidden = gpt.hidden(self._inputs, self._cache)[:, -1:]

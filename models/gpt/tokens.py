@@ -88,6 +88,7 @@ def interleave(
         ValueError: Streams disagree about the number of groups.
     """
     names = stream_names(pattern)
+    # A stream with two tokens in a group fills two slots of the pattern, in turn.
     kinds_row = kind_of_slot(pattern)
     count = codes[names[0]].shape[1] // kinds_row.count(0)
     slots: list[Tensor] = []
@@ -107,6 +108,7 @@ def interleave(
         groups = torch.full((batch,), count, dtype=torch.int64, device=device)
     kinds = torch.tensor(kinds_row, device=device).repeat(count).expand(batch, -1)
     length = groups * len(pattern)
+    # Padding lies behind each row's own tokens, not at the end of each stream.
     valid = torch.arange(body.shape[1], device=device)[None] < length[:, None]
     tokens, kinds = torch.where(valid, body, PAD), torch.where(valid, kinds, 0)
     if ends is None:
@@ -115,6 +117,7 @@ def interleave(
         closed = torch.ones_like(groups, dtype=torch.bool)
     order = torch.arange(len(names), device=device)
     limits = torch.tensor([ends[name] for name in names], device=device)
+    # One End a stream follows, in the order of their first slots.
     at = length[:, None] + order  # after each row's own tokens
     more = functional.pad(tokens, (0, len(names)), value=PAD), functional.pad(kinds, (0, len(names)))
     tokens = more[0].scatter(1, at, torch.where(closed[:, None], limits, PAD))

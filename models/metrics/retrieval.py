@@ -69,6 +69,7 @@ def recall(
     if batch is not None:
         order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
     found: dict[str, list[Tensor]] = {"t2m": [], "m2t": []}
+    # Each batch is a set of candidates of its own; ranks of all batches are averaged together.
     for rows in order.to(text.device)[: count // size * size].view(-1, size):
         between = -(text[rows] @ motion[rows].T)
         if distance == "euclidean":
@@ -168,6 +169,7 @@ def accuracy_among(
             f"one has {fewest}; evaluate more clips or among fewer"
         )
     generator = torch.Generator().manual_seed(seed)
+    # The largest draws choose without replacement; texts that mean the same are never chosen.
     draws = torch.rand(count, count, generator=generator, dtype=torch.float64).masked_fill(~allowed, -1.0)
     others = draws.topk(candidates - 1, dim=1).indices.to(motion.device)
     motion, text = F.normalize(motion.double(), dim=-1), F.normalize(text.double(), dim=-1)

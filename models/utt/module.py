@@ -114,6 +114,7 @@ class UttModule(AlternatingModule):
         tokens, kinds, _ = self.sequences(batch)
         conditions, inputs, z = batch["conditions"], None, None
         size, device = len(tokens), tokens.device
+        # Validation drops no conditions and corrupts no tokens, so its cross-entropy compares.
         if self.training:
             drop = torch.rand(size, device=device) < config.condition_dropout
             conditions = drop_conditions(conditions, drop)
@@ -129,6 +130,7 @@ class UttModule(AlternatingModule):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind)
         if self.discriminator is None or (self.training and not self.judged):
             return values
+        # The critic judges motion decoded by the frozen tokenizer, so that gradients reach the logits.
         how = self.loss_config.adversarial
         fake, length = soft_motion(
             net,

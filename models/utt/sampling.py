@@ -96,15 +96,18 @@ def generate(
         start = Codes(dict.fromkeys(utt.names, none), torch.zeros_like(limit))
     if len(start.groups) != batch:
         raise UserError(f"{len(start.groups)} starts were given for {batch} conditions")
+    # Only the last groups of the start fit into the block beside what is new.
     given, before = last_groups(start, utt.pattern, context)
     size = len(utt.pattern)
     most = int(limit.max()) * size if batch else 0
+    # Numbers of groups already drawn are skipped: sampling in pieces then equals sampling at once.
     uniform = uniform_numbers(seeds, drawn * size + most, device)[:, drawn * size :]
     if not (inject_z and utt.config.z_dim):
         z = None
     elif z is None:
         z = draw_z(seeds, utt.config.z_dim).to(device)
     scale = torch.tensor(scales, device=device) if guided else None
+    # Under guidance both passes are rows of one batch: the network is called once a token.
     if guided and null is not None:
         condition = _stacked(condition, null)
         z = None if z is None else torch.cat([z, z])
@@ -114,6 +117,7 @@ def generate(
 
     def hidden(step: int, tokens: Tensor) -> Tensor:
         nonlocal state, seen, opened
+        # Where the window has moved on, its positions are numbered anew and the cache is of no use.
         first = window_start(step, utt.config.block_size, size)
         fresh = state is None or first != opened
         if state is None or fresh:
@@ -130,6 +134,7 @@ def generate(
             utt, hidden, given, before, limit, uniform=uniform, free=groups is None, how=how, scale=scale
         )
     longest = int(counts.max()) if batch else 0
+    # Rows start behind starts of different lengths; the result begins with each row's first new group.
     at = before[:, None] * size + torch.arange(longest * size, device=device)
     rows = tokens.gather(1, at.clamp(max=max(0, tokens.shape[1] - 1))).view(batch, longest, size)
     return as_codes(rows, utt.pattern, counts)

@@ -14,7 +14,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import (
     CAPTIONER,
     GENERATOR,
-    Finished,
+    CompletedStage,
     Inputs,
     Role,
     Stage,
@@ -35,24 +35,24 @@ from motionloom.pipeline.store.run_state import RunReader, StageRecord, finished
 from motionloom.pipeline.store.weights import LayoutFacts
 
 
-def preview_of(stage: Stage, others: Mapping[str, Stage | Finished]) -> object:
+def preview_of(stage: Stage, others: Mapping[str, Stage | CompletedStage]) -> object:
     """Return the preview of a recipe's stage, as far as it is known before it has run."""
     return stage.kind.preview(stage.config, previews(stage, others))
 
 
-def previews(stage: Stage, others: Mapping[str, Stage | Finished]) -> Inputs:
+def previews(stage: Stage, others: Mapping[str, Stage | CompletedStage]) -> Inputs:
     """Previews of a stage's inputs, by role; `others` are those of its recipe, and finished ones outside."""
 
     def maker(name: str) -> Callable[[], object]:
         found = others[name]
-        if isinstance(found, Finished):
+        if isinstance(found, CompletedStage):
             return partial(preview_of_finished, found)
         return partial(preview_of, found, others)
 
     return Inputs({role: maker(name) for role, name in stage.inputs.items()})
 
 
-def preview_of_finished(stage: Finished) -> object:
+def preview_of_finished(stage: CompletedStage) -> object:
     """Return a completed stage's output, without what only running it needs."""
     makers: dict[str, Callable[[], object]] = {}
     for role, source in stage.inputs.items():
@@ -72,26 +72,26 @@ def stages_giving(run: Path, what: str) -> list[str]:
     return out
 
 
-def finished_stages(run: Path) -> dict[str, Finished]:
+def finished_stages(run: Path) -> dict[str, CompletedStage]:
     """The finished stages of a run by name, in the recipe's order."""
-    made: dict[Path, Finished] = {}
+    made: dict[Path, CompletedStage] = {}
     return {name: _finished(record, made) for name, record in finished_records(run).items()}
 
 
-def outside_stage(folder: Path) -> Finished | None:
+def outside_stage(folder: Path) -> CompletedStage | None:
     """A finished stage of a run or of an export, by its folder, for another run; None where there is none."""
     record = RunReader(None).find(folder.resolve())
     return None if record is None else _finished(record, {})
 
 
-def _finished(record: StageRecord, made: dict[Path, Finished]) -> Finished:
+def _finished(record: StageRecord, made: dict[Path, CompletedStage]) -> CompletedStage:
     """A stage that can be loaded, from its record; each once."""
     if record.folder not in made:
         made[record.folder] = _loadable(record, made)
     return made[record.folder]
 
 
-def _loadable(record: StageRecord, made: dict[Path, Finished]) -> Finished:
+def _loadable(record: StageRecord, made: dict[Path, CompletedStage]) -> CompletedStage:
     folder = record.folder
     where, run, exported = str(folder / "artifact.json"), owner_of(folder), in_export(folder)
     kind = stage_kind(record.kind, where)
@@ -104,7 +104,7 @@ def _loadable(record: StageRecord, made: dict[Path, Finished]) -> Finished:
     if exported:
         read_bundle(run)
         _require_roles(kind, inputs, where)
-    return Finished(
+    return CompletedStage(
         record.name,
         kind,
         kind.config.parse(dict(record.config), f"{where}: config"),
@@ -116,7 +116,7 @@ def _loadable(record: StageRecord, made: dict[Path, Finished]) -> Finished:
     )
 
 
-def _require_roles(kind: StageKind, inputs: Mapping[str, Finished], where: str) -> None:
+def _require_roles(kind: StageKind, inputs: Mapping[str, CompletedStage], where: str) -> None:
     """Refuse stages of an export in roles that they cannot fill."""
     roles = {role.name: role for role in kind.roles() if isinstance(role, Role)}
     for role, source in inputs.items():
@@ -143,7 +143,7 @@ def _gives(kind: StageKind, record: StageRecord) -> frozenset[str]:
         return frozenset()
 
 
-def generators_of(run: Path) -> list[Finished]:
+def generators_of(run: Path) -> list[CompletedStage]:
     """The finished stages of a run that generate, its default first.
 
     Those that the recipe lists as a stage's inputs come first, in that order, then those that a finished
@@ -173,7 +173,7 @@ def generators_of(run: Path) -> list[Finished]:
     return [makers[place] for place in order if place in makers]
 
 
-def captioners_of(run: Path) -> list[Finished]:
+def captioners_of(run: Path) -> list[CompletedStage]:
     """The finished stages of a run that caption motions, in the recipe's order."""
     return [stage for stage in finished_stages(run).values() if stage.gives(CAPTIONER)]
 
@@ -204,9 +204,9 @@ class BundleFile(Config):
     """Fields of `SamplingConfig` that its motions are best drawn with, where nobody says otherwise."""
 
 
-def open_exported(folder: Path, what: str = GENERATOR) -> list[Finished]:
+def open_exported(folder: Path, what: str = GENERATOR) -> list[CompletedStage]:
     """The stages of an export that generate, the default first; or that give `CAPTIONER`."""
-    path, reader, made = folder / BUNDLE_FILE, RunReader(folder), dict[Path, Finished]()
+    path, reader, made = folder / BUNDLE_FILE, RunReader(folder), dict[Path, CompletedStage]()
     makers, listed = [], read_bundle(folder)
     for name in listed.captioners if what == CAPTIONER else listed.generators:
         record = reader.find(folder / name) if re.fullmatch(STAGE_NAME, name) else None

@@ -93,14 +93,14 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Finished:
-    """A finished stage and those that fed it."""
+class CompletedStage:
+    """A completed stage and those that fed it."""
 
     name: str
     kind: StageKind
     config: Any
     folder: Path
-    inputs: Mapping[str, Finished]
+    inputs: Mapping[str, CompletedStage]
     exported: bool = False
     """In an exported folder, which may come from anywhere: nothing outside `folder` is followed."""
     outside: bool = False
@@ -112,7 +112,7 @@ class Finished:
         """Whether other stages may ask this one for `what`."""
         return what in self.kind.gives(self.config)
 
-    def upstream(self) -> Iterator[Finished]:
+    def upstream(self) -> Iterator[CompletedStage]:
         """All stages above this one, each once, those it reads first."""
         seen: set[Path] = set()
         todo = list(self.inputs.values())
@@ -131,25 +131,25 @@ class StageCache:
         self.device = device
         self._loaded: dict[Path, object] = {}
 
-    def get(self, stage: Finished) -> Any:
+    def get(self, stage: CompletedStage) -> Any:
         if stage.folder not in self._loaded:
             require_unchanged(stage.folder)
             self._loaded[stage.folder] = stage.kind.load(stage, self.given_to(stage), self.device)
         return self._loaded[stage.folder]
 
-    def given(self, inputs: Mapping[str, Finished]) -> Inputs:
+    def given(self, inputs: Mapping[str, CompletedStage]) -> Inputs:
         return Inputs({role: partial(self.get, stage) for role, stage in inputs.items()})
 
-    def given_to(self, stage: Finished) -> Inputs:
+    def given_to(self, stage: CompletedStage) -> Inputs:
         """Return the inputs of a completed stage; reading one that is gone raises its message."""
         makers = {role: partial(self.get, source) for role, source in stage.inputs.items()}
         return Inputs({**{role: partial(_refuse, said) for role, said in stage.gone.items()}, **makers})
 
-    def generator(self, stage: Finished) -> MotionGenerator:
+    def generator(self, stage: CompletedStage) -> MotionGenerator:
         require_unchanged(stage.folder)
         return stage.kind.generator(stage, self.given_to(stage), self.device)
 
-    def captioner(self, stage: Finished) -> MotionCaptioner:
+    def captioner(self, stage: CompletedStage) -> MotionCaptioner:
         require_unchanged(stage.folder)
         return stage.kind.captioner(stage, self.given_to(stage), self.device)
 
@@ -167,7 +167,7 @@ class StageContext:
     """Name of the recipe, for people."""
     config: Any
     folder: Path
-    inputs: Mapping[str, Finished]
+    inputs: Mapping[str, CompletedStage]
     seed: int
     hardware: Hardware
     console: Console
@@ -196,7 +196,7 @@ class StageContext:
     def input(self, role: str) -> Path:
         return self.inputs[role].folder
 
-    def every(self, role: str) -> list[Finished]:
+    def every(self, role: str) -> list[CompletedStage]:
         """The stages of a role that is declared with `Every`, in the recipe's order."""
         return [stage for key, stage in self.inputs.items() if key.startswith(f"{role}.")]
 
@@ -255,19 +255,19 @@ class StageKind(ABC, Generic[C]):
         """Return what `load` will return, as far as it is known before the stage has run (dry runs)."""
         return None
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> object:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> object:
         """Return the completed stage's output, for the stages that take it."""
         return stage.folder
 
-    def preview_of_finished(self, stage: Finished, given: Inputs) -> object:
+    def preview_of_finished(self, stage: CompletedStage, given: Inputs) -> object:
         """Return the output of `load` for a dry run; a kind with large weights may leave them out."""
         return self.load(stage, given, CPU)
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         """A generator of motion, of a kind that gives `GENERATOR`."""
         raise NotImplementedError(f"stages of kind {self.name} generate nothing")
 
-    def captioner(self, stage: Finished, given: Inputs, device: torch.device) -> MotionCaptioner:
+    def captioner(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionCaptioner:
         """Return a captioner, of a kind that offers `CAPTIONER`."""
         raise NotImplementedError(f"stages of kind {self.name} say nothing")
 
@@ -279,7 +279,7 @@ class StageKind(ABC, Generic[C]):
         """The config as an export shows it to everybody."""
         return config
 
-    def export(self, stage: Finished, target: Path) -> None:
+    def export(self, stage: CompletedStage, target: Path) -> None:
         """Copy what loading needs into `target`, an empty folder."""
         raise UserError(f"{stage.folder}: a stage of kind {self.name} cannot be exported")
 
@@ -297,7 +297,7 @@ class StageKind(ABC, Generic[C]):
         """Bytes of what it leaves on disk, where that is much and can be said."""
         return None
 
-    def show(self, stage: Finished, given: Inputs) -> list[Showing]:
+    def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
         """Figures of the finished stage for the report, beside its curves."""
         return []
 

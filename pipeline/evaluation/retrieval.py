@@ -14,7 +14,7 @@ from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.retrieval import RECALLS, Distance, recall
 from motionloom.pipeline.contract.lookup import finished_stages, stages_giving
-from motionloom.pipeline.contract.stage import ALIGNMENT, Finished, Role, StageCache
+from motionloom.pipeline.contract.stage import ALIGNMENT, CompletedStage, Role, StageCache
 from motionloom.pipeline.evaluation.estimate import plain
 from motionloom.pipeline.evaluation.figures import (
     CHANCE,
@@ -92,7 +92,7 @@ def retrieve(
     return FigureFile("retrieval", tuple(figures), facts)
 
 
-def _judge(model: Any, stage: Finished, data: Any) -> tuple[Judge, Distance]:
+def _judge(model: Any, stage: CompletedStage, data: Any) -> tuple[Judge, Distance]:
     """A loaded stage as a judge, and how its latents are compared."""
     if not isinstance(model, LoadedEvaluator):
         return Judge.tma(model), "cosine"
@@ -100,7 +100,7 @@ def _judge(model: Any, stage: Finished, data: Any) -> tuple[Judge, Distance]:
     return Judge.evaluator(model), "euclidean"
 
 
-def alignment_stage(run: Path, name: str | None = None) -> Finished:
+def alignment_stage(run: Path, name: str | None = None) -> CompletedStage:
     """A finished stage that aligns text with motion, or an evaluator: by name, else `tma`, else the recipe's
     first, evaluators last.
     """
@@ -127,7 +127,7 @@ def _judges(run: Path) -> list[str]:
     return sorted(names, key=lambda name: name != "tma")
 
 
-def _sources(run: Path, judge: Finished) -> dict[str, Finished]:
+def _sources(run: Path, judge: CompletedStage) -> dict[str, CompletedStage]:
     """The stages of the clips and of the captions' meaning: a judge's own, else the run's first of each.
 
     The published evaluator was made from no stage of the run.

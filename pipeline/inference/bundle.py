@@ -26,7 +26,7 @@ from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator, Prompt, Stretch
 from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import CAPTIONER, CPU, Finished, StageCache
+from motionloom.pipeline.contract.stage import CAPTIONER, CPU, CompletedStage, StageCache
 from motionloom.pipeline.inference.checks import find_mismatches, unknown_captions
 from motionloom.pipeline.inference.generators.idle_pose import blend_to_idle
 from motionloom.pipeline.inference.motion import GeneratedMotion
@@ -65,10 +65,10 @@ class Bundle:
 
     def __init__(
         self,
-        stages: Sequence[Finished],
+        stages: Sequence[CompletedStage],
         stage_cache: StageCache,
         recommended: SamplingConfig | None = None,
-        captioners: Sequence[Finished] = (),
+        captioners: Sequence[CompletedStage] = (),
     ) -> None:
         self.stages, self.captioners = tuple(stages), tuple(captioners)
         """The stages that generate, the default of each kind first; and those that caption motions."""
@@ -115,7 +115,7 @@ class Bundle:
                 raise
             raise UserError(f"{folder}: {error}") from None
 
-    def _open(self, stage: Finished) -> None:
+    def _open(self, stage: CompletedStage) -> None:
         """Load a stage's inputs, and theirs, as far as generation needs them."""
         needed, given = stage.kind.exported(stage.config), self.stage_cache.given_to(stage)
         for role in stage.kind.roles():
@@ -123,20 +123,20 @@ class Bundle:
                 given[role.name]
                 self._open(stage.inputs[role.name])
 
-    def of(self, stage: Finished) -> MotionGenerator:
+    def of(self, stage: CompletedStage) -> MotionGenerator:
         """The generator that a stage is."""
         if stage.folder not in self._generators:
             self._generators[stage.folder] = self.stage_cache.generator(stage)
         return self._generators[stage.folder]
 
-    def encoder(self, stage: Finished) -> PromptEncoder:
+    def encoder(self, stage: CompletedStage) -> PromptEncoder:
         """What encodes prompts for a stage."""
         if stage.folder not in self._encoders:
             self._encoders[stage.folder] = PromptEncoder(self.of(stage).prepared, self.stage_cache.device)
         return self._encoders[stage.folder]
 
     @cached_property
-    def main(self) -> Finished:
+    def main(self) -> CompletedStage:
         """The stage that generates body and hands."""
         for stage in self.stages:
             if self.of(stage).part != "face":
@@ -148,15 +148,15 @@ class Bundle:
         return self.of(self.main)
 
     @cached_property
-    def faces(self) -> dict[str, Finished]:
+    def faces(self) -> dict[str, CompletedStage]:
         """The stages that generate faces, by method; the first is the default."""
-        out: dict[str, Finished] = {}
+        out: dict[str, CompletedStage] = {}
         for stage in self.stages:
             if self.of(stage).part == "face":
                 out.setdefault(self.of(stage).method, stage)
         return out
 
-    def choose_face(self, wanted: str | None) -> Finished | None:
+    def choose_face(self, wanted: str | None) -> CompletedStage | None:
         """The face generator asked for by its method or stage, else the first; None where there is none."""
         if wanted is None:
             return next(iter(self.faces.values()), None)
@@ -322,7 +322,7 @@ class Bundle:
             for motion, face in zip(body, faces, strict=True)
         ]
 
-    def _repeated(self, stage: Finished, prompt: Prompt, words: str, count: int) -> Conditions:
+    def _repeated(self, stage: CompletedStage, prompt: Prompt, words: str, count: int) -> Conditions:
         """The conditions of one prompt, encoded once, for `count` rows."""
         encoder, modalities = self.encoder(stage), self.of(stage).modalities
         return repeated_rows(encoder.encode([prompt], [words], modalities, self.layout.fps), count)

@@ -11,7 +11,7 @@ from pathlib import Path
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.lookup import FORMAT, BundleFile
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.requests import require_used
 from motionloom.pipeline.store.artifact import Artifact, InputStage, require_unchanged
@@ -46,7 +46,7 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
     Stages of other runs come along like the run's own, so an export is whole in itself.
     """
     makers, captioners, skeleton = bundle.stages, bundle.captioners, bundle.layout.skeleton
-    needed: dict[Path, Finished] = {}
+    needed: dict[Path, CompletedStage] = {}
     for stage in (*makers, *captioners):
         _collect(stage, needed)
     names = _names(needed.values())
@@ -83,7 +83,7 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
     write_json(out / BUNDLE_FILE, facts.dump())
 
 
-def _collect(stage: Finished, needed: dict[Path, Finished]) -> None:
+def _collect(stage: CompletedStage, needed: dict[Path, CompletedStage]) -> None:
     """Add a stage after those that it needs."""
     if stage.folder in needed:
         return
@@ -94,7 +94,7 @@ def _collect(stage: Finished, needed: dict[Path, Finished]) -> None:
     needed[stage.folder] = stage
 
 
-def _names(stages: Iterable[Finished]) -> dict[Path, str]:
+def _names(stages: Iterable[CompletedStage]) -> dict[Path, str]:
     """A name for each stage: its own, with a number where one of another run finds its name taken."""
     out: dict[Path, str] = {}
     for stage in sorted(stages, key=lambda stage: stage.outside):

@@ -29,7 +29,7 @@ from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
-from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.edits.clip_file import read_clip, read_seed_motion, require_clip
 from motionloom.pipeline.inference.edits.edit import finish, require_editor, require_work, word_shares
@@ -64,7 +64,7 @@ class MotionModel(
         self._hub_mixin_config = dict(HUB_CONFIG)
 
     @property
-    def _stages(self) -> tuple[Finished, ...]:
+    def _stages(self) -> tuple[CompletedStage, ...]:
         return (*self.bundle.stages, *self.bundle.captioners)
 
     def __repr__(self) -> str:
@@ -320,7 +320,7 @@ def original_of(frames: EditFrames, caption: str) -> GeneratedMotion:
     )  # fmt: skip
 
 
-def _encoded(bundle: Bundle, stage: Finished, text: str) -> Conditions:
+def _encoded(bundle: Bundle, stage: CompletedStage, text: str) -> Conditions:
     """A text as one row of a stage's conditions; none for an empty one."""
     if not text.strip():
         return {}

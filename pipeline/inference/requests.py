@@ -17,7 +17,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import MODEL_FILES
 
@@ -103,11 +103,11 @@ def require_driven(generator: MotionGenerator, prompts: Iterable[Prompt]) -> Non
 
 class _Chooses(Protocol):
     @property
-    def faces(self) -> Mapping[str, Finished]: ...
+    def faces(self) -> Mapping[str, CompletedStage]: ...
     @property
     def generator(self) -> MotionGenerator: ...
-    def choose_face(self, wanted: str | None) -> Finished | None: ...
-    def of(self, stage: Finished) -> MotionGenerator: ...
+    def choose_face(self, wanted: str | None) -> CompletedStage | None: ...
+    def of(self, stage: CompletedStage) -> MotionGenerator: ...
 
 
 def require_used(model: _Chooses, face_captions: Iterable[str] | None, sampling: SamplingConfig) -> None:
@@ -256,7 +256,7 @@ def repeated_rows(conditions: Conditions, count: int) -> Conditions:
     }
 
 
-def weight_bytes(stages: Iterable[Finished]) -> int:
+def weight_bytes(stages: Iterable[CompletedStage]) -> int:
     """Size of the networks of some stages."""
     files = (stage.folder / MODEL_FILES[0] for stage in stages)
     return sum(path.stat().st_size for path in files if path.is_file())

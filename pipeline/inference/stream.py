@@ -26,7 +26,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.drawing import sample_seeds
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
-from motionloom.pipeline.contract.stage import Finished
+from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.idle_pose import IdleBlend
 from motionloom.pipeline.inference.motion import MotionChunk
@@ -207,7 +207,7 @@ class _Maker:
     """One generator's side of a stream: its conditions, its tokens, its frames."""
 
     def __init__(
-        self, bundle: Bundle, stage: Finished, seed: int, sampling: SamplingConfig, config: StreamConfig
+        self, bundle: Bundle, stage: CompletedStage, seed: int, sampling: SamplingConfig, config: StreamConfig
     ) -> None:
         generator = bundle.of(stage)
         streaming = generator.capabilities.streaming
@@ -254,7 +254,7 @@ class _Maker:
         self._frames = np.concatenate([self._frames, frames])
 
 
-def _streaming_face(bundle: Bundle, sampling: SamplingConfig) -> Finished | None:
+def _streaming_face(bundle: Bundle, sampling: SamplingConfig) -> CompletedStage | None:
     """The face generator that was asked for, or the first that can stream; None where there is none."""
     if sampling.face_model is not None:
         return bundle.choose_face(sampling.face_model)

@@ -17,7 +17,7 @@ from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished, Stage, StageCache
+from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache
 from motionloom.pipeline.contract.units import WORK
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
@@ -149,7 +149,9 @@ def _stages_again(
     return folder / target
 
 
-def _inputs_again(folder: Path, recipe: Recipe, stage: Stage, state: RunState | None) -> dict[str, Finished]:
+def _inputs_again(
+    folder: Path, recipe: Recipe, stage: Stage, state: RunState | None
+) -> dict[str, CompletedStage]:
     """The inputs of a stage; with `state` those that are finished, with all that they were made from."""
     stages = {**recipe.outside, **finished_stages(folder)}
     inputs = {role: stages[name] for role, name in stage.inputs.items() if name in stages}

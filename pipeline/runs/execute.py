@@ -13,7 +13,7 @@ from motionloom.datasets.base.files import remove_temporaries, write_text
 from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
-from motionloom.pipeline.contract.stage import Finished, Stage, StageCache, StageContext, StageKind
+from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache, StageContext, StageKind
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, require_fit
@@ -114,17 +114,17 @@ def context_of(
     )
 
 
-def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Finished]:
+def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, CompletedStage]:
     """The stages that feed one of a recipe, by role."""
-    stages: dict[str, Finished] = dict(recipe.outside)
+    stages: dict[str, CompletedStage] = dict(recipe.outside)
 
-    def finished(name: str) -> Finished:
+    def finished(name: str) -> CompletedStage:
         if name not in stages:
             source = recipe.stage(name)
             inputs = {role: finished(above) for role, above in source.inputs.items()}
             gone = {role: message for (needing, role), message in recipe.gone.items() if needing == name}
             folder = stage_folder(run, name)
-            stages[name] = Finished(name, source.kind, source.config, folder, inputs, gone=gone)
+            stages[name] = CompletedStage(name, source.kind, source.config, folder, inputs, gone=gone)
         return stages[name]
 
     return {role: finished(name) for role, name in stage.inputs.items()}

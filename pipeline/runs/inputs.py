@@ -13,7 +13,7 @@ from pathlib import Path
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import outside_stage
-from motionloom.pipeline.contract.stage import Every, Finished, Role, Stage
+from motionloom.pipeline.contract.stage import CompletedStage, Every, Role, Stage
 from motionloom.pipeline.runs.resolve import nearest, place_name
 from motionloom.pipeline.store.artifact import Artifact, require_consistent
 from motionloom.pipeline.store.run_folder import in_export, is_place, label_of, owner_of, stage_folder
@@ -32,7 +32,7 @@ class Sources:
     """Stages that were left out, and what has done so."""
     strict: bool = True
     """Refuse what is gone; else it is noted, since what was made of it may still be used."""
-    outside: dict[str, Finished] = field(default_factory=dict)
+    outside: dict[str, CompletedStage] = field(default_factory=dict)
     gone: dict[tuple[str, str], str] = field(default_factory=dict)
     """Stage and role -> what to say where an input from outside is not there any more."""
 
@@ -86,7 +86,7 @@ class Sources:
         by = self.removed.get(str(name))
         return "" if by is None else f", which {by} leaves out; name another one in inputs, or null"
 
-    def _find(self, stage: Stage, role: str, place: str) -> Finished | None:
+    def _find(self, stage: Stage, role: str, place: str) -> CompletedStage | None:
         at = f"{self.where}: stages.{stage.name}.inputs.{role}"
         try:
             if place not in self.outside:
@@ -138,7 +138,7 @@ class Sources:
             )
 
 
-def find_outside(name: str, where: str) -> Finished:
+def find_outside(name: str, where: str) -> CompletedStage:
     """A stage outside the run; a `UserError` says what is wrong with it and begins with `where`."""
     folder = Path(name).resolve()
     if not folder.is_dir():
@@ -156,7 +156,7 @@ def find_outside(name: str, where: str) -> Finished:
     return stage
 
 
-def _require_usable(outside: Finished, name: str, where: str) -> None:
+def _require_usable(outside: CompletedStage, name: str, where: str) -> None:
     run = owner_of(outside.folder)
     again = f"make it again: motionloom run {run / 'recipe.yaml'} -o {run}"
     for stage in _needed(outside):
@@ -176,7 +176,7 @@ def _require_usable(outside: Finished, name: str, where: str) -> None:
         raise UserError(f"{where}: {name}: {error}") from None
 
 
-def _needed(stage: Finished) -> Iterable[Finished]:
+def _needed(stage: CompletedStage) -> Iterable[CompletedStage]:
     """A stage and those that it needs to load."""
     yield stage
     for role in stage.kind.exported(stage.config):
@@ -197,7 +197,7 @@ def _hint(folder: Path) -> str:
     return nearest(folder.name, names) if names else f"; {_LIKE}"
 
 
-def as_stages(outside: Mapping[str, Finished]) -> dict[str, Stage]:
+def as_stages(outside: Mapping[str, CompletedStage]) -> dict[str, Stage]:
     """Outside stages and all above them, as the checks of a recipe see stages."""
     out: dict[str, Stage] = {}
     for name, stage in outside.items():
@@ -205,7 +205,7 @@ def as_stages(outside: Mapping[str, Finished]) -> dict[str, Stage]:
     return out
 
 
-def _add(name: str, stage: Finished, out: dict[str, Stage]) -> None:
+def _add(name: str, stage: CompletedStage, out: dict[str, Stage]) -> None:
     if name in out:
         return
     above = {role: (place_name(source.folder), source) for role, source in stage.inputs.items()}
@@ -214,7 +214,7 @@ def _add(name: str, stage: Finished, out: dict[str, Stage]) -> None:
         _add(place, source, out)
 
 
-def require_elsewhere(run: Path, stage: Stage, outside: Mapping[str, Finished]) -> None:
+def require_elsewhere(run: Path, stage: Stage, outside: Mapping[str, CompletedStage]) -> None:
     """Refuse, as an input from outside, a stage of the run itself, or one made from what it shall feed."""
     target = stage_folder(run, stage.name).resolve()
     for name in stage.inputs.values():

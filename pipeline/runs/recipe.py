@@ -27,8 +27,8 @@ from pydantic import Field, field_validator
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import (
     VARIABLE,
+    CompletedStage,
     Every,
-    Finished,
     Stage,
     StageConfig,
     StageKind,
@@ -77,7 +77,7 @@ class Recipe:
     hardware: Hardware
     stages: tuple[Stage, ...]
     data_seed: int | None = None
-    outside: Mapping[str, Finished] = field(default_factory=dict)
+    outside: Mapping[str, CompletedStage] = field(default_factory=dict)
     """Stages of other runs and of exports that its stages read, by the names that `Stage.inputs` has."""
     gone: Mapping[tuple[str, str], str] = field(default_factory=dict, compare=False)
     """Stage and role -> what to say of an input from outside that is not there any more."""

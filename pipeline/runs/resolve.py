@@ -34,7 +34,7 @@ from pydantic import ValidationError
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError, explain
-from motionloom.pipeline.contract.stage import Every, Finished, StageConfig, stage_kinds
+from motionloom.pipeline.contract.stage import CompletedStage, Every, StageConfig, stage_kinds
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, is_place
 from motionloom.pipeline.store.weights import load_facts
 from motionloom.pipeline.store.yaml import load_yaml, merge, read_yaml
@@ -300,9 +300,9 @@ class StartingModel:
     """A trained GPT and what it was trained with."""
 
     name: str
-    stages: Mapping[str, Finished]
+    stages: Mapping[str, CompletedStage]
     """By role: gpt, tokenizer, stats, and tma where it has one."""
-    faces: tuple[Finished, ...]
+    faces: tuple[CompletedStage, ...]
     """Its generators of faces."""
     layout: MotionLayout
     """Layout and frame rate of its motion."""
@@ -327,7 +327,7 @@ class StartingModel:
         faces = tuple(stage for stage in generators if stage not in gpts and _of_face(stage))
         return StartingModel(name, stages, faces, load_facts(tokenizer.folder).layout.layout())
 
-    def entry(self, key: str, entry: Tree, missing: Mapping[str, Finished], where: str) -> Tree:
+    def entry(self, key: str, entry: Tree, missing: Mapping[str, CompletedStage], where: str) -> Tree:
         """A stage's entry with what the model says of it."""
         inputs: Tree = dict(entry.get("inputs") or {})
         if "kind" not in entry:
@@ -367,7 +367,7 @@ class StartingModel:
         return out
 
 
-def _generators(name: str, where: str) -> list[Finished]:
+def _generators(name: str, where: str) -> list[CompletedStage]:
     # What opens models is imported where a recipe starts from one.
     from motionloom.pipeline.contract.lookup import generators_of, open_exported
     from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
@@ -382,5 +382,5 @@ def _generators(name: str, where: str) -> list[Finished]:
     raise UserError(f"{where}: neither an export nor a run; name the folder of one")
 
 
-def _of_face(stage: Finished) -> bool:
+def _of_face(stage: CompletedStage) -> bool:
     return bool(getattr(stage.config, "face", False)) or getattr(stage.config, "part", "") == "face"

@@ -133,6 +133,7 @@ def built(folder: Path, build: Callable[[], N]) -> N:
             sizes = [torch.Size(file.get_slice(name).get_shape()).numel() for name in list(file.keys())]
     except (OSError, SafetensorError) as error:
         raise UserError(f"{path}: cannot be read as weights ({error}); copy the folder again") from None
+    # Sizes come from the file alone: a hostile config must not reserve memory that the weights do not fill.
     largest, modules, parameters = max(sizes, default=0), 0, dict[int, torch.nn.Parameter]()
 
     def weighed(_: torch.nn.Module, name: str, part: torch.nn.Parameter | None) -> None:
@@ -156,6 +157,7 @@ def built(folder: Path, build: Callable[[], N]) -> N:
         register_module_buffer_registration_hook(kept),
         register_module_module_registration_hook(counted),
     )
+    # Hooks are global to torch, and another network may be loaded while this one is built.
     building = _BUILDING.set(path)
     try:
         return build()

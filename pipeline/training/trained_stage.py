@@ -20,7 +20,15 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank
 from motionloom.models.training.lora import trained_share
 from motionloom.pipeline.contract.showing import ModelCard
-from motionloom.pipeline.contract.stage import SHOWING, Every, Finished, Inputs, Role, StageContext, StageKind
+from motionloom.pipeline.contract.stage import (
+    SHOWING,
+    CompletedStage,
+    Every,
+    Inputs,
+    Role,
+    StageContext,
+    StageKind,
+)
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.files import copy_files
 from motionloom.pipeline.store.weights import (
@@ -171,18 +179,18 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         facts = self.facts(config, inputs)
         return self.loaded(_frozen(self.network(facts, inputs)), facts, inputs)
 
-    def preview_of_finished(self, stage: Finished, given: Inputs) -> object:
+    def preview_of_finished(self, stage: CompletedStage, given: Inputs) -> object:
         """The network of a stage outside the recipe's run, without its weights."""
         facts, inputs = load_facts(stage.folder), self.inputs.of(given)
         return self.loaded(_frozen(self.network(facts, inputs)), facts, inputs)
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> Any:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> Any:
         facts, inputs = load_facts(stage.folder), self.inputs.of(given)
         net = built(stage.folder, lambda: self.network(facts, inputs))
         load_weights(stage.folder, net)
         return self.loaded(_frozen(net.to(device)), facts, inputs)
 
-    def export(self, stage: Finished, target: Path) -> None:
+    def export(self, stage: CompletedStage, target: Path) -> None:
         copy_files(stage.folder, target, MODEL_FILES)
 
     def estimate(self, config: C, given: Inputs, hardware: Hardware) -> ModelCard:

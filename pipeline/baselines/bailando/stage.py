@@ -23,7 +23,7 @@ from motionloom.pipeline.baselines.bailando.network import ActorCritic, CrossGpt
 from motionloom.pipeline.baselines.bailando.release import release_of_codes, release_of_gpt
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.dances import dance_batches, spread_dances
 from motionloom.pipeline.stages.networks.tokenizer import require_uses
@@ -186,7 +186,7 @@ class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt])
     ) -> Example:
         return Example(example_of(net, inputs.dance_vq, batch), f"3 x {net.config.context} positions")
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         gpt = self.load(stage, given, device)
         return BailandoGenerator(gpt, given["dance_vq"], layout_of(stage), given)
 
@@ -284,7 +284,7 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
         beats = torch.zeros(example["motion"].shape[:2], dtype=torch.bool)
         return Example({**example, "beats": beats}, f"3 x {net.gpt.config.context} positions")
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         note = "" if stage.config.reward_songs == "train" else "rewarded on the songs of the test split"
         gpt = self.load(stage, given, device).gpt
         return BailandoGenerator(gpt, given["dance_vq"], layout_of(stage), given, note)
@@ -299,7 +299,7 @@ def gpt_of(facts: ModelFacts) -> CrossGpt:
     return CrossGpt(CrossGptConfig.parse(facts.config, facts.where), **sizes)
 
 
-def layout_of(stage: Finished) -> MotionLayout:
+def layout_of(stage: CompletedStage) -> MotionLayout:
     """The layout of a finished stage's data."""
     return load_facts(stage.folder).layout.layout()
 

@@ -16,7 +16,7 @@ from motionloom.pipeline.baselines.fact.generator import FactGenerator
 from motionloom.pipeline.baselines.fact.network import Fact, FactConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.stages.networks.captions import part_columns, part_of
 from motionloom.pipeline.stages.networks.dances import dance_batches, spread_dances
 from motionloom.pipeline.store.data import Data
@@ -103,7 +103,7 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
             f"{config.net.motion_frames} frames of motion + {config.net.music_frames} of music",
         )
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return FactGenerator(self.load(stage, given, device), given["stats"].layout, stage.config.part, given)
 
     def exported(self, config: FactStageConfig) -> tuple[str, ...]:

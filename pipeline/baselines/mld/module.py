@@ -12,7 +12,7 @@ from motionloom.models.tma.losses import kl_divergence, reconstruction_loss
 from motionloom.models.training.joints_module import JointsModule
 from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 from motionloom.pipeline.baselines.mld.losses import MotionVaeLossConfig, smooth_l1_of_joints
-from motionloom.pipeline.baselines.mld.network import LatentDenoiser, MotionVae, seen
+from motionloom.pipeline.baselines.mld.network import LatentDenoiser, MotionVae, mask_missing
 
 
 class MotionVaeModule(JointsModule):
@@ -28,7 +28,7 @@ class MotionVaeModule(JointsModule):
         """
         motion, present, config = batch["motion"], batch.get("present"), self.loss_config
         mask = length_mask(batch["length"], motion.shape[1])
-        mu, logvar = self.net.encode(seen(motion, present), mask)
+        mu, logvar = self.net.encode(mask_missing(motion, present), mask)
         rebuilt = self.net.decode(drawn(mu, logvar) if self.training else mu, mask)
         found, wanted = map(self.in_units, (rebuilt, motion))
         zero = torch.zeros_like(mu)
@@ -63,7 +63,7 @@ class LatentDiffusionModule(StageModule):
         config = self.net.config
         with torch.no_grad():
             mask = length_mask(batch["length"], motion.shape[1])
-            mu, logvar = self.vae.module.encode(seen(motion, batch.get("present")), mask)
+            mu, logvar = self.vae.module.encode(mask_missing(motion, batch.get("present")), mask)
             z = drawn(mu, logvar) if self.training else mu
         step = torch.randint(0, config.schedule.steps, (len(z),), device=z.device)
         noise = torch.randn_like(z)

@@ -115,7 +115,7 @@ class MotionVae(nn.Module):
         (`present` bool [B, D], None = all are) is read as 0, the mean.
         """
         mask = length_mask(length, x.shape[1])
-        return self.decode(self.encode(seen(x, present), mask)[0], mask)
+        return self.decode(self.encode(mask_missing(x, present), mask)[0], mask)
 
 
 class LoadedMotionVae(NamedTuple):
@@ -157,7 +157,7 @@ class LatentDenoiser(nn.Module):
         return out[:, : noisy.shape[1]].float()
 
 
-def seen(x: Tensor, present: Tensor | None) -> Tensor:
+def mask_missing(x: Tensor, present: Tensor | None) -> Tensor:
     """Motion [B, T, D] with 0, the mean, in the columns that a clip does not hold (bool [B, D])."""
     return x if present is None else x.masked_fill(~present[:, None], 0.0)
 

@@ -23,7 +23,7 @@ from motionloom.pipeline.baselines.mld.network import (
 )
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, Stage, register
+from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, Stage, register
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     CaptionStage,
@@ -209,7 +209,7 @@ class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffus
     def exported(self, config: LatentDiffusionStageConfig) -> tuple[str, ...]:
         return ("stats", "text", "motion_vae")
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         vae: LoadedMotionVae = given["motion_vae"]
         return LatentMotion(vae.layout, "bodyhand", given, self.load(stage, given, device), vae)
 

@@ -30,14 +30,14 @@ class MotionClipModule(JointsModule):
         [B, D] (optional: all). Means of squared errors over real frames, and of 1 - cosine over clips.
         """
         net, config, present = self.net, self.loss_config, batch.get("present")
-        seen = net.coordinates(batch["motion"], present)
-        mask = length_mask(batch["length"], seen.shape[1])
-        z = net.encode(seen, mask)
-        error = net.decode(z, mask) - seen.float()
-        error = error * mask[..., None]
+        motion = net.coordinates(batch["motion"], present)
+        mask = length_mask(batch["length"], motion.shape[1])
+        z = net.encode(motion, mask)
+        # Padding of the decoder's output is zero, and that of the motion may not be.
+        error = (net.decode(z, mask) - motion.float()) * mask[..., None]
         columns = None if net.sixd is not None else present
         held = None if present is None else present_joints(present, self.layout).repeat_interleave(3, dim=1)
-        apart = self._joints(seen.float() + error) - self._joints(seen.float())
+        apart = self._joints(motion.float() + error) - self._joints(motion.float())
         text = batch["conditions"]["text"].pooled
         losses = {
             "features": masked_mean(error.square(), mask, columns),
@@ -48,9 +48,9 @@ class MotionClipModule(JointsModule):
         loss = torch.stack([getattr(config, name) * value for name, value in losses.items()]).sum()
         return {"loss": loss, **losses}
 
-    def _joints(self, seen: Tensor) -> Tensor:
+    def _joints(self, motion: Tensor) -> Tensor:
         """Joints [B, T, N, 3] in metres of coordinates [B, T, D]."""
-        with torch.autocast(seen.device.type, enabled=False):
+        with torch.autocast(motion.device.type, enabled=False):
             if self.net.sixd is not None:
-                return self.net.sixd.joints(seen)
-            return torch_joints_of(self.in_units(seen), self.layout)
+                return self.net.sixd.joints(motion)
+            return torch_joints_of(self.in_units(motion), self.layout)

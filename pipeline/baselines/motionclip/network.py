@@ -57,26 +57,26 @@ class SixD(nn.Module):
         trans = values[..., self.trans]
         return torch.cat([two.flatten(-3), trans, torch.zeros_like(trans)], dim=-1)
 
-    def decode(self, seen: Tensor) -> Tensor:
+    def decode(self, coordinates: Tensor) -> Tensor:
         """The inverse of `encode`, of what is near rotations too."""
         import roma
 
-        local, trans = self._parts(seen)
-        turns = roma.rotmat_to_rotvec(local).flatten(-2)
-        values = torch.empty(*seen.shape[:-1], len(self.mean), dtype=turns.dtype, device=seen.device)
+        local, trans = self._parts(coordinates)
+        turns: Tensor = roma.rotmat_to_rotvec(local).flatten(-2)
+        values = turns.new_empty(*turns.shape[:-1], len(self.mean))
         values[..., self.pose], values[..., self.trans] = turns, trans
         return (values - self.mean) / self.std
 
-    def joints(self, seen: Tensor) -> Tensor:
+    def joints(self, coordinates: Tensor) -> Tensor:
         """Joints [..., 22, 3] in metres."""
-        return torch_smpl_joints(*self._parts(seen))
+        return torch_smpl_joints(*self._parts(coordinates))
 
-    def _parts(self, seen: Tensor) -> tuple[Tensor, Tensor]:
+    def _parts(self, coordinates: Tensor) -> tuple[Tensor, Tensor]:
         """Rotations [..., 24, 3, 3] by Gram and Schmidt, and translations [..., 3]."""
         import roma
 
-        two = seen[..., :144].reshape(*seen.shape[:-1], 24, 2, 3).transpose(-1, -2)
-        return roma.special_gramschmidt(two), seen[..., 144:147]
+        two = coordinates[..., :144].reshape(*coordinates.shape[:-1], 24, 2, 3).transpose(-1, -2)
+        return roma.special_gramschmidt(two), coordinates[..., 144:147]
 
 
 class MotionClipConfig(StackConfig):
@@ -128,13 +128,14 @@ class MotionClip(nn.Module):
         """Motion [B, T, motion_dim] as it is read and written, [B, T, D]; 0, the mean, in the columns that a
         clip does not hold (`present` bool [B, motion_dim]; None = all are).
         """
-        seen = x if self.sixd is None else self.sixd.encode(x)
-        return seen if present is None or self.sixd else seen.masked_fill(~present[:, None], 0.0)
+        if self.sixd is not None:
+            return self.sixd.encode(x)
+        return x if present is None else x.masked_fill(~present[:, None], 0.0)
 
-    def encode(self, seen: Tensor, mask: Tensor) -> Tensor:
+    def encode(self, coordinates: Tensor, mask: Tensor) -> Tensor:
         """Coordinates [B, T, D], mask bool [B, T] (True = real) -> latents [B, C] of any length."""
-        frames = self.enter(seen)
-        x = torch.cat([self.queries.to(frames.dtype).expand(len(seen), -1, -1), frames], dim=1)
+        frames = self.enter(coordinates)
+        x = torch.cat([self.queries.to(frames.dtype).expand(len(coordinates), -1, -1), frames], dim=1)
         x = self.dropout(x + sinusoid(x.shape[1], x.shape[2], x.device).to(x.dtype))
         visible = torch.cat([mask.new_ones(len(mask), 2), mask], dim=1)
         out: Tensor = self.encoder(x, visible)[:, 0]
@@ -149,9 +150,9 @@ class MotionClip(nn.Module):
         out: Tensor = self.leave(made).float()
         return out * mask[..., None]
 
-    def features(self, seen: Tensor) -> Tensor:
+    def features(self, coordinates: Tensor) -> Tensor:
         """Coordinates [B, T, D] -> normalised motion [B, T, motion_dim]."""
-        return seen if self.sixd is None else self.sixd.decode(seen)
+        return coordinates if self.sixd is None else self.sixd.decode(coordinates)
 
 
 def _stack(config: MotionClipConfig, *, memory: bool = False) -> Transformer:

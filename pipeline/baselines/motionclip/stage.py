@@ -20,7 +20,7 @@ from motionloom.pipeline.baselines.motionclip.network import (
 )
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
@@ -113,7 +113,7 @@ class MotionClipStage(CaptionStage[MotionClipStageConfig, CaptionInputs, MotionC
             mean=mean, std=std, loss=config.loss,
         )  # fmt: skip
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         facts, layout = load_facts(stage.folder), given["stats"].layout
         net = self.load(stage, given, device)
         return TextAsLatent(layout, "bodyhand", given, net, facts.fact("max_frames", int))

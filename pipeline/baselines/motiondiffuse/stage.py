@@ -11,7 +11,7 @@ from motionloom.pipeline.baselines.motiondiffuse.generator import MotionDiffuseM
 from motionloom.pipeline.baselines.motiondiffuse.network import MotionDiffuse, MotionDiffuseConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     CaptionStage,
@@ -63,7 +63,7 @@ class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, M
 
         return DenoiserModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
         return MotionDiffuseMotion(given["stats"].layout, part, given, net)
 

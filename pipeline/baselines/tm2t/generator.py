@@ -23,7 +23,7 @@ from motionloom.pipeline.store.networks import TrainedTokenizer, device_of
 from motionloom.pipeline.store.tokens import PresentTokens, present_table
 
 
-class Written(NamedTuple):
+class Hypothesis(NamedTuple):
     """One sentence."""
 
     words: tuple[int, ...]
@@ -33,7 +33,7 @@ class Written(NamedTuple):
 
 
 @torch.no_grad()
-def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[list[Written]]:
+def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[list[Hypothesis]]:
     """Return up to `count` sentences for each of B motions, likeliest first.
 
     Args:
@@ -49,7 +49,7 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
     scores[:, 0] = 0.0  # the beams of a motion begin as one
     last = torch.full((batch * beam,), START, device=device)
     said = torch.empty(batch, beam, 0, dtype=torch.int64, device=device)
-    done: list[list[Written]] = [[] for _ in range(batch)]
+    done: list[list[Hypothesis]] = [[] for _ in range(batch)]
     for step in range(net.config.max_words + 1):
         words = net.next(last, reading).double().view(batch, beam, -1)
         if step == 0:
@@ -57,6 +57,7 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
         if step == net.config.max_words:
             words[..., :END] = words[..., END + 1 :] = -torch.inf
         total = (scores[..., None] + words).flatten(1)
+        # Twice the beam: as many as `beam` of the best may end here, and `beam` must go on.
         best, at = total.topk(min(2 * beam, total.shape[1]), dim=1)
         origin, word = at // words.shape[-1], at % words.shape[-1]
         for row in range(batch):
@@ -64,11 +65,12 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
                 best[row].tolist(), origin[row].tolist(), (word[row] == END).tolist(), strict=True
             ):
                 if ended and score > -torch.inf:
-                    done[row].append(Written(tuple(said[row, one].tolist()), score))
+                    done[row].append(Hypothesis(tuple(said[row, one].tolist()), score))
             done[row] = sorted(done[row], key=lambda found: -found.log_probability)[:count]
         # Of those that go on, the first `beam`; at most `beam` of the 2 * beam end here.
         going = torch.where(word == END, -torch.inf, best)
         scores, kept = going.topk(beam, dim=1)
+        # Words only make a sentence less likely, so the search ends once no other can overtake.
         if all(_finished(found, count, float(left)) for found, left in zip(done, scores[:, 0], strict=True)):
             break
         origin, word = origin.gather(1, kept), word.gather(1, kept)
@@ -78,7 +80,7 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
     return done
 
 
-def _finished(found: list[Written], count: int, left: float) -> bool:
+def _finished(found: list[Hypothesis], count: int, left: float) -> bool:
     """Whether no unfinished sentence can be among the best: words only make it less likely."""
     return len(found) == count and found[-1].log_probability >= left
 

@@ -124,6 +124,7 @@ class Seq2SeqModule(StageModule):
             logits.flatten(0, 1), tokens.flatten(), ignore_index=-1, reduction="none"
         ).view_as(tokens)
         counted = predicted(tokens, logits, known)
+        # The release sums errors; the mean is logged either way, so that runs compare.
         values = {"loss": summed_or_mean(each, counted, summed=self.loss_config.summed), "ce": ce}
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)

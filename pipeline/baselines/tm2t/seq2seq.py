@@ -36,7 +36,7 @@ class Seq2SeqConfig(Config):
     """Longest sequence, its End tokens included."""
 
 
-class Read(NamedTuple):
+class EncodedWords(NamedTuple):
     """Encoded words, as the decoder reads them."""
 
     keys: Tensor
@@ -102,7 +102,7 @@ class Seq2Seq(TokenNetwork):
         """Longest motion in groups."""
         return (self.config.max_tokens - closing_length(self.pattern)) // len(self.pattern)
 
-    def read(self, text: Tensor, mask: Tensor) -> tuple[Read, Tensor]:
+    def read(self, text: Tensor, mask: Tensor) -> tuple[EncodedWords, Tensor]:
         """Words [B, S, E], `mask` bool [B, S] of real ones, from the first on -> what the decoder sees, and
         its first state [B, D].
         """
@@ -117,9 +117,9 @@ class Seq2Seq(TokenNetwork):
         at = last[..., None].expand(-1, -1, forth.shape[2])
         state = self.begin(torch.cat([forth.gather(1, at), back.gather(1, at)], dim=-1)[:, 0])
         states = torch.cat([forth, back.gather(1, order.expand(-1, -1, back.shape[2]))], dim=-1)
-        return Read(self.key(states), self.value(states), mask), state
+        return EncodedWords(self.key(states), self.value(states), mask), state
 
-    def step(self, x: Tensor, state: Tensor, read: Read) -> Tensor:
+    def step(self, x: Tensor, state: Tensor, read: EncodedWords) -> Tensor:
         """The next state [B, D] after a token's embedding [B, D]."""
         scores = (read.keys @ self.query(state)[..., None])[..., 0] / self.config.dim**0.5
         weights = scores.masked_fill(~read.mask, -torch.inf).softmax(-1)

@@ -25,7 +25,7 @@ from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tStage, Tm2tStageCon
 from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import CAPTIONER, GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.contract.stage import CAPTIONER, GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.tokens import Tokens
 from motionloom.pipeline.store.data import Data, DataPreview, captions_of
@@ -170,7 +170,7 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
         frames = groups * inputs.tokenizer.net.group_frames
         return Example(tensors, f"{len(order)} tokens for {frames} frames, {words - 1} words")
 
-    def captioner(self, stage: Finished, given: Inputs, device: torch.device) -> MotionCaptioner:
+    def captioner(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionCaptioner:
         loaded: TokenCaptioner = self.load(stage, given, device)
         return TokenCaptioner(loaded.net, loaded.tokenizer, loaded.vocabulary, stage.config.beam)
 
@@ -302,7 +302,7 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
         frames = net.max_groups * inputs.tokenizer.net.group_frames
         return Example(tensors, f"{len(order)} tokens for {frames} frames")
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return Seq2SeqGenerator(self.load(stage, given, device), given)
 
     def exported(self, config: Seq2SeqStageConfig) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from motionloom.datasets.shards.store import is_url, open_store
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.contract.stage import (
     RUNTIME,
-    Finished,
+    CompletedStage,
     FunctionStage,
     Inputs,
     StageConfig,
@@ -49,7 +49,7 @@ class DataStage(FunctionStage):
             )
         return DataPreview(MotionLayout.named(name, fps=fps or 30.0))
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> Data:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> Data:
         return Data(stage.folder)
 
 

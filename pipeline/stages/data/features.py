@@ -14,7 +14,7 @@ from motionloom.datasets.modalities.modality import FrameStats, Modality
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import (
-    Finished,
+    CompletedStage,
     Inputs,
     StageConfig,
     StageContext,
@@ -73,10 +73,10 @@ class FeaturesStage(StageKind[FeaturesConfig]):
     def preview(self, config: FeaturesConfig, given: Inputs) -> FeaturesPreview:
         return FeaturesPreview(config.width or self.width)
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> FrameStats:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> FrameStats:
         return FrameStats.load(stage.folder / self.file)
 
-    def export(self, stage: Finished, target: Path) -> None:
+    def export(self, stage: CompletedStage, target: Path) -> None:
         copy_files(stage.folder, target, (self.file,))
 
 

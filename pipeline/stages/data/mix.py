@@ -17,8 +17,8 @@ from motionloom.datasets.motion.layout import MotionLayout, require_layout
 from motionloom.datasets.schema import SPLITS, UserError
 from motionloom.pipeline.contract.stage import (
     RUNTIME,
+    CompletedStage,
     Every,
-    Finished,
     Inputs,
     Stage,
     StageConfig,
@@ -90,11 +90,11 @@ class MixStage(StageKind[MixStageConfig]):
     def preview(self, config: MixStageConfig, given: Inputs) -> DataPreview:
         return DataPreview(_one_layout({key.partition(".")[2]: given[key].layout for key in given}))
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> Data:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> Data:
         return Data(stage.folder)
 
 
-def _part(context: StageContext, stage: Finished, weight: float) -> MixedStage:
+def _part(context: StageContext, stage: CompletedStage, weight: float) -> MixedStage:
     """A stage of the mix; one of another run by the way to it, so that runs can be moved together."""
     folder = place_from(context.folder, stage.folder) if stage.outside else None
     return MixedStage(stage=stage.folder.name, folder=folder, weight=weight)

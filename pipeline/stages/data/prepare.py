@@ -18,7 +18,7 @@ from motionloom.datasets.text.vocabulary import word_counts
 from motionloom.pipeline.contract.stage import (
     CPU,
     RUNTIME,
-    Finished,
+    CompletedStage,
     Inputs,
     StageConfig,
     StageContext,
@@ -110,10 +110,10 @@ class StatsStage(StageKind[StatsConfig]):
             f"    {len(dataset)} clips, {int(dataset.frames.sum())} frames, {dataset.layout.dim} dimensions"
         )
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> FeatureStats:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> FeatureStats:
         return FeatureStats.load(stage.folder / _STATS)
 
-    def export(self, stage: Finished, target: Path) -> None:
+    def export(self, stage: CompletedStage, target: Path) -> None:
         copy_files(stage.folder, target, (_STATS,))
 
 
@@ -165,18 +165,18 @@ class TextStage(StageKind[TextConfig]):
     def preview(self, config: TextConfig, given: Inputs) -> TextPreview:
         return TextPreview.of(config.encoder)
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> TextSource:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> TextSource:
         return _source(stage, device)
 
     def exported_config(self, config: TextConfig) -> TextConfig:
         """Return the config without places on this machine: an export brings its encoder along."""
         return TextConfig()
 
-    def export(self, stage: Finished, target: Path) -> None:
+    def export(self, stage: CompletedStage, target: Path) -> None:
         _source(stage, CPU).export(target)
 
 
-def _source(stage: Finished, device: torch.device) -> TextSource:
+def _source(stage: CompletedStage, device: torch.device) -> TextSource:
     source = TextSource(stage.folder, stage.config.encoder, device, stage.exported)
     if stage.exported:
         _ = source.known  # read at once: what is broken in an export is found before anything is made

@@ -19,7 +19,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs
+from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs
 from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.text import TextSource
@@ -99,7 +99,7 @@ class DenoiserStage(CaptionStage[D, CaptionInputs, T]):
         extra = {"motion_dim": width, "text_dim": inputs.text.dim, "part": config.part}
         return ModelFacts.of(self.name, config.net, layout, extra)
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
         window = stage.config.max_frames  # the longest motion of its training
         return DiffusionMotion(given["stats"].layout, part, given, net, window)

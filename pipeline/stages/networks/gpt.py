@@ -16,7 +16,7 @@ from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.training.lora import LoraConfig, add_lora, merge_lora, require_peft
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, Stage, filled_by, register
+from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, Stage, filled_by, register
 from motionloom.pipeline.inference.generators.gpt import GptGenerator
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.tokens import Tokens
@@ -157,6 +157,7 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int, log: Log
     ) -> Batches:
         data, text, tokenizer = inputs.data, inputs.text.cache, inputs.tokenizer.net
+        # TMA's text latents are the prior, or the target of L_align, or both.
         tma = inputs.tma if config.prior == "tma" or config.aligned else None
 
         @cache
@@ -171,6 +172,7 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
 
         def batches(split: str, batch: int, rank: int = 0, world: int = 1, *, training: bool) -> TokenBatches:
             clips = clips_of(split)
+            # All captions are embedded once, before the first batch.
             latents = tma.embed_captions(clips.texts, text) if tma is not None else None
             if config.prior == "tma" and latents is not None:
                 prior = latents
@@ -233,7 +235,7 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     def loaded(self, net: InterleavedGPT, facts: ModelFacts, inputs: GptInputs) -> LoadedGpt:
         return LoadedGpt(net, facts.fact("prior", str))
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return GptGenerator(self.load(stage, given, device), given, stage.config.face)
 
     def exported(self, config: GptStageConfig) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from motionloom.pipeline.contract.stage import (
-    Finished,
+    CompletedStage,
     Inputs,
     StageConfig,
     StageContext,
@@ -52,10 +52,10 @@ class GuoEvaluatorStage(StageKind[GuoEvaluatorConfig]):
         load_published(source)
         copy_files(source, context.folder, (*FILES, FACTS))
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> LoadedEvaluator:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> LoadedEvaluator:
         return load_published(stage.folder, untagged=stage.config.untagged, device=device)
 
-    def export(self, stage: Finished, target: Path) -> None:
+    def export(self, stage: CompletedStage, target: Path) -> None:
         copy_files(stage.folder, target, (*FILES, FACTS))
 
 

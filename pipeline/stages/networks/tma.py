@@ -19,7 +19,7 @@ from motionloom.pipeline.contract.stage import (
     ALIGNMENT,
     FACE_ALIGNMENT,
     GENERATOR,
-    Finished,
+    CompletedStage,
     Inputs,
     Stage,
     filled_by,
@@ -135,7 +135,7 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
         frames, part = facts.fact("max_frames", int), part_of(facts)
         return LoadedTma(net, facts.layout.layout(), frames, part, inputs)
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         tma: LoadedTma = self.load(stage, given, device)
         return VaeMotion(tma.layout, tma.part, given, tma)
 

@@ -18,7 +18,7 @@ from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.pipeline.contract.showing import Bars, Showing
 from motionloom.pipeline.contract.stage import (
     SHOWING,
-    Finished,
+    CompletedStage,
     Inputs,
     StageConfig,
     StageContext,
@@ -93,10 +93,10 @@ class TokensStage(StageKind[TokensConfig]):
         for split in data.splits:
             yield EncodedSplit(tokenizer.net, data.split(split), stats, context.config.batch_frames)
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> Tokens:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> Tokens:
         return Tokens(stage.folder, tuple(given["tokenizer"].net.streams))
 
-    def show(self, stage: Finished, given: Inputs) -> list[Showing]:
+    def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
         """How often each code is used by the training clips."""
         out: list[Showing] = []
         tokens = self.load(stage, given, torch.device("cpu"))

@@ -15,7 +15,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
-    Finished,
+    CompletedStage,
     Inputs,
     Stage,
     StageContext,
@@ -61,13 +61,13 @@ class UdeStage(StageKind[UdeConfig]):
         """Write the settings down; there is nothing to train."""
         write_json(context.folder / "ude.json", context.config.dump())
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return UdeGenerator(given["utt"], given.get("dmd"), stage.config)
 
     def exported(self, config: UdeConfig) -> tuple[str, ...]:
         return ("utt", "dmd")
 
-    def export(self, stage: Finished, target: Path) -> None:
+    def export(self, stage: CompletedStage, target: Path) -> None:
         """Its settings are in the list of stages."""
         target.mkdir(parents=True, exist_ok=True)
 

@@ -13,7 +13,7 @@ from motionloom.pipeline.contract.showing import FigureTable, Showing
 from motionloom.pipeline.contract.stage import (
     CAPTIONER,
     SHOWING,
-    Finished,
+    CompletedStage,
     Inputs,
     StageConfig,
     StageContext,
@@ -94,7 +94,7 @@ class EvaluateCaptionsStage(StageKind[EvaluateCaptionsConfig]):
         FigureFile(self.name, tuple(figures), who).write(context.folder / FILE_NAME)
         print_tables(figures, context.console)
 
-    def show(self, stage: Finished, given: Inputs) -> list[Showing]:
+    def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
         """The table."""
         found = FigureFile.read(stage.folder / FILE_NAME)
         return [FigureTable(*table) for table in figure_tables(found.figures)]

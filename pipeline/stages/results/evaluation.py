@@ -13,7 +13,14 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.showing import FigureTable, Showing
-from motionloom.pipeline.contract.stage import SHOWING, Finished, Inputs, StageCache, StageContext, StageKind
+from motionloom.pipeline.contract.stage import (
+    SHOWING,
+    CompletedStage,
+    Inputs,
+    StageCache,
+    StageContext,
+    StageKind,
+)
 from motionloom.pipeline.contract.units import Arrays, even_slices
 from motionloom.pipeline.evaluation.cases import shown_cases
 from motionloom.pipeline.evaluation.figures import (
@@ -52,7 +59,7 @@ class EvaluationStage(StageKind):
         print_tables(found.figures, context.console)
         context.units.clear()
 
-    def show(self, stage: Finished, given: Inputs) -> list[Showing]:
+    def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
         """The tables, and the worst and the best to watch."""
         found = FigureFile.read(stage.folder / FILE_NAME)
         tables = [FigureTable(*table) for table in figure_tables(found.figures)]
@@ -106,7 +113,7 @@ class Evaluation:
 
     def about(self, bundle: Bundle | None) -> dict[str, Any]:
         """Return the evaluated stage, split and generators."""
-        made_by = dict[str, Finished | None]()
+        made_by = dict[str, CompletedStage | None]()
         if bundle is not None:
             face = bundle.choose_face(self.config.sampling.face_model)
             made_by = {"generator": bundle.main, "face_generator": face}
@@ -153,7 +160,9 @@ def _joints(dataset: ClipDataset, index: int) -> Any:
     return joints_of(np.asarray(dataset.motion(index))[:, layout.part("bodyhand")], layout)
 
 
-def bundle_driven_by(modality: str, stages: Sequence[Finished], stage_cache: StageCache) -> Bundle | None:
+def bundle_driven_by(
+    modality: str, stages: Sequence[CompletedStage], stage_cache: StageCache
+) -> Bundle | None:
     """The first generator of body motion that is conditioned on `modality`, with the face generators.
 
     None where there is none.

@@ -21,8 +21,8 @@ from motionloom.pipeline.contract.showing import Bars, FigureTable
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
     SHOWING,
+    CompletedStage,
     Every,
-    Finished,
     StageConfig,
     StageContext,
     StageKind,
@@ -146,14 +146,14 @@ def _watch(page: Page, context: StageContext, said: list[ViewerMotion], danced: 
         page.add_viewer(motions, f"Each row is one {row}: {listed}. {use}")
 
 
-def _logged(stages: Sequence[Finished], state: RunState) -> list[Finished]:
+def _logged(stages: Sequence[CompletedStage], state: RunState) -> list[CompletedStage]:
     """The stages with curves: those that are finished, and trainings that are not, in the recipe's order."""
     out = {stage.name: stage for stage in stages if not stage.outside}
     for stage in state.unfinished:
         kind = stage_kind(stage.kind, f"{state.folder / 'recipe.yaml'}: stages.{stage.name}")
         if stage.step:
             config = kind.config.parse(dict(stage.settings), f"{stage.folder}: settings")
-            out[stage.name] = Finished(stage.name, kind, config, stage.folder, {})
+            out[stage.name] = CompletedStage(stage.name, kind, config, stage.folder, {})
     return [out[stage.name] for stage in state.stages if stage.name in out] + [s for s in stages if s.outside]
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from motionloom.datasets.base.progress import duration
 from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
-from motionloom.pipeline.contract.stage import Finished, StageContext, stage_kind
+from motionloom.pipeline.contract.stage import CompletedStage, StageContext, stage_kind
 from motionloom.pipeline.evaluation.cases import Clips
 from motionloom.pipeline.render.charts import curve_label, log_lines
 from motionloom.pipeline.render.page import Page
@@ -39,7 +39,7 @@ def draw_showings(page: Page, heading: str, kind: type[Showing], shown: Sequence
             page.add_histogram(uses, ends, thing.title, thing.x_label, thing.y_label)
 
 
-def draw_curves(page: Page, stages: Sequence[Finished]) -> None:
+def draw_curves(page: Page, stages: Sequence[CompletedStage]) -> None:
     """The curves of trainings, finished or going on, that the kinds of stages find worth drawing."""
     page.add_heading("Training")
     for stage in stages:
@@ -186,11 +186,11 @@ def _settings(context: StageContext, state: RunState | None) -> Iterator[tuple[s
         yield finished.name, finished.kind.name, finished.config.dump()
 
 
-def _upstream(context: StageContext) -> list[Finished]:
+def _upstream(context: StageContext) -> list[CompletedStage]:
     """The stages that the page is made from, those that others read first."""
-    out: dict[Path, Finished] = {}
+    out: dict[Path, CompletedStage] = {}
 
-    def take(stage: Finished) -> None:
+    def take(stage: CompletedStage) -> None:
         if stage.folder not in out:
             for above in stage.inputs.values():
                 take(above)

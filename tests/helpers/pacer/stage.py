@@ -7,7 +7,7 @@ import torch
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, Finished, Inputs, register
+from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, Release
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 from pacer.batches import PacerBatches, PacerInputs
@@ -59,7 +59,7 @@ class PacerStage(TrainedStage[PacerConfig, PacerInputs, Pacer]):
         length = torch.full((batch,), config.window)
         return Example({**both, "length": length}, f"{config.window} frames")
 
-    def generator(self, stage: Finished, given: Inputs, device: torch.device) -> MotionGenerator:
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         """From a run and from an export alike."""
         stats: FeatureStats = given["stats"]
         return PacerGenerator(self.load(stage, given, device), stats.layout, stats, given["audio"])

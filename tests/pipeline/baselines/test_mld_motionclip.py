@@ -13,7 +13,7 @@ from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages, open_exported
-from motionloom.pipeline.contract.stage import Finished, StageCache
+from motionloom.pipeline.contract.stage import CompletedStage, StageCache
 from motionloom.pipeline.evaluation.figures import MODEL, FigureFile
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import export_run, run_recipe
@@ -60,7 +60,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_recipe(folder / "recipe.yaml", folder / "run", console=Console(quiet=True))
 
 
-def of(stages: Iterable[Finished], name: str) -> Bundle:
+def of(stages: Iterable[CompletedStage], name: str) -> Bundle:
     """One generator alone, of a run that has several."""
     return Bundle([stage for stage in stages if stage.name == name], StageCache())
 

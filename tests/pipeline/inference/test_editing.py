@@ -25,7 +25,7 @@ from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Capabilities
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished, StageCache
+from motionloom.pipeline.contract.stage import CompletedStage, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
 from motionloom.pipeline.inference.edits.edit import finish
@@ -52,8 +52,8 @@ class Encoder:
         return EncodedText(sentence, sentence[:, None], np.ones((len(captions), 1), dtype=np.bool_))
 
 
-def stage(made: Any) -> Finished:
-    return Finished("stage", MadeStage(made), None, Path(f"stage-{made.part}"), {})
+def stage(made: Any) -> CompletedStage:
+    return CompletedStage("stage", MadeStage(made), None, Path(f"stage-{made.part}"), {})
 
 
 def editor(name: str = "wholebody363", face: bool = False) -> Bundle:

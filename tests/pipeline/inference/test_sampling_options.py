@@ -26,7 +26,7 @@ from motionloom.models.tokenizer.single import RvqConfig
 from motionloom.pipeline.baselines.mdm.network import Mdm
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import Finished, StageCache
+from motionloom.pipeline.contract.stage import CompletedStage, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.inference.generators.gpt import (
@@ -99,10 +99,10 @@ def bundle(
     return Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], StageCache())
 
 
-def stage(name: str, made: Any, **given: Any) -> Finished:
+def stage(name: str, made: Any, **given: Any) -> CompletedStage:
     """A finished stage that gives `made`, and those that feed it."""
     above = {role: stage(role, SimpleNamespace(encoder=one)) for role, one in given.items()}
-    return Finished(name, MadeStage(made), None, Path(name), above)
+    return CompletedStage(name, MadeStage(made), None, Path(name), above)
 
 
 def test_a_length_for_each_caption() -> None:

@@ -22,7 +22,7 @@ from motionloom.datasets.synth.music.recording import record
 from motionloom.datasets.synth.music.scores import excerpt, scores
 from motionloom.datasets.synth.music.song import Song, draw_song
 from motionloom.pipeline.contract.stage import (
-    Finished,
+    CompletedStage,
     Inputs,
     StageConfig,
     StageContext,
@@ -149,7 +149,7 @@ class SongsStage(StageKind[SongsConfig]):
     def preview(self, config: SongsConfig, given: Inputs) -> SongPool:
         return SongPool(Path(), config)
 
-    def load(self, stage: Finished, given: Inputs, device: torch.device) -> SongPool:
+    def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> SongPool:
         return SongPool(stage.folder, stage.config)
 
 
