@@ -39,6 +39,8 @@ HERE = Path(__file__).resolve().parent
 RECORDS = HERE / "records"
 SEEDS = (7, 8, 9)
 """Seeds of a full table; a row of fewer says how many."""
+OFF = {"sampling.top_k": 0, "sampling.cfg_scale": 1.0, "sampling.candidates": 1}
+"""Values of sampling settings that leave the distribution as it is."""
 Record = dict[str, Any]
 Shares = dict[str, dict[str, float]]
 """Held out or not -> attribute -> share of right ones."""
@@ -204,6 +206,9 @@ def _protocol(record: Record) -> str:
 
 
 def _facts(facts: Mapping[str, Any]) -> str:
+    """Settings in words, without those that change nothing."""
     return ", ".join(
-        f"{name.removeprefix('sampling.')} {value}" for name, value in facts.items() if str(value) != "{}"
+        f"{name.removeprefix('sampling.')} {value}"
+        for name, value in facts.items()
+        if str(value) != "{}" and OFF.get(name) != value
     )
