@@ -92,10 +92,10 @@ class Bundle:
         if not (folder / "recipe.yaml").is_file():
             if not folder.exists():
                 raise UserError(no_such_model(name))
-            said = say_model(name)
+            shipped = say_model(name)
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no {BUNDLE_FILE})"
-                + ("" if said is None else "; the model of this name is taken where no such folder is")
+                + ("" if shipped is None else "; the model of this name is taken where no such folder is")
             )
         return Bundle.from_run(folder, device)
 
@@ -117,10 +117,10 @@ class Bundle:
 
     def _open(self, stage: CompletedStage) -> None:
         """Load a stage's inputs, and theirs, as far as generation needs them."""
-        needed, given = stage.kind.exported(stage.config), self.stage_cache.given_to(stage)
+        needed, inputs = stage.kind.exported(stage.config), self.stage_cache.given_to(stage)
         for role in stage.kind.roles():
-            if role.name in needed and (role.name in given or not role.optional):
-                given[role.name]
+            if role.name in needed and (role.name in inputs or not role.optional):
+                inputs[role.name]  # looking it up loads it, so a broken one is found before anything is made
                 self._open(stage.inputs[role.name])
 
     def of(self, stage: CompletedStage) -> MotionGenerator:
@@ -190,13 +190,13 @@ class Bundle:
         frames = self.generator.max_frames
         return math.inf if frames is None else frames / self.layout.fps
 
-    def drawing(self, given: SamplingConfig | None = None) -> SamplingConfig:
-        """How to draw: the fields that are given, else those that the model recommends."""
-        return self.recommended if given is None else given.over(self.recommended)
+    def drawing(self, sampling: SamplingConfig | None = None) -> SamplingConfig:
+        """How to draw: the fields that are set, else those that the model recommends."""
+        return self.recommended if sampling is None else sampling.over(self.recommended)
 
-    def in_effect(self, given: SamplingConfig | None = None) -> dict[str, object]:
+    def in_effect(self, sampling: SamplingConfig | None = None) -> dict[str, object]:
         """The settings that motions are drawn with, of those that the generators in use take notice of."""
-        sampling = self.drawing(given)
+        sampling = self.drawing(sampling)
         face = self.choose_face(sampling.face_model)
         used = [self.generator, *([] if face is None else [self.of(face)])]
         noticed = frozenset[str]().union(*(generator.settings for generator in used))
@@ -241,7 +241,7 @@ class Bundle:
         require_driven(self.generator, prompts)
         frames = frames_of(self.generator, seconds, prompts)
         begun = seeds_of(self.generator, seed_motions, len(prompts))
-        # One seed per motion, so that results do not depend on batching.
+        # One seed per motion, so that results do not depend on batching; the second half draws faces.
         seeds = sample_seeds(seed, 2 * len(prompts))
         noise = seeds if noise_seed is None else sample_seeds(noise_seed, len(prompts))
         out: dict[int, GeneratedMotion] = {}
@@ -286,10 +286,12 @@ class Bundle:
             )
         require_driven(generator, [segment.prompt for segment in segments])
         frames = [segment_frames(generator, segment, number) for number, segment in enumerate(segments)]
+        # The first half draws bodies, the second faces, so that neither depends on the other.
         seeds = sample_seeds(seed, 2 * samples)
         stretches = [
             Stretch(
-                self._repeated(self.main, segment.prompt, segment.prompt.text, samples), [count] * samples
+                repeated_rows(self.encode(self.main, [segment.prompt], [segment.prompt.text]), samples),
+                [count] * samples,
             )
             for segment, count in zip(segments, frames, strict=True)
         ]
@@ -299,6 +301,7 @@ class Bundle:
             for motion in drive(stretches, seeds[:samples], sampling)
         ]
         faces = self._faces(segments, frames, seeds[samples:], sampling)
+        # Segments last whole units of the generator, so the time line goes by frames, not by what was asked.
         starts = np.concatenate([[0], np.cumsum(frames)]) / fps
         bands = tuple(
             Segment(
@@ -322,10 +325,10 @@ class Bundle:
             for motion, face in zip(body, faces, strict=True)
         ]
 
-    def _repeated(self, stage: CompletedStage, prompt: Prompt, words: str, count: int) -> Conditions:
-        """The conditions of one prompt, encoded once, for `count` rows."""
-        encoder, modalities = self.encoder(stage), self.of(stage).modalities
-        return repeated_rows(encoder.encode([prompt], [words], modalities, self.layout.fps), count)
+    def encode(self, stage: CompletedStage, prompts: Sequence[Prompt], words: Sequence[str]) -> Conditions:
+        """The conditions of a stage's generator, one row a prompt; `words` are about its part of the body."""
+        modalities, fps = self.of(stage).modalities, self.layout.fps
+        return self.encoder(stage).encode(prompts, words, modalities, fps)
 
     def _faces(
         self,
@@ -340,8 +343,9 @@ class Bundle:
             return [None] * len(seeds)
         made = []
         for segment, count in zip(segments, frames, strict=True):
-            conditions = self._repeated(stage, segment.prompt, segment.prompt.words, len(seeds))
-            request = GenerationRequest(conditions, [count] * len(seeds), seeds, sampling)
+            conditions = self.encode(stage, [segment.prompt], [segment.prompt.words])
+            rows = repeated_rows(conditions, len(seeds))
+            request = GenerationRequest(rows, [count] * len(seeds), seeds, sampling)
             made.append(self.of(stage).generate(request))
         return [np.concatenate(pieces) for pieces in zip(*made, strict=True)]
 
@@ -352,9 +356,10 @@ class Bundle:
         face: NDArray[np.float32] | None,
         segments: tuple[Segment, ...] = (),
     ) -> GeneratedMotion:
-        features, with_it = split_columns(motion, self.generator, self.layout)
+        """The motion of columns [T, C] of the body's generator, which may hold the face too."""
+        features, own_face = split_columns(motion, self.generator, self.layout)
         joints = joints_of(features, self.layout)
-        expression = with_it if face is None else face
+        expression = own_face if face is None else face
         return GeneratedMotion(prompt, features, joints, expression, self.layout, segments)
 
     def _batch(
@@ -365,27 +370,26 @@ class Bundle:
         sampling: SamplingConfig,
         seed_motions: list[NDArray[np.float32]] | None,
     ) -> list[GeneratedMotion]:
+        """Motions of prompts that all have a length or all have none; seeds of body, face and noise."""
         generator, layout = self.generator, self.layout
-        conditions = self.encoder(self.main).encode(
-            prompts, [p.text for p in prompts], generator.modalities, layout.fps
-        )
-        lengths = None if None in frames else [n for n in frames if n is not None]
+        conditions = self.encode(self.main, prompts, [prompt.text for prompt in prompts])
+        lengths = None if None in frames else [count for count in frames if count is not None]
         request = GenerationRequest(conditions, lengths, seeds[0], sampling, seeds[2], seed_motions)
         body = generator.generate(request)
         face: list[NDArray[np.float32]] | list[None] = [None] * len(prompts)
         stage = self.choose_face(sampling.face_model)
         if stage is not None:
-            maker = self.of(stage)
-            words = self.encoder(stage).encode(
-                prompts, [p.words for p in prompts], maker.modalities, layout.fps
-            )
+            words = self.encode(stage, prompts, [prompt.words for prompt in prompts])
             # The face takes the body's length, so that both share one time line.
-            face = maker.generate(GenerationRequest(words, [len(m) for m in body], seeds[1], sampling))
+            lengths = [len(motion) for motion in body]
+            face = self.of(stage).generate(GenerationRequest(words, lengths, seeds[1], sampling))
+        # After the face, which needs nothing of the body but its length.
         body = [
             blend_to_idle(motion, [prompt.idle], [len(motion)], layout, generator.part)
             for motion, prompt in zip(body, prompts, strict=True)
         ]
         made = [self._motion(*row) for row in zip(prompts, body, face, strict=True)]
+        # A model may end before its music does: beats after its last frame are none of the motion's.
         ticks = [ticks_of(prompt, conditions, row, layout.fps) for row, prompt in enumerate(prompts)]
         return [
             replace(one, beats=() if one.prompt.idle else tuple(t for t in own if t < one.seconds))

@@ -322,10 +322,7 @@ def original_of(frames: EditFrames, caption: str) -> GeneratedMotion:
 
 def _encoded(bundle: Bundle, stage: CompletedStage, text: str) -> Conditions:
     """A text as one row of a stage's conditions; none for an empty one."""
-    if not text.strip():
-        return {}
-    modalities = bundle.of(stage).modalities & {"text"}
-    return bundle.encoder(stage).encode([Prompt(text)], [text], modalities, bundle.layout.fps)
+    return bundle.encode(stage, [Prompt(text)], [text]) if text.strip() else {}
 
 
 def _faces(

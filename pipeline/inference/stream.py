@@ -217,7 +217,7 @@ class _Maker:
             )
         self.generator = generator
         self._stream, self._per_group = next(iter(streaming.group_tokens.items()))
-        self._encoder, self._fps = bundle.encoder(stage), bundle.layout.fps
+        self._bundle, self._stage = bundle, stage
         self._flow = streaming.tokens(seed, sampling, config)
         self._decoder = streaming.frames(seed, sampling, config)
         self._frames: NDArray[np.float32] = np.zeros(
@@ -232,7 +232,7 @@ class _Maker:
         return len(self._frames)
 
     def condition(self, prompt: Prompt, words: str) -> None:
-        self._flow.condition(self._encoder.encode([prompt], [words], self.generator.modalities, self._fps))
+        self._flow.condition(self._bundle.encode(self._stage, [prompt], [words]))
 
     def draw(self, left: int | None) -> None:
         codes = self._flow.draw(left)

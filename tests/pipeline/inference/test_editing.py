@@ -211,20 +211,20 @@ def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:
 
 
 REFUSED: list[tuple[dict[str, object], str]] = [
-    ({"keep": [{}]}, "nothing to make"),
-    ({}, "nothing of the clip is kept"),
-    ({"keep": [{"start": 9.0}]}, "keep.0: it starts at 9 s and the clip lasts 3.00 s"),
-    ({"keep": ENDS, "pins": [{"at": 1.5, "joint": "tail", "position": [0, 1, 0]}]}, "no joint 'tail'"),
-    ({"keep": ENDS, "pins": [{"at": 0.5, "joint": "head", "position": [0, 1, 0]}]}, "head is kept at 0.5 s"),
-    ({"keep": ENDS, "pins": [{"at": 9, "joint": "head", "position": [0, 1, 0]}]}, "from 0 s to 2.95 s"),
-    ({"pins": [{"at": 1, "joint": "head", "position": [0, 9, 0]}]}, "9 m above the floor"),
-    ({"path": [{"at": 0, "x": 0, "z": 0}, {"at": 1, "x": 90, "z": 0}]}, "90 m/s"),
-    ({"path": [{"at": 1, "x": 0, "z": 0}, {"at": 1, "x": 1, "z": 0}]}, "in order of time"),
-    ({"keep": ENDS, "path": [{"at": 0.5, "x": 0, "z": 0}]}, "at 0.5 s the legs are kept"),
-    ({"keep": ENDS, "path": [{"at": 1.1, "x": 90, "z": 0}]}, "where the root is kept"),
-    ({"words": [{"start": 1, "end": 2, "text": " "}]}, "say what the person does"),
+    ({"keep": [{}]}, "keep"),
+    ({}, "likeness"),
+    ({"keep": [{"start": 9.0}]}, "keep.0: .*9 s.*3.00 s"),
+    ({"keep": ENDS, "pins": [{"at": 1.5, "joint": "tail", "position": [0, 1, 0]}]}, "pins: .*'tail'"),
+    ({"keep": ENDS, "pins": [{"at": 0.5, "joint": "head", "position": [0, 1, 0]}]}, "pins: head .*0.5 s"),
+    ({"keep": ENDS, "pins": [{"at": 9, "joint": "head", "position": [0, 1, 0]}]}, "0 s to 2.95 s"),
+    ({"pins": [{"at": 1, "joint": "head", "position": [0, 9, 0]}]}, "'pins.0'.*9 m"),
+    ({"path": [{"at": 0, "x": 0, "z": 0}, {"at": 1, "x": 90, "z": 0}]}, "path: 90 m/s"),
+    ({"path": [{"at": 1, "x": 0, "z": 0}, {"at": 1, "x": 1, "z": 0}]}, "path: 1 s"),
+    ({"keep": ENDS, "path": [{"at": 0.5, "x": 0, "z": 0}]}, "path: .*0.5 s"),
+    ({"keep": ENDS, "path": [{"at": 1.1, "x": 90, "z": 0}]}, "path: .*m/s"),
+    ({"words": [{"start": 1, "end": 2, "text": " "}]}, "'words.0'"),
     ({"keep": [{"parts": ["leg"]}]}, "keep.0.parts.0"),
-    ({"keeps": []}, "did you mean 'keep'"),
+    ({"keeps": []}, "'keep'"),
 ]  # fmt: skip
 
 
@@ -232,9 +232,9 @@ REFUSED: list[tuple[dict[str, object], str]] = [
 def test_what_cannot_be_done_is_refused_in_one_sentence(
     walk: Walk, task: dict[str, object], said: str
 ) -> None:
-    with pytest.raises(UserError) as error:
+    with pytest.raises(UserError, match=said) as error:
         edit(editor(), clip(walk), **task)
-    assert said in str(error.value) and "\n" not in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:

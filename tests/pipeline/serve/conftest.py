@@ -72,7 +72,7 @@ class QuickModel:
             generate=self.generate,
             main="body",
             of=lambda stage: generator,
-            encoder=lambda stage: SimpleNamespace(encode=lambda *_: {}),
+            encode=lambda *_: {},
             choose_face=lambda name: None,
             drawing=lambda sampling: sampling,
             unknown_captions=lambda *_: [],
