@@ -220,6 +220,7 @@ def _flags(frames: NDArray[np.int64], count: int) -> NDArray[np.float32]:
 
 def _tempograms(onsets: NDArray[np.float32], width: int) -> Iterator[NDArray[np.float64]]:
     """[width, frames] of block after block."""
+    # librosa's own padding of a centred tempogram, made once for all blocks.
     padded = np.pad(onsets, width // 2, mode="linear_ramp", end_values=0)
     for start in range(0, len(onsets), _BLOCK):
         stop = min(start + _BLOCK, len(onsets))

@@ -61,6 +61,7 @@ def beats_of_rows(rows: NDArray[np.floating], fps: float) -> NDArray[np.float64]
     """Return seconds of the beats that the phases of features [F, 19] pass; none where no beat was found."""
     if len(rows) < 2 or not rows[:, :2].any():
         return np.empty(0)
+    # The phase of the beat runs from 0 to 1; where it passes 1 between two rows lies a beat.
     turns = np.arctan2(rows[:, 1], rows[:, 0]).astype(np.float64) / (2 * np.pi)
     phase = np.round(turns, 6) % 1.0
     step = np.diff(phase) % 1.0
@@ -73,6 +74,7 @@ def _phases(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """[F, 6] of seconds [F]."""
     if len(beats.times) < 2:
         return np.zeros((len(at), 6))
+    # A circle's cosine and sine have no jump at the beat, as a phase itself has.
     number = _beat_numbers(beats.times, at)
     before = np.clip(np.floor(number).astype(np.int64), 0, len(beats.times) - 1)
     in_bar = beats.bar_places[before] + number - before
@@ -95,6 +97,7 @@ def _tempo(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
     """Octaves above 120 beats a minute, by the median of nine beats around."""
     if len(beats.times) < 2:
         return np.zeros(len(at))
+    # A median, so that a beat that was missed or added does not halve or double the tempo.
     steps = np.pad(np.diff(beats.times), 4, mode="edge")
     around = np.median(np.lib.stride_tricks.sliding_window_view(steps, 9), axis=1)
     middle = (beats.times[1:] + beats.times[:-1]) / 2
@@ -115,6 +118,7 @@ def _dynamics(
     columns.append(_onsets(power))
     slow = _moving_mean(loudness, 2 * ROWS)
     columns.append(np.clip((slow - median) / wide, -2, 2))
+    # Novelty: the loudness of the four seconds that follow less that of the four before.
     half = 2 * ROWS
     padded = np.pad(slow, half, mode="edge")
     columns.append(np.clip((padded[2 * half :] - padded[: -2 * half]) / wide, -2, 2))
@@ -153,6 +157,7 @@ def _onsets(power: NDArray[np.float32]) -> NDArray[np.float64]:
     loudest = float(power.max(initial=0.0))
     if loudest <= 0:
         return np.zeros(len(power))
+    # Only rises count: a note begins where power grows, in whichever bands, and ends without an onset.
     decibels = np.log10(power / loudest + _SILENCE)
     rise = np.maximum(np.diff(decibels, axis=0, prepend=decibels[:1]), 0).mean(axis=1)
     return np.asarray(np.clip(rise / max(float(np.percentile(rise, 98)), 1e-3), 0, 2))
@@ -160,6 +165,7 @@ def _onsets(power: NDArray[np.float32]) -> NDArray[np.float64]:
 
 def _moving_mean(values: NDArray[np.floating], width: int) -> NDArray[np.float64]:
     """Return means of the rows [T] around each, fewer at the ends."""
+    # Differences of running sums: the cost does not depend on the width.
     sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
     rows = np.arange(len(values))
     first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))

@@ -209,6 +209,7 @@ def resample_sound(samples: NDArray[np.float32], rate_in: int, rate_out: int) ->
     """
     import soxr
 
+    # soxr rounds the length its own way; features count on librosa's.
     length = resampled_length(len(samples), rate_in, rate_out)
     if rate_in == rate_out:
         return samples
@@ -334,6 +335,7 @@ def _check_wave_chunks(file: BinaryIO, name: str, size: int) -> None:
     """Walk the chunks up to the samples: a format with a rate, and as many bytes as the file promises."""
     long_data: int | None = None
     formatted = False
+    # Chunks are walked as they state their lengths; what no reader knows (LIST, bext) is passed over.
     while len(head := file.read(8)) == 8:
         kind, length = struct.unpack("<4sI", head)
         start = file.tell()

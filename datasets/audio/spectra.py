@@ -65,6 +65,7 @@ def separate(samples: NDArray[np.float32], rate: int) -> Spectra:
         spectrum = librosa.stft(piece.samples, n_fft=FFT, hop_length=HOP)
         magnitude = np.abs(spectrum)
         mel[:, piece.frames] = _mel(magnitude, rate)[:, piece.inside]
+        # Notes are steady along time and percussion along frequency: medians each way tell them apart.
         steady, sudden = _row_medians(magnitude), _row_medians(magnitude.T).T
         shares = []
         for share, other in ((steady, sudden), (sudden, steady)):
@@ -94,6 +95,7 @@ def _pieces(samples: NDArray[np.float32]) -> Iterator[_Piece]:
     count = 1 + len(samples) // HOP
     for start in range(0, count, _PIECE):
         stop = min(start + _PIECE, count)
+        # The last piece takes the rest as it is: librosa reflects the end of the sound, no other edge.
         first, last = max(0, start - _MARGIN), stop + _MARGIN
         around = samples[first * HOP :] if last >= count else samples[first * HOP : (last - 1) * HOP]
         yield _Piece(around, slice(start, stop), slice(start - first, stop - first))

@@ -66,6 +66,7 @@ def folder_lock(out: Path, *, shared: bool = False) -> Iterator[None]:
     try:
         yield
     finally:
+        # Removed while it is still held: who opened it before sees another file at its name, and opens again.
         if not shared:
             path.unlink(missing_ok=True)
         if handle is not None:

@@ -87,6 +87,7 @@ class ConditionedClips:
         if self.face:
             self.members["text"] = "face_texts.json"
         self.min_frames, self.max_frames, self.captioned = min_frames, max_frames, captioned
+        # What a clip holds is known from the index: no shard is opened to say which clips qualify.
         usable = dataset.frames >= min_frames
         if captioned:
             usable &= dataset.has(self.members["text"])

@@ -65,6 +65,7 @@ def encode_sample(
     wanted = (layout.name, layout.family, layout.fps, layout.skeleton_name)
     if stated != wanted:
         raise ValueError(f"metadata says layout, family, fps, skeleton = {stated}, the dataset is {wanted}")
+    # Split and length are facts of the set and the array; a converter cannot state them wrongly.
     meta = meta.model_copy(update={"split": split, "frames": len(motion)})
     members = {"meta.json": json_bytes(meta.dump()), "motion.npy": npy_bytes(stored)}
     if sample.texts:

@@ -197,6 +197,7 @@ def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -
         return Dropped(source=label, reason=str(drop))
     except MemoryError:
         raise
+    # A full disk is no fault of this clip: such errors stop the run, and what is finished stays.
     except Exception as error:  # a converter meets whatever a bad file makes of its libraries
         if of_the_machine(error):
             raise

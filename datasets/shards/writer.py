@@ -262,6 +262,7 @@ def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dic
     if name_before != name:
         raise UserError(f"{out} holds dataset '{name_before}', not '{name}'; choose another folder")
     before |= {"layout": manifest.get("layout"), "fps": manifest.get("fps")}
+    # Options as JSON has them: a tuple that was written comes back as a list.
     now = {**json.loads(json.dumps(options)), "layout": layout.name, "fps": layout.fps}
     changed = [
         _difference(key, before.get(key), now.get(key))

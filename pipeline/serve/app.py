@@ -195,6 +195,7 @@ class Site:
         """Keep the sound file that the body is, under a name for later requests."""
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
+        # Decoded in another thread, so that the server answers meanwhile; the body is held until then.
         async with self._uploads:
             most = _bytes(self.config.max_sound_mb)
             data = await read_body(http, "the sound", most, self.config.patience)

@@ -66,6 +66,7 @@ def read_face(path: Path) -> FaceTake:
     times = _times(path, rows, columns)
     fps = (len(times) - 1) / (times[-1] - times[0])
     fps = float(round(fps)) if abs(fps / round(fps) - 1) < _WHOLE else float(fps)
+    # Phones record at uneven intervals; a take is resampled at its mean rate.
     steady = times[0] + np.arange(int((times[-1] - times[0]) * fps + 1.5)) / fps
     both = np.concatenate([weights, turned], axis=1)
     even = np.stack([np.interp(steady, times, column) for column in both.T], axis=1)

@@ -81,6 +81,7 @@ class BodyModel:
         if path.suffix.lower() in (".pkl", ".pickle"):
             raise UserError(f"{path} {_PICKLE}")
         named = Skeleton.named(skeleton)
+        # Sizes are compared before each array is read: a model of another kind, or a bomb, costs nothing.
         with NpzFile(path) as file:
             tree = file.numbers("kintree_table", limit=2**20)
             kind, chosen = _choose(path, tree, named)
@@ -103,6 +104,7 @@ class BodyModel:
             "sentence": f"Joints of the user's {kind} model, posed by forward kinematics from the rest "
             f"joints of each clip's shape (betas).",
         }
+        # Joints are linear in vertices and these in shape, so both are folded: no mesh is kept.
         directions = np.tensordot(regressor, shapes, axes=1)
         return BodyModel(named, regressor @ vertices, directions, statement)
 

@@ -222,6 +222,7 @@ class _HierarchyParser:
                     started = True
                 else:
                     raise self._error("a BVH file must start with HIERARCHY")
+        # Blocks that are still open lack a brace each; so does one that was announced and never opened.
         missing = len(self.open) + (self.pending is not None)
         if missing:
             raise self._error(f"braces are not balanced: {missing} '}}' missing before MOTION")
