@@ -171,16 +171,21 @@ class Modality(ABC):
         return []
 
 
+def condition_of(*parts: NDArray[np.generic]) -> Condition:
+    """Return the condition of arrays: features [B, L, E], mask [B, L], and pooled [B, E] where it has any."""
+    import torch
+
+    from motionloom.datasets.conditions import Condition
+
+    return Condition(*map(torch.as_tensor, parts))
+
+
 class FrameModality(Modality):
     """A modality of numbers, a row for each frame of the motion: one `.npy` member and statistics."""
 
     timed = True
 
     def batch(self, reader: object, dataset: Clips, rows: Rows) -> Condition:
-        import torch
-
-        from motionloom.datasets.conditions import Condition
-
         assert isinstance(reader, FrameStats)
         features = np.zeros((len(rows.clips), rows.frames, reader.dim), dtype=np.float32)
         # Rows without the modality stay zero and masked, so that one batch may mix all kinds of clips.
@@ -189,10 +194,10 @@ class FrameModality(Modality):
             stored = self._stored(dataset, int(rows.clips[row]), reader.dim)
             first, count = int(rows.begin[row]), int(rows.length[row])
             features[row, :count] = reader.normalize(stored[first : first + count])
-        return Condition(torch.from_numpy(features), torch.from_numpy(mask))
+        return condition_of(features, mask)
 
     def _stored(self, dataset: Clips, clip: int, width: int) -> NDArray[np.float32]:
-        """A clip's features [T, E], which must be one row a frame."""
+        """Return a clip's features [T, E]; `UserError` unless they are one row a frame."""
         features, frames = dataset.array(clip, self.members[0]), int(dataset.frames[clip])
         if features is None or features.shape != (frames, width):
             shape = "none" if features is None else str(list(features.shape))
@@ -204,25 +209,18 @@ class FrameModality(Modality):
         return features
 
     def encode(self, prepared: object, values: Sequence[object | None], fps: float) -> Condition:
-        import torch
-
-        from motionloom.datasets.conditions import Condition
-
-        found = [None if value is None else self.features(value, fps, prepared) for value in values]
-        width = next(row.shape[1] for row in found if row is not None)
-        longest = max(len(row) for row in found if row is not None)
-        features = torch.zeros(len(found), longest, width)
-        mask = torch.zeros(len(found), longest, dtype=torch.bool)
-        for k, row in enumerate(found):
+        rows = [None if value is None else self.features(value, fps, prepared) for value in values]
+        some = [row for row in rows if row is not None]
+        features = np.zeros((len(rows), max(map(len, some)), some[0].shape[1]), dtype=np.float32)
+        mask = np.zeros(features.shape[:2], dtype=np.bool_)
+        for k, row in enumerate(rows):
             if row is not None:
-                features[k, : len(row)], mask[k, : len(row)] = (
-                    torch.from_numpy(np.ascontiguousarray(row)),
-                    True,
-                )
-        return Condition(features, mask)
+                features[k, : len(row)] = row
+                mask[k, : len(row)] = True
+        return condition_of(features, mask)
 
     def features(self, value: object, fps: float, prepared: object = None) -> NDArray[np.float32]:
-        """Features [T, E] of what a person gives, a row for each frame; an array is taken as it is."""
+        """Return features [T, E] of a person's input, a row for each frame; an array is taken as it is."""
         if not isinstance(value, np.ndarray) or value.ndim != 2:
             raise UserError(f"{self.name}: give its features, an array [frames, {self.width}]")
         return np.asarray(value, np.float32)
@@ -238,8 +236,4 @@ class FrameModality(Modality):
         return condition._replace(features=((features - mean) / std).masked_fill(~mask[..., None], 0.0))
 
     def example(self, batch: int, frames: int, width: int) -> Condition:
-        import torch
-
-        from motionloom.datasets.conditions import Condition
-
-        return Condition(torch.empty(batch, frames, width), torch.ones(batch, frames, dtype=torch.bool))
+        return condition_of(np.empty((batch, frames, width), np.float32), np.ones((batch, frames), np.bool_))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
-from motionloom.datasets.modalities.modality import Clips, Modality, Rows
+from motionloom.datasets.modalities.modality import Clips, Modality, Rows, condition_of
 from motionloom.datasets.schema import UserError
 
 if TYPE_CHECKING:
@@ -39,10 +39,6 @@ class TextModality(Modality):
 
     def batch(self, reader: object, dataset: Clips, rows: Rows) -> Condition:
         """Word features [B, L, E] and unit sentence embeddings [B, E] of the rows' captions."""
-        import torch
-
-        from motionloom.datasets.conditions import Condition
-
         cache, count = cast("TextCache", reader), len(rows.captions)
         with_text = np.flatnonzero(rows.present)
         chosen = [rows.captions[row] for row in with_text.tolist()]
@@ -54,32 +50,23 @@ class TextModality(Modality):
         pooled = np.zeros((count, cache.dim), dtype=np.float32)
         if len(with_text):
             features[with_text], mask[with_text], pooled[with_text] = tokens, known, cache.sentence(chosen)
-        return Condition(torch.from_numpy(features), torch.from_numpy(mask), torch.from_numpy(pooled))
+        return condition_of(features, mask, pooled)
 
     def encode(self, prepared: object, values: Sequence[object | None], fps: float) -> Condition:
-        import torch
-
-        from motionloom.datasets.conditions import Condition
-
         if prepared is None:
             raise UserError("this model has no text encoder; leave the text out")
         words = ["" if text is None else str(text) for text in values]
         encoded = cast(_Prepared, prepared).encoder.encode(words)
-        features, mask = torch.as_tensor(encoded.tokens), torch.as_tensor(encoded.mask)
-        pooled = torch.as_tensor(encoded.sentence)
-        has_text = torch.tensor([bool(text.strip()) for text in words])
+        features, mask, pooled = encoded.tokens, encoded.mask, encoded.sentence
+        has_text = np.array([bool(text.strip()) for text in words])
         if not has_text.all():
             mask = mask & has_text[:, None]
             features, pooled = features * mask[..., None], pooled * has_text[:, None]
-        return Condition(features, mask, pooled)
+        return condition_of(features, mask, pooled)
 
     def example(self, batch: int, frames: int, width: int) -> Condition:
-        import torch
-
-        from motionloom.datasets.conditions import Condition
-
-        mask = torch.ones(batch, _WORDS, dtype=torch.bool)
-        return Condition(torch.empty(batch, _WORDS, width), mask, torch.empty(batch, width))
+        features, pooled = np.empty((batch, _WORDS, width), np.float32), np.empty((batch, width), np.float32)
+        return condition_of(features, np.ones((batch, _WORDS), np.bool_), pooled)
 
 
 RECORD = TextModality()
