@@ -29,7 +29,7 @@ from motionloom.datasets.audio.features import beats as librosa_beats
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.audio.tracker import track
 from motionloom.datasets.synth.music.performance import render_song
-from motionloom.pipeline.stages.networks.beats.songs import RENDER_RATE, SongsConfig
+from motionloom.pipeline.baselines.beats.songs import RENDER_RATE, SongsConfig
 
 Times = NDArray[np.float64]
 

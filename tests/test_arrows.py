@@ -168,7 +168,7 @@ def top_of(room: str) -> str:
 
 
 READERS = {
-    "synth": "pipeline/cli/data pipeline/stages/data pipeline/stages/networks/beats pipeline/evaluation "
+    "synth": "pipeline/cli/data pipeline/stages/data pipeline/baselines/beats pipeline/evaluation "
     "pipeline/inference/checks",
     "actions": "datasets/synth pipeline/stages/data pipeline/evaluation pipeline/inference/checks",
 }

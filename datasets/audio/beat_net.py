@@ -2,7 +2,7 @@
 
 Row t is centred at t / 60 s. Dilated convolutions see some eight seconds to both sides of a row. The weights
 in this package (`beats.safetensors`) were trained by the recipe `beats` on songs that a band of General MIDI
-instruments plays, whose beats are known; `stages/networks/beats` says how they are made.
+instruments plays, whose beats are known; `pipeline/baselines/beats` says how they are made.
 
 Gain and equaliser of a recording are taken out before the network: power becomes decibels, of which each
 band's mean over the piece is subtracted. Spectra need no librosa, whose import takes seconds.

@@ -3,7 +3,7 @@
 The weights in the package are those of the recipe `beats`:
 
     motionloom run ude-beats -o runs/beats
-    python -c "from motionloom.pipeline.stages.networks.beats import stage; from pathlib import Path; \\
+    python -c "from motionloom.pipeline.baselines.beats import stage; from pathlib import Path; \\
         stage.put_into_package(Path('runs/beats/stages/beats'))"
 """
 
@@ -17,15 +17,15 @@ from pydantic import Field
 
 from motionloom.datasets.audio.beat_net import BANDS, ROWS, WEIGHTS, BeatNet, BeatNetConfig, write_beat_net
 from motionloom.models.training.optim import OptimConfig
+from motionloom.pipeline.baselines.beats.songs import SongPool
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Inputs, register
-from motionloom.pipeline.stages.networks.beats.songs import SongPool
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts, load_weights
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
-    from motionloom.pipeline.stages.networks.beats.training import BeatsModule
+    from motionloom.pipeline.baselines.beats.training import BeatsModule
 
 _NO_MOTION = LayoutFacts(name="none", fps=ROWS, family="none")
 
@@ -67,12 +67,12 @@ class BeatsStage(TrainedStage[BeatsConfig, BeatsInputs, BeatNet]):
         return BeatNet(BeatNetConfig.parse(facts.config, facts.where))
 
     def module(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int) -> BeatsModule:
-        from motionloom.pipeline.stages.networks.beats.training import BeatsModule
+        from motionloom.pipeline.baselines.beats.training import BeatsModule
 
         return BeatsModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
     def batches(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int, log: Log) -> Batches:
-        from motionloom.pipeline.stages.networks.beats.training import SongBatches
+        from motionloom.pipeline.baselines.beats.training import SongBatches
 
         trained, kept = (inputs.songs.songs(validation=which) for which in (False, True))
         rows = config.rows

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from motionloom.datasets.audio.beat_net import read_beat_net
+from motionloom.pipeline.baselines.beats.songs import AnnotatedSong, SongsConfig
+from motionloom.pipeline.baselines.beats.stage import put_into_package
+from motionloom.pipeline.baselines.beats.training import SongBatches, _targets
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.stages.networks.beats.songs import AnnotatedSong, SongsConfig
-from motionloom.pipeline.stages.networks.beats.stage import put_into_package
-from motionloom.pipeline.stages.networks.beats.training import SongBatches, _targets
 
 RECIPE = """
 name: beats

@@ -20,7 +20,7 @@ from motionloom.datasets.audio.beat_net import BANDS, ROWS
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import StageModule
-from motionloom.pipeline.stages.networks.beats.songs import AnnotatedSong
+from motionloom.pipeline.baselines.beats.songs import AnnotatedSong
 
 _WIDE = 1.5
 """Rows from a beat at which its target is 0; a row away it is one half."""
