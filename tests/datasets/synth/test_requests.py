@@ -63,22 +63,23 @@ def test_true_requests_are_shown_and_others_are_not() -> None:
     wave = clip("wave").joints
     for action in ("walk", "turn", "run", "jump", "squat", "kick", "clap", "hop", "punch", "bow", "crawl"):
         assert find_mismatch([{"action": action}], clip(action).joints, FPS) is None
-        assert find_mismatch([{"action": action}], wave, FPS) == f"the motion shows no {action}"
+        assert action in (find_mismatch([{"action": action}], wave, FPS) or "")
     assert find_mismatch([{"action": "sit"}, {"action": "wave"}], wave, FPS) is None
 
 
 @pytest.mark.parametrize(
     ("action", "asked", "seen"),
     [
-        ("walk", {"speed": "quickly"}, "the speed is another, not quickly"),
-        ("raise", {"side": "both"}, "the side is left, not both"),
-        ("raise", {"side": "left"}, None),
+        ("walk", {"speed": "quickly"}, ["speed", "quickly"]),
+        ("raise", {"side": "both"}, ["side", "left", "both"]),
+        ("raise", {"side": "left"}, []),
     ],
 )
-def test_attributes_are_compared(action: str, asked: dict[str, str], seen: str | None) -> None:
+def test_attributes_are_compared(action: str, asked: dict[str, str], seen: list[str]) -> None:
     truth: dict[str, object] = {"side": "left"} if action == "raise" else {"speed": None}
     joints = clip(action, **truth).joints
-    assert find_mismatch([{"action": action, **asked}], joints, FPS) == seen
+    found = find_mismatch([{"action": action, **asked}], joints, FPS)
+    assert (found is not None) == bool(seen) and all(word in (found or "") for word in seen)
 
 
 def test_counts_are_compared() -> None:
@@ -87,7 +88,7 @@ def test_counts_are_compared() -> None:
     count = described(twice, FPS, "squat")["count"]
     assert find_mismatch([{"action": "squat", "count": count}], twice, FPS) is None
     found = find_mismatch([{"action": "squat", "count": count + 1}], twice, FPS)
-    assert found == f"the count is {count}, not {count + 1}"
+    assert found is not None and str(count) in found and str(count + 1) in found
 
 
 def test_actions_of_a_truth() -> None:
