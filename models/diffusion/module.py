@@ -93,8 +93,9 @@ class InBetweenModule(TextDenoiserModule):
         return predicted
 
     def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
+        loss = super().mean(error, mask, present)
         speed_error = mean_of_rows(error.diff(dim=1).square(), mask[:, 1:], present)
-        return super().mean(error, mask, present) + self.net.config.velocity_weight * speed_error
+        return loss + self.net.config.velocity_weight * speed_error
 
 
 class DmdModule(StageModule):
