@@ -27,7 +27,7 @@ SCRIPTS = [path for path in sorted(FOLDER.glob("*.py")) if path.name != "bench.p
 SCRIPTS.append(FOLDER.parent / "docs" / "pictures.py")
 
 
-DOCS = sorted([*FOLDER.parent.glob("*.md"), *FOLDER.parent.glob("docs/*.md")])
+DOCS = sorted(page for depth in ("*", "docs/*", "models/*/*/*") for page in FOLDER.parent.glob(f"{depth}.md"))
 COMMANDS = sorted(
     {
         found.strip("` ").removeprefix("python benchmarks/")

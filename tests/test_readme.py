@@ -17,6 +17,7 @@ import typer
 import yaml
 from rich.console import Console
 
+from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.inference.script import Script
@@ -196,6 +197,12 @@ def test_named_recipes_exist() -> None:
     everything = "".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
     family = "(?:humantomato|ude|baselines|bvh|t2m-gpt)"
     assert set(re.findall(rf"`({family}-[a-z]+[a-z0-9-]*)`", everything)) <= set(shipped_recipes())
+
+
+def test_settings_of_sources_exist() -> None:
+    keys = {key for source in converters() for key in source.config_class.model_fields}
+    text = (ROOT / "docs" / "sources.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"(?:--set |`)([a-z_]+)=", text)) <= keys
 
 
 def test_widths_of_layouts_are_true() -> None:
