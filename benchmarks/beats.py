@@ -10,7 +10,6 @@ them agree within 70 ms for four beats and more, they are right.
 
 F is of beats within 70 ms, each counted once; `any` lets a tracker beat at half or double the tempo; `late`
 is the median of how far the found beats are behind the true ones.
-Then what is no music, by `confidence`: silence, noise, and files that `--speech` names.
 """
 
 from __future__ import annotations
@@ -135,7 +134,7 @@ def real(path: Path, references: list[str]) -> Record:
         cells[name] = [agreed_f(runs, times, any_tempo=False)]
         cells[f"{name}, any octave"] = [agreed_f(runs, times, any_tempo=True)]
         cells[f"{name}, late"] = [1000 * lateness(whole, times)]
-    facts = {"confidence": f"{ours.confidence:.2f}", "bpm": f"{_bpm(ours.times):.0f}", "beats": len(whole)}
+    facts = {"confidence": f"{ours.confidence:.2f}", "beats": len(whole)}
     return {"title": path.stem, "cells": cells, "protocol": facts}
 
 
@@ -151,26 +150,10 @@ def _true_runs(path: Path, references: list[str], seconds: float) -> list[Times]
     return max((agreed_runs(*two) for two in combinations(known, 2)), key=lambda runs: sum(map(len, runs)))
 
 
-def no_music(speech: list[Path]) -> list[Record]:
-    """Confidence in what has no beat."""
-    rng = np.random.default_rng(0)
-    noise = np.clip(0.2 * rng.standard_normal(20 * RENDER_RATE), -1, 1).astype(np.float32)
-    sounds = {"silence": Sound(np.zeros_like(noise), RENDER_RATE), "noise": Sound(noise, RENDER_RATE)}
-    sounds |= {path.stem: Sound.read(path) for path in speech}
-    return [
-        {"title": name, "cells": {}, "protocol": {"confidence": f"{track(sound).confidence:.2f}"}}
-        for name, sound in sounds.items()
-    ]
-
-
 def _printed(command: str, path: Path, seconds: float) -> Times:
     made = subprocess.run([*shlex.split(command), str(path)], capture_output=True, text=True, check=True)
     times = np.array([float(line.split()[0]) for line in made.stdout.splitlines() if line.strip()])
     return times[times < seconds]
-
-
-def _bpm(times: Times) -> float:
-    return float(60 / np.median(np.diff(times))) if len(times) > 1 else 0.0
 
 
 def main() -> None:
@@ -178,11 +161,10 @@ def main() -> None:
     parser.add_argument("songs", nargs="*", type=Path)
     parser.add_argument("--rendered", type=int, default=0, help="how many songs to render")
     parser.add_argument("--reference", action="append", default=[], help="a command that prints beats")
-    parser.add_argument("--speech", action="append", default=[], type=Path)
     args = arguments(parser)
     rows = [rendered(args.rendered)] if args.rendered else []
     rows += [real(path, args.reference) for path in args.songs]
-    report("F of beats within 70 ms", COLUMNS, rows + no_music(args.speech), args.record)
+    report("F of beats within 70 ms", COLUMNS, rows, args.record)
 
 
 if __name__ == "__main__":

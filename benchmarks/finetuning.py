@@ -38,13 +38,12 @@ from wordings_obeyed import Label, read_labels
 
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
-from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.latent_metrics import LatentRow, recalls
-from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.networks import embed_motions
@@ -67,7 +66,7 @@ COLUMNS = (
         Column(figure, figure, 1, 100)
         for figure in ("t2m_r1", "t2m_r3", "m2t_r1", "content", "style", "obeys")
     ),
-    *(Column(figure, figure) for figure in ("pose_mm", "world_mm", "seconds")),
+    Column("seconds", "seconds", 0),
 )
 PROBE = (10, 40)
 """Steps of the two trainings whose difference says what a step costs."""
@@ -114,17 +113,6 @@ class Clips:
             "style": float(right[:, 1].mean()),
             "obeys": float(np.mean(obeyed)),
         }
-
-    def reconstruction(self, tokenizer: Any) -> dict[str, float]:
-        """Mean distance of the body's joints after the tokenizer, mm: from the root, and in the world."""
-        pose, world = [], []
-        for truth in self.truths[::4]:
-            made = joints_of(reconstruct_truth(tokenizer, truth), tokenizer.layout)[:, :BODY_JOINTS]
-            real = truth.joints[: len(made), :BODY_JOINTS]
-            world.append(np.linalg.norm(made - real, axis=-1).mean())
-            made, real = made - made[:, :1], real - real[:, :1]
-            pose.append(np.linalg.norm(made - real, axis=-1).mean())
-        return {"pose_mm": 1000 * float(np.mean(pose)), "world_mm": 1000 * float(np.mean(world))}
 
 
 def base(args: argparse.Namespace) -> Path:
@@ -232,11 +220,10 @@ def best_rate(args: argparse.Namespace, arm: str, steps: Mapping[str, int]) -> f
 
 
 def figures_of(bundle: Bundle, clips: Clips, seed: int, args: argparse.Namespace) -> dict[str, float]:
-    """Of motions for the captions, and of the tokenizer."""
+    """Figures of motions for the captions."""
     sampling = SamplingConfig(top_p=args.top_p, cfg_scale=args.cfg_scale)
     made = bundle.generate(clips.captions, seed=seed, sampling=sampling)
-    tokenizer = bundle.generator.tokenizer  # type: ignore[attr-defined]
-    return clips.figures([m.joints for m in made]) | clips.reconstruction(tokenizer)
+    return clips.figures([m.joints for m in made])
 
 
 def main() -> None:

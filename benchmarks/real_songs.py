@@ -237,12 +237,8 @@ def main() -> None:
         "random training dance": rival(training.random),
         "standing": rival(training.standing),
     }
-    protocol = {
-        "songs": len(args.songs),
-        "stretches": len(parts),
-        "seconds each": args.seconds,
-        "late": args.late,
-    }
+    sizes = {"songs": len(args.songs), "stretches": len(parts)}
+    protocol = sizes | {"seconds each": args.seconds, "late": args.late}
     found = []
     for name, make in rows.items():
         each = [figures(parts, make(seed), training.fps, training, seed) for seed in range(args.seeds)]

@@ -10,6 +10,7 @@ them that part says so and is left out. The trainings are those of
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import os
@@ -19,7 +20,6 @@ import tempfile
 from collections.abc import Callable
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tests/helpers"))  # the tests do the same on a smaller scale
@@ -56,15 +56,6 @@ TEARS, FLIPS = 20, 100
 CHECKPOINT_DAMAGE = ("checkpoint, torn", "checkpoint, one bit flipped", "the same, by torch alone")
 
 
-class Asked(NamedTuple):
-    """Of the matrix of kills."""
-
-    kills: int
-    """SIGKILLs in each cell."""
-    cells: str
-    """Pattern of the cells' names, which are STAGE-RANKS-WORKERS."""
-
-
 def base_run(recipe: str, work: Path) -> Path:
     """A finished run of a recipe; the stage under test is taken out of copies of it."""
     run = work / f"base-{recipe}"
@@ -76,7 +67,7 @@ def base_run(recipe: str, work: Path) -> Path:
     return run
 
 
-def kills(work: Path, asked: Asked) -> None:
+def kills(work: Path, args: argparse.Namespace) -> None:
     """SIGKILL at random moments: every family of trainings, loader workers 0 and 2, ranks 1 and 2."""
     folder = work / "kills"
     bases = {recipe: base_run(recipe, folder) for recipe, _ in FAMILIES.values()}
@@ -88,13 +79,13 @@ def kills(work: Path, asked: Asked) -> None:
             stage=stage,
             ranks=ranks,
             workers=workers,
-            kills=asked.kills,
+            kills=args.kills,
         )
         for workers in (0, 2)
         for ranks in (1, 2)
         for stage, (recipe, _) in FAMILIES.items()
     ]
-    run_cells([cell for cell in cells if fnmatch(cell.name, asked.cells)], folder)
+    run_cells([cell for cell in cells if fnmatch(cell.name, args.cells)], folder)
 
 
 def kills_table(work: Path) -> list[str]:
@@ -131,7 +122,7 @@ def kills_table(work: Path) -> list[str]:
     ]
 
 
-def preemption(work: Path, asked: Asked) -> None:
+def preemption(work: Path, args: argparse.Namespace) -> None:
     """Five urgent jobs on a SLURM of two nodes."""
     out = work / "preemption.json"
     if out.exists():
@@ -167,7 +158,7 @@ def preemption_table(work: Path) -> list[str]:
     return rows
 
 
-def damage(work: Path, asked: Asked) -> None:
+def damage(work: Path, args: argparse.Namespace) -> None:
     """Cut and flip a checkpoint and a shard, and count who notices."""
     out = work / "damage.json"
     if out.exists():
@@ -252,12 +243,13 @@ def damage_table(work: Path) -> list[str]:
     ]
 
 
-PARTS: dict[str, Callable[[Path, Asked], None]] = {"damage": damage, "preemption": preemption, "kills": kills}
-TABLES: dict[str, Callable[[Path], list[str]]] = {
-    "damage": damage_table,
-    "preemption": preemption_table,
-    "kills": kills_table,
+Part = tuple[Callable[[Path, argparse.Namespace], None], Callable[[Path], list[str]]]
+PARTS: dict[str, Part] = {
+    "damage": (damage, damage_table),
+    "preemption": (preemption, preemption_table),
+    "kills": (kills, kills_table),
 }
+"""Name -> what does it, and what prints it."""
 
 
 def main() -> None:
@@ -269,8 +261,8 @@ def main() -> None:
     parser.add_argument("--cells", default="*", help="pattern of the cells' names: STAGE-RANKS-WORKERS")
     args = arguments(parser)
     for name in filter(None, args.parts.split(",")):
-        PARTS[name](args.work, Asked(args.kills, args.cells))
-    for name, table in TABLES.items():
+        PARTS[name][0](args.work, args)
+    for name, (_, table) in PARTS.items():
         print(f"\n{name}\n\n" + "\n".join(table(args.work)))
 
 

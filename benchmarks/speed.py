@@ -4,23 +4,17 @@
     python benchmarks/speed.py --only bvh --bvh ARCHIVES
 
 All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
-turns. `bvh` converts archives that lie beside their joint_map.json, twice, and compares all bytes of one
-worker, of two, and of two that were killed (SIGKILL to the process group) and started again. `streaming`
-makes ten minutes of motion with a model of the package and looks at its memory.
+turns. `streaming` makes ten minutes of motion with a model of the package and looks at its memory.
 """
 
 from __future__ import annotations
 
-import hashlib
 import io
 import itertools
 import os
-import random
-import signal
 import subprocess
 import sys
 import tempfile
-import time
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Iterator
@@ -239,38 +233,19 @@ def streaming(args: Namespace) -> Record:
 
 
 def bvh(args: Namespace) -> Record:
-    """Archives to shards beside parsing alone; and whether workers or kills change a byte."""
-    source: Path = args.bvh
+    """Archives to shards with one worker, beside parsing alone."""
     motion, begin = 0.0, process_seconds()
-    for batch in list_batches(source, ".bvh"):
+    for batch in list_batches(args.bvh, ".bvh"):
         for file in batch.read(".bvh"):
             clip = read_bvh(file.data, name=file.label)
             motion += clip.frames / clip.fps
     parsing = process_seconds() - begin
     command = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "data", "convert", "bvh"]
     with tempfile.TemporaryDirectory() as folder:
-
-        def convert(name: str, workers: int) -> list[str]:
-            return [*command, str(source), f"{folder}/{name}", "--licence", "CC0", "--workers", str(workers)]
-
         begin = process_seconds()
-        subprocess.run(convert("one", 1), check=True)
+        options = ["--licence", "CC0", "--workers", "1"]
+        subprocess.run([*command, str(args.bvh), f"{folder}/shards", *options], check=True)
         taken = process_seconds() - begin
-        subprocess.run(convert("two", 2), check=True)
-        chance = random.Random(0)
-        for _ in range(5):
-            process = subprocess.Popen(convert("killed", 2), start_new_session=True)
-            time.sleep(chance.uniform(2, 2 + taken / 2))
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-        subprocess.run(convert("killed", 2), check=True)
-        digests = [
-            {str(path.relative_to(place)): hashlib.sha256(path.read_bytes()).hexdigest()
-             for path in place.rglob("*") if path.is_file()}
-            for place in (Path(folder) / name for name in ("one", "two", "killed"))
-        ]  # fmt: skip
-    if digests.count(digests[0]) != 3:
-        raise SystemExit("shards of one worker, of two and of killed runs differ")
     title = "BVH archives to shards"
     return row(title, f"{motion / taken:.0f} × real time", f"{motion / parsing:.0f} ×, parsing alone")
 

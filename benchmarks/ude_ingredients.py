@@ -115,14 +115,9 @@ def token_model(seed: int, steps: int, net: dict[str, Any], loss: dict[str, Any]
 
 
 def engine(
-    name: str,
-    utt: str,
-    dmd: str | None,
-    inject_z: bool,
-    sampling: dict[str, Any],
-    repeats: int,
+    name: str, utt: str, dmd: str | None, inject_z: bool, sampling: dict[str, Any], repeats: int,
     music: bool = False,
-) -> Stages:
+) -> Stages:  # fmt: skip
     """A generator and its figures for captions, and for music."""
     made = {"kind": "ude", "inputs": {"utt": utt, "dmd": dmd}, "inject_z": inject_z}
     more = {"sampling": sampling, "repeats": repeats}

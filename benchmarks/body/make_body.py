@@ -2,8 +2,8 @@
 
 python benchmarks/body/make_body.py pipeline/render/body/body.npz
 
-The body is modelled here from implicit shapes (`shapes.py`, `field.py`, `surface.py`), with a face laid on
-the head (`features.py`) and its shapes (`arkit_looks.py`). The package only reads the file. The result is the
+The body is modelled here from implicit shapes (`shapes.py`, `field.py`), with a face laid on
+the head and its shapes (`features.py`). The package only reads the file. The result is the
 same on every run. Each of the three details holds its arrays under `near_`, `far_` and `shadow_`:
 
 * `places` uint16 [V, 3], `low` and `step` float64 [3]: vertices at rest are low + step * places, metres;
@@ -20,14 +20,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from arkit_looks import ARKIT_SHAPES, Shape
-from features import CONTROLS, EXPRESSIONS, Feature, Look, behind_mouth, features, on_skin, skin_shift
-from field import Field, Floats, skin_weights
+from features import (
+    ARKIT_SHAPES,
+    CONTROLS,
+    EXPRESSIONS,
+    Feature,
+    Look,
+    Shape,
+    behind_mouth,
+    features,
+    on_skin,
+    skin_shift,
+)  # fmt: skip
+from field import Field, Floats, mesh_of, normals_of, skin_weights
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from shapes import collar, cuff, ears, hair, hand, head, head_centre, nose, spread, trunk_and_limbs
-from surface import mesh_of, normals_of
 
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -335,13 +344,8 @@ def main() -> None:
     arrays: dict[str, NDArray[np.generic]] = {"colours": np.array(list(COLOURS.values()), np.uint8)}
     for detail in SPACING:
         arrays |= packed(detail)
-        print(
-            detail,
-            len(arrays[f"{detail}_places"]),
-            "vertices",
-            len(arrays[f"{detail}_triangles"]),
-            "triangles",
-        )
+        counts = [len(arrays[f"{detail}_{name}"]) for name in ("places", "triangles")]
+        print("{}: {} vertices, {} triangles".format(detail, *counts))
     with atomic_file(path) as file:
         np.savez_compressed(file, **arrays)
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
