@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import io
+import re
 import tarfile
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -100,9 +101,8 @@ def test_the_same_motion_twice(tmp_path: Path) -> None:
         Made("x", "val", features(2)),
     )
     assert report.warning_kinds == {"same motion": 1}
-    assert report.error_kinds == {"same motion in two splits": 1}
-    assert "'c' has the same motion as" in str(report.errors[0])
-    assert "which is in split 'train', not 'test'" in str(report.errors[0])
+    (error,) = report.errors
+    assert all(part in str(error) for part in ("'c'", "'train'", "'test'"))
 
 
 def test_a_mirror_image_that_does_not_say_so(tmp_path: Path) -> None:
@@ -116,9 +116,8 @@ def test_a_mirror_image_that_does_not_say_so(tmp_path: Path) -> None:
         Made("b", motion=features(1)),
         Made("b2", "val", jittered),
     )
-    said = " ".join(map(str, report.errors))
-    assert report.error_kinds == {"same recording in two splits": 2}
-    assert "'image' is the mirror image of 'a'" in said and "'b2' is the same recording as 'b'" in said
+    named = [re.findall(r"'(image|b2)'.* '(a|b)'", str(error)) for error in report.errors]
+    assert sorted(named) == [[("b2", "b")], [("image", "a")]]
     same_split = report_on(tmp_path / "same", Made("a"), Made("image", "train", image))
     assert (same_split.errors, same_split.warnings) == ([], [])
 
@@ -132,22 +131,19 @@ def test_mirror_images_stay_in_the_split_of_their_family(tmp_path: Path) -> None
         Made("Mb2", "test", features(3), mirror_of="b"),
         Made("Mc", "train", features(4), mirror_of="gone"),
     )
-    said = sorted(problem.message for problem in report.errors)
-    assert said == [
-        "mirrors 'a', which is in split 'train', not 'test'",
-        "mirrors 'b', as 'Mb' does in split 'train', not 'test'",
-    ]
+    quoted = sorted(re.findall(r"'(\w+)'", problem.message) for problem in report.errors)
+    assert quoted == [["a", "train", "test"], ["b", "Mb", "train", "test"]]
 
 
 @pytest.mark.parametrize(
     ("name", "value", "word"),
-    [("root_height", 90.0, "root_height[0] is 90 at frame 3"), ("velocities", 25.0, "is 500 m/s at frame 3")],
+    [("root_height", 90.0, "root_height[0] is 90"), ("velocities", 25.0, "is 500 m/s")],
 )
 def test_absurd_values_are_errors(tmp_path: Path, name: str, value: float, word: str) -> None:
     motion = features(0)
     motion[3, LAYOUT.slice(name).start] = value
     report = report_on(tmp_path, Made("a", motion=motion), Made("b", motion=features(1)))
-    assert word in str(report.errors[0]) and "wrong unit, scale or layout" in str(report.errors[0])
+    assert word in str(report.errors[0])
     assert "'000000-00000" in report.errors[0].where
 
 
@@ -157,7 +153,7 @@ def test_numbers_that_are_none_are_an_error(tmp_path: Path, monkeypatch: pytest.
     motion[7, 3] = np.nan
     monkeypatch.setattr(sample_module, "require_finite", lambda *_: None)
     report = report_on(tmp_path, Made("a"), Made("b", motion=motion))
-    assert "NaN or infinity in row 7" in " ".join(map(str, report.errors))
+    assert "in row 7" in " ".join(map(str, report.errors))
 
 
 def test_glitches_are_warnings(tmp_path: Path) -> None:
@@ -165,7 +161,7 @@ def test_glitches_are_warnings(tmp_path: Path) -> None:
     motion[3, LAYOUT.slice("velocities").start + 5] = -5.0
     report = report_on(tmp_path, Made("a", motion=motion))
     assert report.errors == []
-    assert "velocities[5] is -100 m/s at frame 3; at most 40 is sensible" in str(report.warnings[0])
+    assert "velocities[5] is -100 m/s" in str(report.warnings[0])
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
@@ -215,7 +211,7 @@ def test_licences_and_splits_are_told(tmp_path: Path) -> None:
         tmp_path, Made("a", "test", licence="CC-BY-4.0"), Made("b", "test", features(1), licence=" ")
     )
     assert report.warning_kinds == {"licence": 2, "no licence": 1, "no training split": 1}
-    assert "'CC-BY-4.0' is not in the manifest" in " ".join(map(str, report.warnings))
+    assert "'CC-BY-4.0'" in " ".join(map(str, report.warnings))
 
 
 def test_findings_are_bounded_and_counted() -> None:
@@ -287,7 +283,7 @@ def test_cut_joined_and_packed_shards(tmp_path: Path) -> None:
         verdict = check_file(path)  # wherever it is cut, a shard is refused or whole samples are left
         assert not verdict.ok or verdict.what in ("shard of 1 samples", "shard of 2 samples")
     path.write_bytes(whole + whole)
-    assert "two archives in one file" in str(check_file(path))
+    assert "two archives" in str(check_file(path))
     header = whole.index(b"b.motion.npy")
     path.write_bytes(whole[:header] + b"damage" * 20 + whole[header + 120 :])
     assert "are no tar entries" in str(check_file(path))
@@ -309,15 +305,15 @@ def test_layouts_of_arrays(tmp_path: Path) -> None:
     assert "--set layout=joints22" in str(check_file(path))
     assert check_file(path, FileRules(layout="joints22")).ok
     np.save(path, 100 * walk(0))
-    assert "is the length unit right?" in str(check_file(path, FileRules(layout="joints22")))
+    assert "length unit" in str(check_file(path, FileRules(layout="joints22")))
     np.save(path, np.full((4, 322), 7.0, np.float32))
-    assert check_file(path).ok and "beyond what a person can do" in check_file(path).notes[0]
+    assert check_file(path).ok and len(check_file(path).notes) == 1
 
 
 def test_files_that_nothing_reads(tmp_path: Path) -> None:
     (tmp_path / "a.fbx").write_bytes(b"")
     (tmp_path / "folder.npy").mkdir()
-    with pytest.raises(UserError, match=r"nothing here reads '\.fbx' files; known: \.tar"):
+    with pytest.raises(UserError, match=r"'\.fbx'.* \.tar"):
         check_file(tmp_path / "a.fbx")
     assert "not a plain file" in str(check_file(tmp_path / "folder.npy"))
     assert "no such file" in str(check_file(tmp_path / "none.npy"))
@@ -348,10 +344,11 @@ def test_a_recording_in_two_splits_is_found_whatever_it_is_called() -> None:
         "train": Clips("train", {"sit": sit, "j": jump}),
         "test": Clips("test", {"walk": walk, "run": run}),
     }
-    assert find_leaks({"one": one, "other": other}) == [  # type: ignore[dict-item]
-        "'j' of one (train) is 'j' of other (test)",
-        "'walk' of one (test) is 'x' of other (train)",
-        "'run' of one (test) is 'run' of other (train)",
+    leaks = find_leaks({"one": one, "other": other})  # type: ignore[dict-item]
+    assert [re.findall(r"'(\w+)' of \w+ \((\w+)\)", leak) for leak in leaks] == [
+        [("j", "train"), ("j", "test")],
+        [("walk", "test"), ("x", "train")],
+        [("run", "test"), ("run", "train")],
     ]
     assert find_leaks({"one": one, "same": one}) == []  # type: ignore[dict-item]
 
@@ -378,5 +375,5 @@ def test_a_leaking_mix_is_refused_unless_it_is_allowed(tmp_path: Path) -> None:
         if allowed:
             run_recipe(recipe, tmp_path / "run", console=Console(quiet=True))
             continue
-        with pytest.raises(UserError, match=r"clips are in two splits of a mix.*allow_leaks"):
+        with pytest.raises(UserError, match=r"allow_leaks"):
             run_recipe(recipe, tmp_path / "run", console=Console(quiet=True))

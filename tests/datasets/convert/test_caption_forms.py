@@ -16,7 +16,7 @@ from rich.console import Console
 
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.captions.names import label_words, subject_of, subject_splits
-from motionloom.datasets.convert.captions.options import list_clips, nearest
+from motionloom.datasets.convert.captions.options import list_clips
 from motionloom.datasets.convert.captions.read import read_captions
 from motionloom.datasets.convert.common.splits import SplitNames, hash_split, read_split_files
 from motionloom.datasets.convert.registry import prepare
@@ -122,7 +122,7 @@ def test_every_form_gives_the_same_data_set(
     form: str, source: Path, tmp_path: Path, expected: list[str]
 ) -> None:
     captions = FORMS[form](tmp_path / "captions", TEXTS)
-    assert "3 of 3 clips have captions in captions" in convert(source, tmp_path / "out", captions)
+    assert "3 of 3 clips" in convert(source, tmp_path / "out", captions)
     if form == "HumanML3D":  # brings tokens, so the shards are not the same bytes
         rows = read_captions(captions)
         assert {name: [text.text for text in row.texts] for name, row in rows.items()} == TEXTS
@@ -244,7 +244,7 @@ def test_a_subject_is_in_one_split() -> None:
 def test_nothing_to_read(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="cannot read"):
         read_captions(tmp_path / "none.csv")
-    with pytest.raises(UserError, match=r"no \.txt file in it; expected one caption a line"):
+    with pytest.raises(UserError, match=r"no \.txt file"):
         read_captions(tmp_path)
     for name, text in (("c.csv", " \n"), ("c.json", "[ ]"), ("c.jsonl", "")):
         (tmp_path / name).write_text(text)
@@ -273,7 +273,7 @@ def test_captions_with_times_other_keys_and_several_columns(tmp_path: Path) -> N
     )
     assert [(c.text, c.start) for c in read_captions(path)["7"].texts] == [("x", 1.0), ("y", 0.0)]
     path.write_text('{"id": "a", "text": "x", "split": "dev"}\n{"id": "a", "text": "y", "split": "test"}')
-    with pytest.raises(UserError, match=r":2: split of clip 'a' is 'test' here and 'val' at .*:1"):
+    with pytest.raises(UserError, match=r":2: .*'a'.*'test'.*'val'.*:1"):
         read_captions(path)
 
 
@@ -306,16 +306,8 @@ def test_split_files_name_clips_as_captions_do(source: Path, tmp_path: Path) -> 
         with pytest.raises(UserError, match=rf"val\.txt: {said}"):
             plan(source, None, splits=tmp_path)
     (tmp_path / "val.txt").write_text("jump\nsub/turn\nhop\n")
-    with pytest.raises(
-        UserError, match=r"'sub/turn' in val\.txt means sub/turn\.bvh, which is in train\.txt too"
-    ):
+    with pytest.raises(UserError, match=r"'sub/turn'.*val\.txt.*sub/turn\.bvh.*train\.txt"):
         plan(source, None, splits=tmp_path)
-
-
-def test_nearest_names() -> None:
-    few = ["walks/walk_001.bvh", "walks/walk_002.bvh", "jump.bvh"]
-    assert nearest("Walk-001", few) == ["walks/walk_001.bvh", "walks/walk_002.bvh"]
-    assert nearest("zzz", few) == []
 
 
 def plan(source: Path, captions: Path | None, **changes: Any) -> Any:
@@ -327,14 +319,12 @@ def test_clips_without_captions_stop_the_conversion_until_it_is_decided(source: 
     path = tmp_path / "c.csv"
     path.write_text("name,caption\nwalk_a,walks\njumps,jumps\n")
     made = plan(source, path)
-    assert made.captions == (
-        "1 of 3 clips have captions in c.csv; 2 have none (jump.bvh, sub/turn.bvh); "
-        "captions for 1 clip that is not in the source ('jumps', nearest: jump.bvh)"
-    )
+    for part in ("1 of 3 clips", "c.csv", "(jump.bvh, sub/turn.bvh)", "('jumps', nearest: jump.bvh)"):
+        assert part in made.captions
     assert made.captions in made.notes and len(made.uncaptioned) == 2
     shown = "".join(str(cell) for column in made.table().columns for cell in column.cells)
-    assert "no captions for 2 of 3 clips" in shown
-    with pytest.raises(UserError, match=r"c\.csv: no captions for 2 of 3 clips \(jump\.bvh, sub/turn\.bvh\)"):
+    assert "2 of 3 clips" in shown
+    with pytest.raises(UserError, match=r"c\.csv: .*2 of 3.*\(jump\.bvh,.*turn\.bvh\)"):
         made.require_settled()
     with pytest.raises(UserError, match=r"nearest: jump\.bvh.*uncaptioned"):
         convert(source, tmp_path / "out", path)
@@ -343,7 +333,7 @@ def test_clips_without_captions_stop_the_conversion_until_it_is_decided(source: 
         settled = plan(source, path, uncaptioned=choice)
         settled.require_settled()
         assert sum(settled.counts().values()) == count
-        assert f"2 have none and are {'kept' if choice == 'keep' else 'left out'} (" in settled.captions
+        assert ("kept" if choice == "keep" else "left out") in settled.captions
 
 
 def test_names_of_splits(source: Path, tmp_path: Path) -> None:
@@ -354,7 +344,7 @@ def test_names_of_splits(source: Path, tmp_path: Path) -> None:
         plan(source, path)
     mapped = plan(source, path, splits_map="fold 1=train, fold 2=drop")
     assert {clip.id: split for split, clip in mapped.items} == {"walk_a": "val", "jump": "train"}
-    assert [drop.reason for drop in mapped.dropped] == ["in a split that is left out (splits_map)"]
+    assert ["splits_map" in drop.reason for drop in mapped.dropped] == [True]
     ignored = plan(source, path, splits_map="ignore")
     assert {clip.id: split for split, clip in ignored.items} == {
         "walk_a": "val",
@@ -376,5 +366,5 @@ def test_split_files_by_other_names(tmp_path: Path) -> None:
     assert counts["train"] / 20_000 == pytest.approx(0.80, abs=0.01)
     assert counts["val"] / 20_000 == pytest.approx(0.05, abs=0.005)
     (tmp_path / "dev.txt").write_text("in Train\n")
-    with pytest.raises(UserError, match=r"'in Train' is also in Train\.txt; a clip in two splits leaks"):
+    with pytest.raises(UserError, match=r"'in Train'.*Train\.txt"):
         read_split_files(tmp_path)

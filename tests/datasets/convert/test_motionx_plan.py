@@ -17,22 +17,12 @@ def fixture(shared: Path) -> Path:
     return shared / "data/layouts/motionx"
 
 
-def test_plan_tells_subsets_and_frames(fixture: Path) -> None:
-    plan = prepare(config(fixture)).plan
-    assert {clip.id for _, clip in plan.items} == ALL
-    assert plan.frames == {"train": 50 + 42 + 45 + 50 + 50, "val": 44, "test": 30 + 41}
-    assert plan.found == 8
-
-
 # Texts
 
 
 def test_captions_of_both_grammars(fixture: Path) -> None:
     clips = planned(fixture)
-    assert [c.text for c in clips[BOW].texts] == [
-        "A person bows happily.",
-        "Someone greets with a cheerful bow.",
-    ]
+    assert [c.text.split()[-1] for c in clips[BOW].texts] == ["happily.", "bow."]
     assert clips[DANCE].texts[0].text == "Dance Krump Stomp"
     texts = clips[HUMANML].texts
     # The third line's segment ends at 2.5 s; 50 frames are 1.67 s at 30 fps (they would be 2.5 s at 20).
@@ -43,7 +33,7 @@ def test_captions_of_both_grammars(fixture: Path) -> None:
     assert [c.text for c in clips[BOW].face_texts] == ["happy"]
     assert clips[BOW].face_texts[0].source == "face"
     notes = prepare(config(fixture)).plan.notes
-    assert any(f"{HUMANML}: a caption at 0.5 s is beyond its 1.7 s" in note for note in notes)
+    assert any(HUMANML in note and "0.5 s" in note and "1.7 s" in note for note in notes)
 
 
 def test_segments_are_seconds_at_30_fps(copy: Path) -> None:
@@ -121,10 +111,9 @@ def test_other_representations_and_copies_are_not_motion(copy: Path) -> None:
     plan = prepare(config(copy)).plan
     assert {clip.id for _, clip in plan.items} == ALL
     assert plan.found == 9
-    assert "captions: 1 files of clips that have one" in plan.notes
-    assert [d.reason for d in plan.dropped] == [
-        f"second file for clip id '{MUG}'; the first is {MOTION}/{MUG}.npy"
-    ]
+    assert any(note.startswith("captions: 1 files") for note in plan.notes)
+    (drop,) = plan.dropped
+    assert f"'{MUG}'" in drop.reason and f"{MOTION}/{MUG}.npy" in drop.reason
     assert not plan.broken
 
 
@@ -150,14 +139,12 @@ def test_missing_and_unlisted_clips(copy: Path) -> None:
     lines = (copy / "train.txt").read_text().splitlines()
     (copy / "train.txt").write_text("\r\n".join(line for line in lines if line != BOW) + "\r\n\r\n")
     plan = prepare(config(copy)).plan
-    assert [(d.source, d.reason) for d in plan.missing] == [
-        (MUG, "listed in val.txt, but its motion is not here")
-    ]
+    assert [(d.source, "val.txt" in d.reason) for d in plan.missing] == [(MUG, True)]
     assert [(d.source, d.reason) for d in plan.dropped] == [(f"{MOTION}/{BOW}.npy", "in no split file")]
-    assert any("1 caption files have no motion" in note for note in plan.notes)
+    assert any(note.startswith("1 caption files") for note in plan.notes)
 
 
-def test_subsets_limit_and_licences(fixture: Path) -> None:
+def test_subsets_frames_limit_and_licences(fixture: Path) -> None:
     plan = prepare(config(fixture, subsets=("GRAB", "aist"))).plan
     assert {clip.id for _, clip in plan.items} == {MUG, DANCE}
     assert not plan.missing
@@ -167,3 +154,7 @@ def test_subsets_limit_and_licences(fixture: Path) -> None:
     assert {clip.licence for _, clip in prepare(config(fixture, licence="mine")).plan.items} == {"mine"}
     assert prepare(config(fixture, licence="mine")).facts().licence == "mine"
     assert clips_of(fixture)[DANCE].licence.endswith("AIST++-annotations-CC-BY-4.0")
+    plan = prepare(config(fixture)).plan
+    assert {clip.id for _, clip in plan.items} == ALL
+    assert plan.frames == {"train": 50 + 42 + 45 + 50 + 50, "val": 44, "test": 30 + 41}
+    assert plan.found == 8

@@ -35,7 +35,7 @@ def test_limit_per_column(tmp_path: Path) -> None:
     values = np.array([[1.0, 50.0], [-3.0, 50.0]], dtype=np.float32)
     np.save(tmp_path / "a.npy", values)
     load_array(tmp_path / "a.npy", width=2, limit=np.array([3.0, 100.0]))
-    with pytest.raises(UserError, match="absurd value -3 at frame 1, column 0; at most 2 is sensible"):
+    with pytest.raises(UserError, match=r"frame 1, column 0.*2"):
         load_array(tmp_path / "a.npy", width=2, limit=np.array([2.0, 100.0]))
 
 
@@ -139,8 +139,8 @@ def test_inside_keeps_names_in_their_folder(tmp_path: Path) -> None:
         assert inside(root, name) == root / name
         assert inside(tmp_path / "linked", name) == tmp_path / "linked" / name
     for name in ("../secret.txt", "/etc/passwd", "sub/../../secret.txt", "C:/x", "a\\b", "", ".", "sub//1"):
-        with pytest.raises(UserError, match="not a plain relative name"):
+        with pytest.raises(UserError, match="plain relative name"):
             inside(root, name)
     for name in ("out.txt", "up/secret.txt", "loop"):
-        with pytest.raises(UserError, match=f"^{name}: a link that leaves root/"):
+        with pytest.raises(UserError, match=f"^{name}: .*leaves root/"):
             inside(root, name)

@@ -229,13 +229,13 @@ def test_learns_and_leaves_no_seams() -> None:
 
 def test_mistakes_are_named(net: Dmd) -> None:
     codes = random_codes([4, 4])
-    with pytest.raises(UserError, match="1 seeds and 2 token sequences"):
+    with pytest.raises(UserError, match="1 seeds"):
         decode_motions(net, codes, seeds=[1])
-    with pytest.raises(UserError, match="window 16 and overlap 16 must be multiples of 4"):
+    with pytest.raises(UserError, match="overlap 16"):
         decode_motions(net, codes, seeds=[1, 2], window=16, overlap=16)
     with pytest.raises(UserError, match="2000 denoising steps"):
         decode_motions(net, codes, seeds=[1, 2], steps=2000)
-    with pytest.raises(UserError, match="cannot fill in for hidden ones"):
+    with pytest.raises(UserError, match="hidden"):
         decode_motions(net, codes, seeds=[1, 2], hidden=torch.zeros(2, 4, dtype=torch.bool))
-    with pytest.raises(ValueError, match="tokens of 12 frames were given for 16"):
+    with pytest.raises(ValueError, match=r"12 frames.* 16"):
         net(torch.zeros(1, 16, 6), torch.tensor([1]), random_codes([3]).codes, torch.tensor([12]))

@@ -183,11 +183,11 @@ def test_the_autoencoders_loss_counts_real_frames_of_present_columns() -> None:
 def test_wrong_widths_and_lengths_are_refused() -> None:
     net = network()
     motion: Tensor = torch.zeros(1, 40, 263)
-    with pytest.raises(ValueError, match="built for 263 features, got 262"):
+    with pytest.raises(ValueError, match=r"263.* 262"):
         net.encode_motion(motion[..., 1:], torch.tensor([40]))
-    with pytest.raises(ValueError, match="44 frames, and at most 40"):
+    with pytest.raises(ValueError, match=r"44 frames.* 40"):
         net.encode_motion(torch.zeros(1, 44, 263), torch.tensor([44]))
-    with pytest.raises(ValueError, match="built for 6 text features, got 7"):
+    with pytest.raises(ValueError, match=r"6 text features.* 7"):
         net.encode_text(torch.zeros(1, 2, 7), torch.ones(1, 2, dtype=torch.bool))
     with pytest.raises(ValueError, match="no multiple of 4"):
         Evaluator(SMALL, LAYOUT, TEXT, 42)
