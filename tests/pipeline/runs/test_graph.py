@@ -88,7 +88,7 @@ def test_runs_all_and_then_what_changed_and_all_below(
     assert {role: i.stage for role, i in artifact.inputs.items()} == {"left": "left", "right": "right"}
     plan = make_plan(recipe(tmp_path, "left.add=2"), tmp_path / "run")
     reasons = {row.stage.name: row.reason for row in plan}
-    assert reasons["left"] == "changed: add 1 -> 2" and reasons["both"] == "input left changed"
+    assert reasons["left"].endswith("add 1 -> 2") and reasons["both"] == "input left changed"
     assert reasons["right"] == "finished"
     for overrides, ran in (
         ((), []),
@@ -195,7 +195,8 @@ def test_a_role_is_filled_by_every_stage_that_gives_it(tmp_path: Path) -> None:
     # The first of several generators is the default, so another order makes something else.
     turned = several(tmp_path, "listed.inputs.numbers=[first, second]")
     rows = {row.stage.name: (row.action, row.reason) for row in make_plan(turned, run)}
-    assert rows.pop("listed") == ("run", "source files or the order of inputs changed")
+    action, reason = rows.pop("listed")
+    assert action == "run" and "order of inputs" in reason
     assert {action for action, _ in rows.values()} == {"skip"}
 
 
@@ -239,7 +240,7 @@ def test_a_seed_of_the_data_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert go(tmp_path, "both.kind=fit", "data_seed=6", "seed=6") == ALL
     assert go(tmp_path, "both.kind=fit", "seed=6") == [], "it is `seed` where it is not given"
     plan = make_plan(recipe(tmp_path, "both.kind=fit", "seed=7"), tmp_path / "run")
-    assert "seed 6 -> 7; data_seed: 6 keeps" in plan[0].reason
+    assert "data_seed: 6 keeps" in plan[0].reason
     again = load_recipe(tmp_path / "run/recipe.yaml")
     assert again.data_seed is None and "data_seed" not in again.to_yaml()
     seeded = recipe(tmp_path, "data_seed=3")

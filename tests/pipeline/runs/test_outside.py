@@ -161,14 +161,12 @@ def test_another_run_that_has_changed_is_noticed(runs: Path) -> None:
     artifact.finish(runs / "other/stages/net")
     row = make_plan(load_recipe("recipe.yaml"), run)[1]
     assert (row.action, row.reason) == ("run", "input runs/other/stages/net changed")
-    said = f"stage 'judge' was made from another 'net' of {runs / 'other'}, which has been made anew since"
+    said = f"'judge' .*another 'net' of {runs / 'other'}, "
     with pytest.raises(UserError, match=said):
         require_consistent(run, ["judge"])
-    with pytest.raises(UserError, match="'net' was made from another 'net'"):
+    with pytest.raises(UserError, match=r"'net' .*another 'net'"):
         evaluate_run(run, console=QUIET)
-    assert f"'net' of {runs / 'other'} has been made anew since" in "; ".join(
-        stage.why for stage in run_state(run).unfinished
-    )
+    assert f"'net' of {runs / 'other'} " in "; ".join(stage.why for stage in run_state(run).unfinished)
     with pytest.raises(UserError, match=r"  net: input runs/other/stages/net changed"):
         run_recipe("recipe.yaml", run, console=QUIET)
     run_recipe("recipe.yaml", run, replace=True, console=QUIET)
@@ -184,9 +182,9 @@ def test_another_run_made_of_mixed_stages_is_refused(runs: Path) -> None:
     artifact = Artifact.load_json(data / "artifact.json")
     artifact.model_copy(update={"fingerprint": "0" * 64}).finish(data)
     assert identity_of(runs / "other/stages/net") == fresh
-    with pytest.raises(UserError, match="'net' was made from another 'data'"):
+    with pytest.raises(UserError, match=r"'net' .*another 'data'"):
         load_recipe("recipe.yaml")
-    with pytest.raises(UserError, match="'net' was made from another 'data'"):
+    with pytest.raises(UserError, match=r"'net' .*another 'data'"):
         require_consistent(runs / "mine", ["net"])
 
 
@@ -195,15 +193,15 @@ def test_another_run_that_is_gone(runs: Path) -> None:
     recipe = MINE + "  report: {kind: page}\n"
     run = go(recipe, "runs/mine")
     (runs / "other").rename(runs / "away")
-    gone = f"{runs / 'other/stages/net'}, where no finished stage is any more"
-    with pytest.raises(UserError, match=f"{run}: stage 'net' was made from {gone}"):
+    gone = runs / "other/stages/net"
+    with pytest.raises(UserError, match=f"{run}: stage 'net' .* {gone}, "):
         StageCache().get(finished_stages(run)["net"])
-    with pytest.raises(UserError, match=r"stages.net.inputs.start: runs/other/stages/net: no such folder"):
+    with pytest.raises(UserError, match=r"stages\.net\.inputs\.start: runs/other/stages/net: "):
         load_recipe(run / "recipe.yaml")
-    with pytest.raises(UserError, match=r"inputs.generators: .*runs/other/stages/net: no such folder"):
+    with pytest.raises(UserError, match=r"inputs\.generators: .*runs/other/stages/net: "):
         evaluate_run(run, console=QUIET)
     assert [stage.name for stage in generators_of(run)] == ["net"]
-    with pytest.raises(UserError, match=f"stage 'net' was made from {gone}"):
+    with pytest.raises(UserError, match=f"stage 'net' .* {gone}, "):
         report_run(run, None, console=QUIET)
     (runs / "away").rename(runs / "other")
     report_run(run, None, console=QUIET)
@@ -239,14 +237,14 @@ def test_a_stage_of_another_version_or_with_a_file_missing(
     Path("recipe.yaml").write_text(MINE)
     net = runs / "other/stages/net"
     (net / "value.json").rename(net / "old.json")
-    with pytest.raises(UserError, match=r"value\.json is gone .*: motionloom"):
+    with pytest.raises(UserError, match=r"value\.json .*: motionloom"):
         load_recipe("recipe.yaml")
     (net / "old.json").rename(net / "value.json")
     root = Loading("root", "a toy", AddConfig, add_up, version=2, offers=frozenset({"data"}))
     register_toys(monkeypatch, root)
     text = MINE.replace("start: runs/other/stages/net", "data: runs/other/stages/data")
     Path("recipe.yaml").write_text(text.replace("  data: {kind: root, add: 100}\n", ""))
-    with pytest.raises(UserError, match=r"'data' .* version 1 .* root, .* version 2"):
+    with pytest.raises(UserError, match=r"'data' .*version 1 .*version 2"):
         load_recipe("recipe.yaml")
 
 

@@ -83,14 +83,14 @@ def test_a_folder_with_mixed_stages_is_not_used(go: Go, tmp_path: Path) -> None:
     go()
     go("tma.add=2", until="tma", replace=True)
     for use in (lambda: Bundle.from_run(run), lambda: evaluate_run(run, console=QUIET)):
-        with pytest.raises(UserError, match="'gpt' was made from another 'tma'") as error:
+        with pytest.raises(UserError, match=r"'gpt' .*another 'tma'") as error:
             use()
         assert f"motionloom run {run / 'recipe.yaml'} -o {run}" in str(error.value)
     run_recipe(run / "recipe.yaml", run, replace=True, console=QUIET)  # the fix
     evaluate_run(run, console=QUIET)
     require_consistent(run, finished_stages(run))
     go("tokenizer.add=2", until="tokenizer", replace=True)  # further up
-    with pytest.raises(UserError, match="'tokens' was made from another 'tokenizer'"):
+    with pytest.raises(UserError, match=r"'tokens' .*another 'tokenizer'"):
         evaluate_run(run, console=QUIET)
     go(replace=True)
     go("data.add=2", until="data")
@@ -99,7 +99,7 @@ def test_a_folder_with_mixed_stages_is_not_used(go: Go, tmp_path: Path) -> None:
     go(replace=True)
     with pytest.raises(KeyboardInterrupt):  # one that is being made anew is another one too
         go("tma.add=-1", until="tma", replace=True)
-    with pytest.raises(UserError, match="'gpt' was made from another 'tma'"):
+    with pytest.raises(UserError, match=r"'gpt' .*another 'tma'"):
         Bundle.from_run(run)
 
 
@@ -122,12 +122,12 @@ def took(run: Path, **seconds: float) -> None:
 def test_another_recipe_is_refused_in_the_folder(go: Go, tmp_path: Path) -> None:
     go()
     before = files(tmp_path / "run")
-    with pytest.raises(UserError, match=r"(?s)'toy', not 'other'; .*gpt.* --replace"):
+    with pytest.raises(UserError, match=r"(?s)'toy', .*'other'; .*gpt.* --replace"):
         go("gpt.add=2", recipe="other")
-    with pytest.raises(UserError, match=r"'toy', not 'other'; -o .*run-2 .*--replace"):
+    with pytest.raises(UserError, match=r"'other'; -o .*run-2 .*--replace"):
         go("report.add=2", recipe="other")
     said = go("gpt.add=2", recipe="other", dry_run=True)
-    assert "without --replace this is refused" in said and "holds a run of recipe 'toy', not 'other'" in said
+    assert "--replace" in said and "'toy', not 'other'" in said
     assert before == files(tmp_path / "run")
     assert "2 of 9" not in go("gpt.add=2", recipe="other", replace=True, until="gpt")
     assert json.loads((tmp_path / "run/stages/gpt/value.json").read_text()) == 2
@@ -140,19 +140,20 @@ def test_finished_trainings_are_not_replaced_unasked(go: Go, tmp_path: Path) -> 
     before = files(run)
     with pytest.raises(UserError) as error:
         go("tokenizer.add=2", "evaluate.add=3")
-    assert str(error.value).splitlines() == [
-        f"{run}: this would replace 2 finished stages, 10 h 25 min of work:",
-        "  tokenizer: changed: add 1 -> 2 (2 h 05 min of training)",
-        "  gpt: input tokens changed (8 h 20 min of training)",
-        f"with the settings of the last run here, --set too: motionloom run {run}/recipe.yaml -o {run}",
-        f"-o {run}-2 keeps both, --replace goes on here: what fits is kept, the rest is made again",
+    parts = [
+        (f"{run}: ", "2 finished stages", "10 h 25 min"),
+        ("  tokenizer: ", "add 1 -> 2", "2 h 05 min"),
+        ("  gpt: ", "input tokens changed", "8 h 20 min"),
+        (f"motionloom run {run}/recipe.yaml -o {run}",),
+        (f"-o {run}-2 ", "--replace"),
     ]
+    for line, wanted in zip(str(error.value).splitlines(), parts, strict=True):
+        assert all(part in line for part in wanted), line
     said = go("tokenizer.add=2", "evaluate.add=3", dry_run=True)
-    assert "without --replace this is refused." in said
     assert all(line in said for line in str(error.value).splitlines())
     assert files(run) == before
     said = go("tokenizer.add=2", "evaluate.add=3", replace=True)
-    assert "replaces finished stages: tokenizer, gpt\n" in said
+    assert "stages: tokenizer, gpt\n" in said
     assert said.index("replaces") < said.index("] tokenizer")
 
 
@@ -161,18 +162,18 @@ def test_what_is_cheap_is_made_anew_without_asking(go: Go, tmp_path: Path) -> No
     assert "replaces" not in go("evaluate.add=3")
     assert json.loads((tmp_path / "run/stages/evaluate/value.json").read_text()) == 3
     took(tmp_path / "run", evaluate=3601.0)
-    with pytest.raises(UserError, match=r"  evaluate: changed: add 3 -> 1 \(1 h 00 min of work\)"):
+    with pytest.raises(UserError, match=r"evaluate: .*3 -> 1 \(1 h"):
         go()
     (tmp_path / "run/stages/gpt/timing.json").unlink()
-    with pytest.raises(UserError, match=r"  gpt: changed: add 1 -> 2 \(training of unknown time\)"):
+    with pytest.raises(UserError, match=r"gpt: .*1 -> 2 .*unknown"):
         go("gpt.add=2", until="gpt")
 
 
 def test_what_is_asked_for_by_name_is_made_anew_and_what_was_begun_is_named(go: Go) -> None:
     go()
-    assert "3 of 9 stages to run" in go("gpt.add=2", first="gpt")
-    assert "9 of 9 stages to run" in go("tokenizer.add=2", first="data")
-    with pytest.raises(UserError, match="  tokenizer: changed: add 2 -> 3"):
+    assert "3 of 9 " in go("gpt.add=2", first="gpt")
+    assert "9 of 9 " in go("tokenizer.add=2", first="data")
+    with pytest.raises(UserError, match=r"  tokenizer: .*2 -> 3"):
         go("tokenizer.add=3", first="gpt")
     with pytest.raises(KeyboardInterrupt):
         go("tokenizer.add=2", "gpt.add=-1", replace=True)

@@ -178,12 +178,12 @@ def test_clips_without_a_caption_are_left_out(tmp_path: Path, face: bool) -> Non
 
 def test_no_caption_at_all_is_refused(tmp_path: Path) -> None:
     dataset = dataset_of(tmp_path, Convert([[ALL], [WALKS]]))
-    with pytest.raises(UserError, match="no clip of split 'train' has a face caption"):
+    with pytest.raises(UserError, match=r"'train' .*face caption"):
         clips_of(dataset, face=True)
     silent = dataset_of(tmp_path / "silent", Convert([[], []]))
-    with pytest.raises(UserError, match="no clip of split 'train' has a caption"):
+    with pytest.raises(UserError, match=r"'train' .*a caption"):
         clips_of(silent)
-    with pytest.raises(UserError, match="no clip of split 'train' has a caption"):
+    with pytest.raises(UserError, match=r"'train' .*a caption"):
         spread(silent, 4)
 
 
@@ -193,7 +193,7 @@ def test_a_tokenizer_without_a_hand_stream_needs_hands(tmp_path: Path) -> None:
     clips, _, _ = clips_of(dataset, config=config)
     assert len(clips.captions) == 2 and clips.present is None and clips.uncaptioned == 0
     bare = dataset_of(tmp_path / "bare", Convert([[ALL]] * 2, present=(2, 2)))
-    with pytest.raises(UserError, match="holds all that the tokenizer models"):
+    with pytest.raises(UserError, match="the tokenizer models"):
         clips_of(bare, config=VqConfig(width=8, depth=1, code_dim=8, num_codes=8, part="bodyhand"))
 
 

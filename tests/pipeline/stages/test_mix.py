@@ -89,7 +89,7 @@ stages:
     assert [source.weight for source in dataset.sources()] == [1.0, 3.0]
     wanted = clips(own) + clips(dances)
     assert all(np.array_equal(a, b) for a, b in zip(clips(dataset), wanted, strict=True))
-    with pytest.raises(UserError, match=r"weights\.dances is of no stage .*; these are own, run:dances"):
+    with pytest.raises(UserError, match=r"weights\.dances .* own, run:dances"):
         load_recipe(tmp_path / "recipe.yaml", ["data.weights={dances: 1}"])
     with pytest.raises(UserError, match="stages/data', a mix itself"):
         load_recipe(tmp_path / "recipe.yaml", [f"data.inputs.data=[own, {tmp_path}/run/stages/data]"])
@@ -107,7 +107,7 @@ def test_its_layout_is_known_before_it_runs(tmp_path: Path) -> None:
         return name
 
     assert layout() == "body133"
-    with pytest.raises(UserError, match="stage 'dances', mixed with 'texts': holds layout wholebody363"):
+    with pytest.raises(UserError, match=r"'dances', .*'texts': .*wholebody363"):
         layout("dances.layout=wholebody363", "dances.fps=20")
 
 
@@ -140,5 +140,5 @@ stages:
   fast: {{kind: shards, path: {tmp_path}/at25, layout: body133}}
   data: {{kind: mix}}
 """
-    with pytest.raises(UserError, match="stage 'fast', mixed with 'slow': holds layout body133"):
+    with pytest.raises(UserError, match=r"'fast', .*'slow': .*body133"):
         run_recipe(write(tmp_path, text), tmp_path / "run", console=Console(quiet=True))

