@@ -109,7 +109,7 @@ def test_going_on_from_a_checkpoint_ends_with_the_same_bytes(stage: str, run: Pa
 
 def test_a_dry_run_knows_its_sizes(run: Path, call: Callable[..., Any], tmp_path: Path) -> None:
     done = call("run", run.parent / "recipe.yaml", "-o", tmp_path / "run", "--dry-run")
-    assert done.code == 0 and "2 latents of 16 a motion" in done.out
+    assert done.code == 0 and "2 latents of 16" in done.out
 
 
 @pytest.mark.parametrize(
@@ -120,14 +120,10 @@ def test_a_dry_run_knows_its_sizes(run: Path, call: Callable[..., Any], tmp_path
         ("motion_vae.max_frames=498", "net.positions is 500"),
         ("motion_vae.net.layers=4", "layers 4 must be odd"),
         ("motion_vae.part=face", "part"),
-        (
-            "motionclip.net.latent=64",
-            "net.latent 64 must be the width of the text stage's sentence embeddings",
-        ),
+        ("motionclip.net.latent=64", "net.latent 64"),
     ],
 )
 def test_what_does_not_fit_is_refused_before_anything_runs(change: str, says: str, run: Path) -> None:
     with pytest.raises(UserError, match=says):
-        run_recipe(
-            run.parent / "recipe.yaml", run, overrides=[change], dry_run=True, console=Console(quiet=True)
-        )
+        recipe, quiet = run.parent / "recipe.yaml", Console(quiet=True)
+        run_recipe(recipe, run, overrides=[change], dry_run=True, console=quiet)

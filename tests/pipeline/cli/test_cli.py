@@ -105,13 +105,11 @@ def damaged(shards: Path, tmp_path: Path) -> Path:
     return root
 
 
+CONVERT = ("data", "convert", "bvh", "nowhere", "out", "--licence", "CC0")
 MISTAKES: dict[str, tuple[list[str], str]] = {
     "unknown command": (["genrate"], "'generate'"),
     "unknown source": (["data", "convert", "bhv"], "'bvh'"),
-    "unknown setting": (
-        ["data", "convert", "bvh", "mocap", "out", "--licence", "x", "--set", "looks=3"],
-        "'look'",
-    ),
+    "unknown setting": ([*CONVERT, "--set", "looks=3"], "'look'"),
     "unknown option": (["run", "humantomato-tiny", "--outt", "x"], "--outt"),
     "unknown recipe": (["run", "humantomato-tin"], "'humantomato-tiny'"),
     "unknown stage": (["run", "humantomato-tiny", "--set", "tmaa.optim.lr=1"], "'tma'"),
@@ -125,20 +123,11 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "an unknown setting": (["edit", "nowhere", "walk.bvh", "--set", "likenes=0.5"], "'likeness'"),
     "a setting of nothing": (["generate", "nowhere", "a person walks", "--set", "colour=1"], "temperature"),
     "a task of nothing": (["edit", "nowhere", "walk.bvh", "--task", "no.yaml"], "no.yaml: cannot be read"),
-    "convert nothing": (
-        ["data", "convert", "bvh", "nowhere", "out", "--set", "joint_map=map.json", "--licence", "CC0"],
-        "map.json: ",
-    ),
+    "convert nothing": ([*CONVERT, "--set", "joint_map=map.json"], "map.json: "),
     "synth of a wrong layout": (["data", "synth", "out", "--set", "layout=body13"], "layout"),
-    "generate before a model is opened": (
-        ["generate", "nowhere", "a person walks", "-o", "file/sub"],
-        "file: ",
-    ),
+    "generate before a model is opened": (["generate", "nowhere", "jump", "-o", "file/sub"], "file: "),
     "report": (["report", "nowhere", "-o", "folder"], "folder: "),
-    "check with the options of files": (
-        ["data", "check", "SHARDS", "--set", "layout=h3d263", "--set", "seconds=3"],
-        "layout, seconds",
-    ),
+    "options of files": (["data", "check", "SHARDS", "--set", "layout=h3d263"], "layout"),
     "run of an empty recipe": (["evaluate", "empty"], "empty/recipe.yaml: "),
     "model of an empty recipe": (["generate", "empty", "jump"], "empty/recipe.yaml: "),
     "model of no YAML": (["export", "broken", "-o", "new"], "broken/recipe.yaml: "),
@@ -219,17 +208,7 @@ def test_convert_plans_and_converts(tmp_path: Path, call: Call) -> None:
     text = write_clip(source / "control_ok.bvh", 0).read_text()
     (source / "frame_time_zero.bvh").write_text(re.sub(r"Frame Time: .*", "Frame Time: 0.0", text))
     joint_map = write_map(tmp_path / "joint_map.json")
-    words = (
-        "data",
-        "convert",
-        "bvh",
-        source,
-        out,
-        "--set",
-        f"joint_map={joint_map}",
-        "--licence",
-        "CC-BY-NC-4.0",
-    )
+    words = ("data", "convert", "bvh", source, out, "--set", f"joint_map={joint_map}", "--licence", "CC0")
     plan = call(*words, "--plan")
     assert plan.code == 0 and "frame_time_zero.bvh" in plan.out and not out.exists()
     strict = call(*words, "--set", "strict=true", "--workers", 1)
@@ -245,7 +224,7 @@ def test_a_wrong_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, call:
     words = ("data", "convert", "bvh", source, out, *more)
     plan = call(*words, "--plan")
     assert plan.code == 0 and not out.exists()
-    assert "0 of 3, along +z" in plan.out and "try: --set up=z" in plan.out
+    assert "0 of 3, " in plan.out and "try: --set up=z" in plan.out
     assert plan.out.rstrip().endswith(f"--set joint_map={joint_map} --set up=z")
     refused = call(*words)
     assert refused.code == 2 and "--set up=z" in refused.err

@@ -190,9 +190,6 @@ def test_without_the_module_it_is_one_sentence(recipe: Path, run: Path, export: 
     for folder in (run, export):
         with pytest.raises(UserError, match=f"'pacer' .*{registry.VARIABLE}"):
             Bundle.open(folder)
-
-
-def test_a_module_that_is_not_there_is_one_sentence(recipe: Path) -> None:
     said = program("run", recipe, "--dry-run", code=2, stages="pacer.stage, no_such_module")
     assert "MOTIONLOOM_STAGES=no_such_module: cannot be imported" in said and len(said.splitlines()) == 1
 

@@ -90,16 +90,8 @@ def test_it_says_what_is_in_the_set(page: Path, nasty: Path) -> None:
     for word in ("Data set nasty", "wholebody363 (exact)", "synth version 7", "40", "train", "val", "test"):
         assert word in text, word
     whole = page.read_text()
-    for word in (
-        "shorter than 1 s",
-        "NaN at frame 3",
-        "8 clips of 48 were left out",
-        "7 × … s, shorter than … s",
-        "1 × NaN at frame …",
-        "a note",
-        "deep.er",
-        "30720",
-    ):
+    dropped = ("8 clips of 48", "shorter than 1 s", "7 × … s", "NaN at frame 3", "1 × NaN at frame …")
+    for word in (*dropped, "a note", "deep.er", "30720"):
         assert word in whole, word
     assert whole.count("<h1>") == 1 and whole.count("<h2") == 5
     assert re.search(r"<dt>captions</dt><dd>180</dd>", whole), "40 clips of 4, and every other one more"
@@ -159,7 +151,7 @@ def test_commands(call: Callable[..., Any], nasty: Path, tmp_path: Path) -> None
 def test_loose_files_are_checked(call: Callable[..., Any], tmp_path: Path) -> None:
     np.save(tmp_path / "good.npy", np.zeros((4, 263), np.float32))
     good = call("data", "check", tmp_path / "good.npy", "--set", "layout=h3d263")
-    assert good.code == 0 and "good.npy: ok, h3d263 [4, 263]" in good.out
+    assert good.code == 0 and "good.npy: ok, h3d263" in good.out
     assert call("data", "check", tmp_path / "good.npy").code == 1
     (tmp_path / "bad\x1b[2Jname\n.txt").write_text("")
     bad = call("data", "check", tmp_path, "--set", "layout=h3d263")

@@ -217,10 +217,7 @@ def test_another_run_that_is_gone(runs: Path) -> None:
         ("runs/other/stages", r"no finished stage \(no artifact.json\); name the folder of a stage"),
         ("runs/other/stages/data", r"its input 'start' is the stage '.*data' of kind root, which is no net"),
         ("[net, runs/other/stages/data]", "'runs/other/stages/data' is no stage that gives a generator"),
-        (
-            "[runs/other/stages/net, runs/sub/other/stages/net]",
-            "two are called 'other:net'; name each once, or rename",
-        ),
+        ("[runs/other/stages/net, runs/sub/other/stages/net]", "two .*'other:net'"),
     ],
 )
 def test_what_is_no_stage_is_refused(place: str, says: str, runs: Path) -> None:

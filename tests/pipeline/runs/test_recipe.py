@@ -67,6 +67,7 @@ def test_ablations_of_ude_change_what_they_are_named_for() -> None:
 
 
 TINY = "extends: humantomato-tiny\nname: x\n"
+CHILD = "extends: base\nname: child\nstages: "
 LISTED = """
 name: two-faces
 stages:
@@ -110,10 +111,7 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
     ("text", "says"),
     [
         ("name: x\nstages: {stats: {kind: stats}}", "needs a stage 'data'"),
-        (
-            "name: x\nstages: {data: {kind: synth}, s: {kind: stats, inputs: {dat: data}}}",
-            "unknown role 'dat'",
-        ),
+        ("name: x\nstages: {data: {kind: synth}, s: {kind: stats, inputs: {dat: data}}}", "role 'dat'"),
         ("name: x\nstage: {}", "unknown key 'stage'; did you mean 'stages'"),
         ("name: ../x\nstages: {data: {kind: synth}}", "name"),
         ("name: /tmp/x\nstages: {data: {kind: synth}}", "name"),
@@ -127,33 +125,14 @@ def test_wrong_overrides_name_the_key_and_the_fix(override: str, says: str) -> N
         ("name: x\nstages: {data: {kind: synth, clips: 3, clips: 4}}", "key 'clips'"),
         (TINY + "stages: {toknizer: {train: {steps: 3}}}", "did you mean 'tokenizer'"),
         ("extends: recipe\nname: x", "circle"),
-        (
-            TINY + "stages: {face_vae: {kind: tma, part: face, net: {frame_stride: 2}}}",
-            "frame_stride must be 1",
-        ),
+        (TINY + "stages: {face_vae: {kind: tma, part: face, net: {frame_stride: 2}}}", "frame_stride .* 1"),
         # By kind or by what it gives; what would fit is named.
-        (
-            TINY + "stages: {gpt: {inputs: {tokenizer: tma}}}",
-            "'tma' of kind tma, which is no tokenizer; choose .*face_tokenizer",
-        ),
-        (
-            TINY + "stages: {tma: {inputs: {stats: data}}}",
-            r"'data' of kind synth, which is no stats; choose stats in stages\.tma",
-        ),
+        (TINY + "stages: {gpt: {inputs: {tokenizer: tma}}}", "'tma' .* no tokenizer; .*face_tokenizer"),
+        (TINY + "stages: {tma: {inputs: {stats: data}}}", r"'data' .* no stats; .*stats in stages\.tma"),
         (TINY + "stages: {face_gpt: {inputs: {start: gpt}}}", "starts from 'gpt', which differs in"),
-        (
-            "extends: base\nname: child\nstages: {face_vae: null}",
-            r"generate.inputs.generators: 'face_vae' is no stage that gives a generator, as "
-            r"stages.face_vae: null in .*recipe.yaml leaves it out; valid names: diffusion",
-        ),
-        (
-            "extends: base\nname: child\nstages: {text: null}",
-            r"stage 'face_vae' needs a stage 'text' \(role 'text'\), which stages.text: null in .* leaves",
-        ),
-        (
-            "extends: base\nname: child\nstages: {face_vea: null}",
-            "there is no such stage to remove; did you mean 'face_vae'",
-        ),
+        (CHILD + "{face_vae: null}", r"inputs.generators: 'face_vae' .*face_vae: null in .*yaml.* diffusion"),
+        (CHILD + "{text: null}", r"'face_vae' .*'text'.* stages.text: null in .*recipe\.yaml"),
+        (CHILD + "{face_vea: null}", "did you mean 'face_vae'"),
         (LISTED.replace("{kind: mdm, part: face}", "null"), r"stages\.diffusion"),
     ],
 )
@@ -163,9 +142,7 @@ def test_wrong_recipes_are_refused(text: str, says: str, load: Any) -> None:
 
 
 def test_a_stage_of_the_base_can_be_left_out(load: Any) -> None:
-    child = (
-        "extends: base\nname: child\nstages: {face_vae: null, generate: {inputs: {generators: [diffusion]}}}"
-    )
+    child = CHILD + "{face_vae: null, generate: {inputs: {generators: [diffusion]}}}"
     left = ["data", "stats", "text", "diffusion", "tma", "generate"]
     assert names(load(child, base=LISTED)) == left
     assert names(load(LISTED, "face_vae=null", "generate.inputs.generators=[diffusion]")) == left
@@ -197,17 +174,9 @@ def test_a_tma_on_captions_of_another_encoder_is_refused(load: Any) -> None:
 @pytest.mark.parametrize(
     ("recipe", "override", "says"),
     [
-        (
-            "humantomato-tiny",
-            "tokenizer.net.reset_below=1.0",
-            r"stage tokenizer: .*net.reset_below to 0\.\d+ or less",
-        ),
-        (
-            "humantomato-tiny",
-            "tokenizer.net.num_codes=8192",
-            r"stage tokenizer: .*net.reset_below to 0\.\d+ or less",
-        ),
-        ("ude-tiny", "tokenizer.net.reset_below=1.0", r"256 codes gets 256 vectors .*to 0\.25 or less"),
+        ("humantomato-tiny", "tokenizer.net.reset_below=1.0", r"stage tokenizer: .*reset_below to 0\.\d+"),
+        ("humantomato-tiny", "tokenizer.net.num_codes=8192", r"stage tokenizer: .*reset_below to 0\.\d+"),
+        ("ude-tiny", "tokenizer.net.reset_below=1.0", r"256 codes .*256 vectors .*to 0\.25 or less"),
         ("baselines-tiny-ude", "dance_vq.net.reset_below=2.0", r"stage dance_vq: .*to 0\.5 or less"),
         ("humantomato-tiny", "hardware.accelerator=gpu", "no GPU is here; set hardware.devices"),
     ],
@@ -236,11 +205,8 @@ def test_shards_that_are_not_there_or_of_another_layout(tmp_path: Path) -> None:
     path.write_text("name: x\nstages: {data: {kind: shards, path: shards}, stats: {kind: stats}}")
     synthesize(SynthConfig(clips=4), tmp_path / "shards", workers=1)
     for sets, says in (
-        ([f"data.path={tmp_path / 'nowhere'}"], "nowhere: no such folder; set the path of the data stage"),
-        (
-            [f"data.path={tmp_path / 'shards'}", "data.layout=body133"],
-            "layout wholebody363, but the recipe wants body133",
-        ),
+        ([f"data.path={tmp_path / 'nowhere'}"], "nowhere: "),
+        ([f"data.path={tmp_path / 'shards'}", "data.layout=body133"], "wholebody363, .*body133"),
     ):
         with pytest.raises(UserError, match=says):
             run_recipe(path, tmp_path / "run", overrides=sets, dry_run=True, console=QUIET)
@@ -293,10 +259,7 @@ stages: {more: {kind: fsq}, other: {kind: separate}, data: {clips: 11}}
     assert (config(found, "more").net.width, config(found, "more").optim.lr) == (8, 5e-4)
     assert config(found, "more").optim.warmup_steps == 7, "the base's, which the child does not name"
     # Those of a base may concern a stage that was replaced.
-    assert (
-        config(load("extends: base\nname: child\nstages: {tokenizer: {kind: fsq}}"), "tokenizer").net.width
-        == 512
-    )
+    assert config(load(CHILD + "{tokenizer: {kind: fsq}}"), "tokenizer").net.width == 512
     assert load(BASE, "tokenizer={kind: fsq}").stage("tokenizer").kind.name == "fsq"
     (tmp_path / "below").mkdir()
     (tmp_path / "below" / "base.yaml").write_text(BASE)
@@ -342,12 +305,8 @@ def test_the_schema_refuses_mistakes_and_passes_shipped_recipes() -> None:
         {"kind": "gpt", "prior": "words"},
     ):
         assert not validator.is_valid({"name": "x", "stages": {"s": wrong}}), wrong
-    for wrong in (
-        {"trained": {"net": {"width": 8}}},
-        {"vq": {"kind": "vq"}},
-        {"vq": {"net": {"widht": 8}}},
-        {"vqq": {}},
-    ):
+    unknown = ({"trained": {"net": {"width": 8}}}, {"vq": {"kind": "vq"}}, {"vq": {"net": {"widht": 8}}})
+    for wrong in (*unknown, {"vqq": {}}):
         assert not validator.is_valid({"name": "x", "defaults": wrong, "stages": stages}), wrong
 
 

@@ -162,10 +162,10 @@ def test_what_is_cheap_is_made_anew_without_asking(go: Go, tmp_path: Path) -> No
     assert "replaces" not in go("evaluate.add=3")
     assert json.loads((tmp_path / "run/stages/evaluate/value.json").read_text()) == 3
     took(tmp_path / "run", evaluate=3601.0)
-    with pytest.raises(UserError, match=r"evaluate: .*3 -> 1 \(1 h"):
+    with pytest.raises(UserError, match=r"evaluate: .*3 -> 1 \(1"):
         go()
     (tmp_path / "run/stages/gpt/timing.json").unlink()
-    with pytest.raises(UserError, match=r"gpt: .*1 -> 2 .*unknown"):
+    with pytest.raises(UserError, match=r"gpt: .*1 -> 2 .*time"):
         go("gpt.add=2", until="gpt")
 
 
@@ -180,20 +180,9 @@ def test_what_is_asked_for_by_name_is_made_anew_and_what_was_begun_is_named(go: 
     assert "replaces unfinished trainings: gpt\n" in go("tokenizer.add=2", "gpt.add=5")
 
 
-@pytest.mark.parametrize(
-    ("select", "said"),
-    [
-        ({"first": "gpt", "until": "tma"}, "'tma' does not need 'gpt'"),
-        ({"first": "tokens", "until": "gpt"}, "2 of 9 stages to run"),
-        ({"first": "gpt", "until": "gpt"}, "1 of 9 stages to run"),
-    ],
-)
-def test_options_that_contradict_each_other_and_that_do_not(
-    go: Go, select: dict[str, object], said: str
-) -> None:
+def test_options_that_contradict_each_other_and_that_do_not(go: Go) -> None:
     go()
-    if "stages to run" in said:
-        assert said in go(**select)
-        return
-    with pytest.raises(UserError, match=said):
-        go(**select)
+    for first, count in (("tokens", 2), ("gpt", 1)):
+        assert f"{count} of 9 " in go(first=first, until="gpt")
+    with pytest.raises(UserError, match=r"'tma' .*'gpt'"):
+        go(first="gpt", until="tma")

@@ -102,20 +102,11 @@ def test_torchrun_equals_one_process(
 ) -> None:
     run = tmp_path / "run"
     shutil.copytree(single, run)
-    torchrun = (
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        2,
-        "--no-python",
-    )
+    torchrun = (sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
     program = Path(sys.executable).with_name("motionloom")
     # The GPT alone, so that both have exactly the same tokens.
-    output = finish(
-        running(program, "run", recipe, "--out", run, "--from", "gpt", "--until", "gpt", program=torchrun)
-    )
+    words = ("--no-python", program, "run", recipe, "--out", run, "--from", "gpt", "--until", "gpt")
+    output = finish(running(*words, program=torchrun))
     assert output.count("[9/15] gpt") == 1
     assert files(run) == files(single)
     assert_same_training(single, run, "gpt")

@@ -111,7 +111,7 @@ def test_a_damaged_newest_checkpoint_changes_no_weight(
     again = train(tmp_path / "hit", console=Console(width=999), **settings)
     assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
     said = capsys.readouterr().out
-    assert f"{folder / names[1]}: the bytes are not those that were written" in said
+    assert f"{folder / names[1]}: the bytes" in said
     assert sorted(path.name for path in folder.iterdir()) == ["step=00000006.ckpt", "step=00000008.ckpt"]
 
 
@@ -138,7 +138,7 @@ def interrupt(out: Path, rank: int, hardware: dict[str, Any]) -> None:
         stops.append(stopped.value.step)
         if step == 1:  # in the first validation, of one rank
             signalled = {0: signal.SIGTERM} if rank == 1 else None
-            with pytest.raises(Interrupted, match="saved at step 7 of 24"):
+            with pytest.raises(Interrupted, match="step 7 of 24"):
                 train(out / "interrupted", validation_signalled=signalled, **settings)
     again = train(out / "interrupted", **settings)
     assert_equal(whole.state_dict(), again.state_dict())

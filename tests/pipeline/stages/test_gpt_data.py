@@ -76,7 +76,7 @@ def clips_of(
 ) -> tuple[GptClips, TokenStore, Tokenizer]:
     torch.manual_seed(0)
     small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
-    net = config or H2VQConfig(**small).build(dataset.layout)
+    net = (config or H2VQConfig(**small)).build(dataset.layout)
     net(torch.randn(8, 16, net.dim))
     net.freeze()
     store = encode_split(net, dataset, compute(dataset), 512)

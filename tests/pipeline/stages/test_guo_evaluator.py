@@ -155,7 +155,7 @@ def test_captions_are_read_as_published(release: Path, folder: Path) -> None:
 
 
 def test_a_caption_without_tags_is_refused_unless_asked_for(release: Path, folder: Path) -> None:
-    with pytest.raises(UserError, match=r"caption 'The person hops' has no word/POS tags.*untagged: other"):
+    with pytest.raises(UserError, match=r"'The person hops' .*untagged: other"):
         load_published(folder).embed_captions(["The person hops"], [()])
     judge = load_published(folder, untagged="other")
     found = judge.embed_captions(["The per-son, left!"], [()])
@@ -190,14 +190,8 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no facts": (lambda f: (f / "evaluator.json").unlink(), r"evaluator\.json: no such file"),
     "no file": (lambda f: (f / "stats.safetensors").unlink(), r"stats\.safetensors: no such file"),
     "other layout": (lambda f: rewrite(f, "evaluator.json", layout="body133"), "key 'layout' = 'body133'"),
-    "no checksum": (
-        lambda f: rewrite(f, "evaluator.json", sha256={}),
-        r"key 'sha256\.model\.safetensors' is required",
-    ),
-    "other bytes": (
-        lambda f: (f / "words.json").write_text("{}"),
-        r"words\.json: not the file whose sha256 evaluator\.json names",
-    ),
+    "no checksum": (lambda f: rewrite(f, "evaluator.json", sha256={}), r"'sha256\.model\.safetensors'"),
+    "other bytes": (lambda f: (f / "words.json").write_text("{}"), r"words\.json: .* sha256"),
     "torn": (
         lambda f: ((f / "stats.safetensors").write_bytes(b"torn"), sign(f, "stats.safetensors")),
         r"stats\.safetensors: cannot be read",
@@ -222,14 +216,8 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda f: spoil(f, "stats.safetensors", lambda t: t["std"].zero_()),  # type: ignore[arg-type, return-value]
         "std has columns that are not above 0",
     ),
-    "no unknown word": (
-        lambda f: rewrite(f, "words.json", words=[w for w in WORDS if w != "unk"]),
-        "key 'words' lacks 'unk'",
-    ),
-    "other class": (
-        lambda f: rewrite(f, "words.json", lists={"Nowhere": ["left"]}),
-        "key 'classes' lacks 'Nowhere'",
-    ),
+    "no unknown word": (lambda f: rewrite(f, "words.json", words=WORDS[:1] + WORDS[2:]), "'words' .*'unk'"),
+    "other class": (lambda f: rewrite(f, "words.json", lists={"Nowhere": ["left"]}), "'classes' .*'Nowhere'"),
 }
 
 
@@ -249,7 +237,7 @@ def test_the_script_reads_no_objects_from_pickles(release: Path, tmp_path: Path)
     shutil.copytree(release, bad)
     (bad / "glove/our_vab_words.pkl").write_bytes(pickle.dumps([Path("x")]))
     done = convert(bad, tmp_path / "out")
-    assert done.returncode == 1 and "which a list of words does not need: not read" in done.stderr
+    assert done.returncode == 1 and "a list of words" in done.stderr
     (bad / "glove/our_vab_words.pkl").write_bytes(pickle.dumps(WORDS))
     torch.save({"movement_encoder": Path("x")}, bad / "checkpoints/t2m/text_mot_match/model/finest.tar")
     done = convert(bad, tmp_path / "out")
@@ -319,7 +307,7 @@ def test_a_run_is_judged_by_it(
     assert (facts["split"], facts["clips"], facts["distance"]) == ("test", 10, "euclidean")
     assert {one["name"][0] for one in record["figures"]} == set("ABCD"), "the run has a text stage"
     done = call("run", tmp_path / "plain.yaml", "--out", tmp_path / "plain-run")
-    assert done.code == 2 and "has no word/POS tags" in done.err
+    assert done.code == 2 and "word/POS tags" in done.err
     other = ("--set", "guo.untagged=other")
     done = call("run", tmp_path / "plain.yaml", "--out", tmp_path / "plain-run", *other)
     assert done.code == 0, done.err

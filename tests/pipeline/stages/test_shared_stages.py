@@ -12,6 +12,7 @@ import pytest
 
 pytestmark = pytest.mark.slow
 
+FIGURES = {"evaluate": "metrics.json"}
 CAPTIONS = """
 extends: small
 name: small
@@ -37,24 +38,14 @@ def run(start: Callable[..., Any], *arguments: object) -> str:
 @pytest.mark.parametrize(
     ("given", "recipe", "makers", "stages"),
     [
-        (
-            "small_run",
-            CAPTIONS,
-            ["gpt", "face_gpt"],
-            {"tokens": "tokens-train.safetensors", "evaluate": "metrics.json"},
-        ),
-        ("ude_run", DANCES, ["ude"], {"evaluate": "metrics.json", "evaluate_dances": "metrics.json"}),
+        ("small_run", CAPTIONS, ["gpt", "face_gpt"], {"tokens": "tokens-train.safetensors", **FIGURES}),
+        ("ude_run", DANCES, ["ude"], {**FIGURES, "evaluate_dances": "metrics.json"}),
     ],
 )
 def test_two_processes_make_what_one_makes(
-    given: str,
-    recipe: str,
-    makers: list[str],
-    stages: dict[str, str],
-    start: Callable[..., Any],
-    tmp_path: Path,
-    request: pytest.FixtureRequest,
-) -> None:
+    given: str, recipe: str, makers: list[str], stages: dict[str, str], start: Callable[..., Any],
+    tmp_path: Path, request: pytest.FixtureRequest,
+) -> None:  # fmt: skip
     small: Any = request.getfixturevalue(given)
     shutil.copy(small.recipe, tmp_path / small.recipe.name)
     (tmp_path / "shared.yaml").write_text(recipe)
@@ -93,6 +84,4 @@ def test_two_processes_make_what_one_makes(
         found = json.loads((folder / "stages" / stage / stages[stage]).read_text())
         before = json.loads(made[0][stage])
         assert before["about"]["made_by"] != found["about"]["made_by"]
-        assert [before[key] for key in ("figures", "protocol")] == [
-            found[key] for key in ("figures", "protocol")
-        ]
+        assert all(before[key] == found[key] for key in ("figures", "protocol"))

@@ -46,32 +46,22 @@ def test_a_finished_run_keeps_its_worst_and_best_to_watch(small_run: Any) -> Non
         error = {one["place"]: one["error"] for one in cases if one["of"] == of}
         assert error["worst 1"] >= error["best 1"] > 0
     text = text_of(small_run.folder / "stages/report/report.html")
-    for words in (
-        "Worst and best reconstructions",
-        "Worst and best generated motions",
-        "Settings of every stage",
-        "The data: 52 joints at 20 frames a second",
-    ):
+    for words in ("best reconstructions", "best generated motions", "Settings of every", "52 joints at 20 "):
         assert words in text, words
     assert "in training" not in text and "Still missing" not in text
 
 
-def test_the_report_of_an_unfinished_run(unfinished: Path, call: Callable[..., Any]) -> None:
+def test_the_report_of_an_unfinished_run(unfinished: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
     done = call("report", unfinished)
     assert done.code == 0, done.err
-    assert re.search(r"gpt \(.*12 of 30\), face_gpt \(", done.out)
+    assert re.search(r"gpt \(.*12 of 30\), face_gpt", done.out)
     text = text_of(unfinished / "report/report.html")
     assert "step 12 of 30" in text and "evaluate: not run yet" in text
     assert "the recorded clip, and" in text
     assert "that the model made" not in text and "Figures on held-out clips" not in text
     assert "gpt: cross-entropy" in text and "tokenizer: reconstruction" in text, "its curves so far"
     assert "9 of 15" not in text and "8 of 15" in text
-
-
-def test_the_report_of_a_run_that_has_hardly_begun(
-    unfinished: Path, tmp_path: Path, call: Callable[..., Any]
-) -> None:
-    bare = tmp_path / "bare"
+    bare = tmp_path / "bare"  # a run that has hardly begun
     bare.mkdir()
     shutil.copy(unfinished / "recipe.yaml", bare)
     done = call("report", bare)
@@ -87,7 +77,7 @@ def test_a_whole_and_an_unfinished_run_compared(
     shutil.copytree(small_run.folder, twin)
     done = call("compare", small_run.folder, unfinished, twin, "-o", tmp_path / "page.html")
     assert done.code == 0, done.err
-    assert re.search("gpt: .*12 of 30; face_gpt: ", done.out)
+    assert re.search("gpt: .*12 of 30; face_gpt", done.out)
     runs = open_runs([small_run.folder, unfinished, twin])
     assert setting_differences(runs) == [], "one recipe made them"
     mpjpe = FigureFile.read(small_run.folder / "stages/evaluate/metrics.json").of("reconstruction.mpjpe")

@@ -70,10 +70,7 @@ WRONG = {
     "too many numbers": ({"rows": [{**ROW, "paper": "1 | 2"}]}, "row 'm' has 2 numbers for 1 columns"),
     "neither figure nor why": ({"columns": [{"name": "a"}]}, "give either figure"),
     "no row of three": ({"rows": [{"method": "m", "paper": "1"}]}, "give one of ours"),
-    "conditions on nothing": (
-        {"rows": [{**ROW, "ours": {"setting": {"a": 1}}}]},
-        "needs a condition on one of",
-    ),
+    "conditions on nothing": ({"rows": [{**ROW, "ours": {"setting": {"a": 1}}}]}, "needs a condition"),
     "unknown role": ({"rows": [{**ROW, "ours": {"tokeniser": {"kind": "vq"}}}]}, "did you mean 'tokenizer'"),
     "columns of one name": ({"columns": BASE["columns"] * 2}, "two columns are called 'a'"),
     "unknown data set": ({"columns": [{"name": "a", "figure": "x", "data": "GRAB"}]}, "no data set 'GRAB'"),
@@ -85,8 +82,5 @@ def test_a_wrong_file_is_refused(case: str) -> None:
     change, message = WRONG[case]
     with pytest.raises(UserError, match=re.escape(message)):
         PaperTable.parse({**BASE, **change}, "table.yaml")
-
-
-def test_the_base_of_the_wrong_files_is_right() -> None:
     (cell,) = PaperTable.parse(BASE, "table.yaml").rows[0].printed()
     assert cell is not None and (cell.text, cell.mean, cell.decimals) == ("1.50", 1.5, 2)
