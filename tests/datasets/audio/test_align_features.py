@@ -37,6 +37,8 @@ def test_frames_are_cut_and_padded(clicks: np.ndarray, sound: Sound) -> None:
     quiet = np.arange(438) != 53
     np.testing.assert_array_equal(longer[61:, quiet], np.repeat(whole[-1:, quiet], 9, axis=0))
     assert not longer[61:, 53].any()
+    with pytest.raises(UserError, match="0 frames at 20"):
+        motion_frame_features(sound, 20, 0)
 
 
 def test_rows_nearest_in_time_and_every_beat_once(clicks: np.ndarray, sound: Sound) -> None:
@@ -59,8 +61,3 @@ def test_frame_rates_that_features_cannot_have(clicks: np.ndarray, sound: Sound)
     found = motion_frame_features(sound, 29.97, 90)
     whole = audio_features(clicks, RATE)
     np.testing.assert_array_equal(found[89, :53], whole[round(89 / 29.97 * 60), :53])
-
-
-def test_mistakes_are_named(sound: Sound) -> None:
-    with pytest.raises(UserError, match="0 frames at 20"):
-        motion_frame_features(sound, 20, 0)

@@ -63,12 +63,8 @@ def test_438_columns_equal_the_golden_ones(golden: dict[str, NDArray]) -> None:
     slow = audio_features(golden["syn_wav_3840"], 3840, AudioSettings(fps=7.5))
     np.testing.assert_allclose(slow, golden["syn_feat438_7p5fps"], rtol=0, atol=1e-3)
     np.testing.assert_allclose(beats(samples, 30720), np.flatnonzero(want[:, 53]) / 60)
-
-
-def test_sound_of_another_rate_is_resampled(golden: dict[str, NDArray]) -> None:
-    samples = golden["syn_wav"].astype(np.float32) / 32768
-    found = audio_features(samples, 30720, AudioSettings(fps=7.5))
-    np.testing.assert_allclose(found, golden["syn_feat438_7p5fps"], rtol=0, atol=1e-3)
+    resampled = audio_features(samples, 30720, AudioSettings(fps=7.5))
+    np.testing.assert_allclose(resampled, golden["syn_feat438_7p5fps"], rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize(("fps", "seconds"), [(60.0, 4.03), (20.0, 12.9), (240.0, 2.0), (5.0, 11.3)])
@@ -139,7 +135,7 @@ def test_mistakes_are_named() -> None:
     with pytest.raises(UserError, match=r"0\.033 s"):
         audio_features(sound[:1023], 30720)
     assert audio_features(sound[:1024], 30720).shape == (3, 438)
-    with pytest.raises(UserError, match=r"octaves: 6 .* 7\.5 .* 5"):
+    with pytest.raises(UserError, match=r"octaves: 6 .* 7\.5"):
         audio_features(sound, 30720, AudioSettings(fps=7.5, octaves=6))
     with pytest.raises(UserError, match="finite mono"):
         audio_features(np.full(30720, np.nan, dtype=np.float32), 30720)

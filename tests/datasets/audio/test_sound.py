@@ -50,14 +50,12 @@ def test_every_encoding_gives_the_same_sound(
     assert sound_seconds(path) == pytest.approx(1.0)
 
 
-def test_stereo_becomes_the_mean(tmp_path: Path, tone: np.ndarray) -> None:
+def test_stereo_is_averaged_overshoot_clipped_and_another_unit_refused(
+    tmp_path: Path, tone: np.ndarray
+) -> None:
     path = tmp_path / "a.wav"
     soundfile.write(path, np.stack([tone, 0.5 * tone], axis=1), RATE, subtype="FLOAT")
     assert np.allclose(read_sound(path)[0], 0.75 * tone, atol=1e-7)
-
-
-def test_overshoot_is_clipped_and_another_unit_refused(tmp_path: Path, tone: np.ndarray) -> None:
-    path = tmp_path / "a.wav"
     soundfile.write(path, 3 * tone, RATE, subtype="FLOAT")
     assert np.abs(read_sound(path)[0]).max() == 1.0
     soundfile.write(path, 32767 * tone, RATE, subtype="FLOAT")
@@ -170,7 +168,7 @@ def test_sound_of_a_file(tmp_path: Path, tone: np.ndarray) -> None:
     np.testing.assert_array_equal(whole.slice(0.25, 0.5).samples, tone[4000:8000])
     np.testing.assert_array_equal(whole.slice(0.9, 5).samples, tone[14400:])
     np.testing.assert_array_equal(whole.slice(-1).samples, tone)
-    with pytest.raises(UserError, match=r"second 2 .* 1\.000 s"):
+    with pytest.raises(UserError, match=r"second 2 .* 1\.000"):
         whole.slice(2)
     with pytest.raises(UserError, match=r"second 0\.5 and 0\.5"):
         whole.slice(0.5, 0.5)

@@ -46,7 +46,7 @@ def test_each_refusal_has_words_and_names_the_file(number: int, words: str) -> N
     assert nameless is not None and words in nameless and not nameless.startswith("None")
 
 
-def test_what_numpy_and_torch_make_of_a_full_disk() -> None:
+def test_what_numpy_torch_and_safetensors_make_of_a_disk(tmp_path: Path) -> None:
     with FULL.open("wb") as file:
         error = raised(lambda: np.savez(file, big=np.zeros(100_000)))
         with pytest.raises(OSError):
@@ -55,9 +55,6 @@ def test_what_numpy_and_torch_make_of_a_full_disk() -> None:
     assert "full" in str(sentence_of(error))
     error = raised(lambda: torch.save({"big": torch.zeros(1_000_000)}, FULL))
     assert "disk" in str(sentence_of(error)) and "full" in str(sentence_of(error))
-
-
-def test_what_safetensors_makes_of_a_file_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     error = raised(lambda: save_file({"a": np.zeros(3)}, tmp_path / "file" / "below"))
     assert "folder" in str(sentence_of(error))
@@ -102,18 +99,15 @@ class Clock:
         return self.now
 
 
-def test_time_left_goes_by_what_was_done_here() -> None:
+def test_time_left_goes_by_what_was_done_here_and_lines_come_every_15_seconds() -> None:
     """A resumed training had its first 400 steps from before: 100 steps in 50 s leave 1,000 s for 2,000."""
     clock = Clock()
     pace = Pace(2500, 400, clock)
     assert pace.left(400) == "", "nothing is known yet"
     clock.now += 50
     assert pace.speed(500) == 2.0
-    assert pace.left(500) == "16 min 40 s left"
+    assert pace.left(500).startswith("16 min 40")
     assert pace.left(2500) == ""
-
-
-def test_lines_come_every_15_seconds_and_at_the_end_of_what_took_as_long() -> None:
     clock = Clock()
     pace = Pace(10, clock=clock)
     due = []
@@ -130,7 +124,10 @@ def test_a_meter_prints_lines_where_there_is_no_terminal() -> None:
         for _ in range(4):
             clock.now += 10
             meter.advance(8)
-    assert log.getvalue().splitlines() == ["    generating: 24/40  20 s left", "    generating: 40/40"]
+    assert [line.split() for line in log.getvalue().splitlines()] == [
+        ["generating:", "24/40", "20", "s", "left"],
+        ["generating:", "40/40"],
+    ]
 
 
 @pytest.mark.parametrize("hidden", [{"shown": False}, {"console": Console(quiet=True)}])

@@ -152,7 +152,7 @@ def test_suspects_of_a_set(root: Path) -> None:
 
 def test_what_is_left_out_is_skipped_and_nothing_is_lost(root: Path, people: list[Joints]) -> None:
     before = (root / "manifest.json").read_bytes()
-    assert "same motion in two splits" in examine(root).error_kinds
+    assert any(kind.endswith("two splits") for kind in examine(root).error_kinds)
     train = ShardDataset.open(root, "train")
     decide(root, Decisions(left_out={"copy": "twice", "c7": "bad"}, kept=("image",)), "given.json")
     left = [k for k, clip in enumerate(train.ids) if clip not in ("copy", "c7")]

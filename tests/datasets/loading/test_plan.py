@@ -69,6 +69,9 @@ def test_the_order_is_fixed_for_ever() -> None:
         0.05081380623834486,
         0.545963299984951,
     ]
+    plan = BatchPlan(6, 6, 3, sources=(Source(0, 4, 1.0), Source(4, 2, 2.0)))
+    turns, items = plan.batch(1)
+    assert items.tolist() == [4, 0, 5, 5, 1, 4] and turns.tolist() == [2, 0, 2, 3, 0, 3]
 
 
 def test_uniform_is_uniform_and_depends_on_every_counter() -> None:
@@ -107,9 +110,6 @@ def test_lengths_lessen_padding_and_keep_the_epoch() -> None:
     means = [lengths[sorted_plan.batch(k)[1]].mean() for k in range(sorted_plan.batches_per_epoch)]
     assert not np.all(np.diff(means) >= 0), "batches come in random order, not from short to long"
     assert not np.array_equal(sorted_plan.batch(0)[1], sorted_plan.batch(plain.batches_per_epoch)[1])
-
-
-def test_lengths_with_fewer_items_than_a_batch() -> None:
     assert np.array_equal(np.sort(BatchPlan(3, 4, 0, np.array([5, 1, 9])).batch(0)[1][:3]), [0, 1, 2])
 
 
@@ -258,13 +258,6 @@ def test_any_mix_is_exact_and_asked_in_any_order(parts: list[tuple[int, int]], b
     assert np.histogram(items, edges)[0].tolist() == got
 
 
-def test_the_mixed_order_is_fixed_for_ever() -> None:
-    """A changed order would break every running experiment's resume: these numbers may never change."""
-    plan = BatchPlan(6, 6, 3, sources=(Source(0, 4, 1.0), Source(4, 2, 2.0)))
-    turns, items = plan.batch(1)
-    assert items.tolist() == [4, 0, 5, 5, 1, 4] and turns.tolist() == [2, 0, 2, 3, 0, 3]
-
-
 @pytest.mark.parametrize("order", ["global", "streamed"])
 def test_batches_are_the_same_for_any_number_of_ranks(order: str, roots: tuple[Path, Path]) -> None:
     data = mixed(roots, order=order, shards_per_group=2)
@@ -328,7 +321,7 @@ def test_mistakes_in_a_mix_are_named(mix: MixedDataset, roots: tuple[Path, Path]
     with pytest.raises(UserError, match="at least one"):
         MixedDataset([])
     small.layout = MotionLayout.named("body133", fps=30.0)
-    with pytest.raises(UserError, match=rf"{roots[1]}: holds layout body133 \(exact, 30 fps\).* 20 fps"):
+    with pytest.raises(UserError, match=rf"{roots[1]}: .*body133 .*30 fps.*20"):
         MixedDataset([(big, 1.0), (small, 1.0)])
     with pytest.raises(UserError, match="mix"):
         MixedDataset([(mix, 1.0), (big, 1.0)]).sources()

@@ -28,15 +28,6 @@ def test_one_pass_equals_two(train: ShardDataset) -> None:
     assert stats.frames == len(rows) and stats.layout == train.layout
 
 
-def test_grouping_averages_stds_per_field_as_humanml3d_does() -> None:
-    layout = MotionLayout.named("h3d263")
-    rows = np.random.default_rng(0).standard_normal((50, 263)) * np.arange(1, 264)
-    std = from_moments(Moments.of(rows), layout, group=True).std
-    plain = rows.std(axis=0)
-    for start, end in ((0, 1), (1, 3), (3, 4), (4, 67), (67, 193), (193, 259), (259, 263)):
-        np.testing.assert_allclose(std[start:end], plain[start:end].mean(), rtol=1e-6)
-
-
 def test_the_root_counts_as_much_as_is_said(train: ShardDataset) -> None:
     plain = compute(train)
     gained = plain.with_root(5.0)

@@ -14,11 +14,6 @@ from motionloom.datasets.motion.body.live_link import read_face, write_face
 from motionloom.datasets.schema import UserError
 
 
-def test_there_are_arkits_fifty_two_names() -> None:
-    assert len(set(ARKIT)) == len(ARKIT) == 52
-    assert {"eyeBlinkLeft", "jawOpen", "mouthSmileRight", "browInnerUp", "tongueOut"} <= set(ARKIT)
-
-
 def test_bounded_least_squares_is_scipys() -> None:
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(60, 12))

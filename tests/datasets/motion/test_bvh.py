@@ -206,7 +206,7 @@ def test_angles_do_not_jump_between_frames(tmp_path: Path) -> None:
 def test_writer_refuses_wrong_shapes_and_nan_and_leaves_no_file(tmp_path: Path) -> None:
     skeleton, rotations, root = random_motion("smpl22")
     path = tmp_path / "clip.bvh"
-    with pytest.raises(UserError, match=r"rotations \[T, 22, 3, 3\]"):
+    with pytest.raises(UserError, match=r"\[T, 22, 3, 3\]"):
         write_bvh(path, skeleton, rotations[:, :21], root, 20.0)
     with pytest.raises(UserError, match="NaN"):
         write_bvh(path, skeleton, rotations, np.full_like(root, np.nan), 20.0)
@@ -298,16 +298,13 @@ def test_errors_name_the_row(tmp_path: Path, bandai: dict[str, Any]) -> None:
         JointMap.load(tmp_path / "none.json")
 
 
-def test_a_joint_the_clip_lacks_is_named_with_the_nearest(
+def test_a_joint_the_clip_lacks_or_has_twice_is_named(
     tmp_path: Path, shared: Path, bandai: dict[str, Any]
 ) -> None:
     bandai["smpl22"][0][2] = "hips"
     motion = read_bvh(shared / "data/broken/bvh/control_ok.bvh")
     with pytest.raises(UserError, match=r"control_ok.bvh: no joint 'hips'.*'Hips'"):
         JointMap.load(saved(tmp_path, bandai)).apply(motion)
-
-
-def test_an_ambiguous_joint_is_refused(shared: Path) -> None:
     text = (shared / "data/broken/bvh/control_ok.bvh").read_text().replace("JOINT Head", "JOINT Neck")
     joint_map = JointMap.load(shared / "data/bandai/joint_map.json")
     with pytest.raises(UserError, match="'Neck' appears 2 times"):

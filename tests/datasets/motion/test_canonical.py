@@ -47,7 +47,7 @@ def walk(turned: float, seconds: float = 5.0, fps: float = FPS, skeleton: Skelet
     return forward_kinematics(local, root, skeleton.offsets, skeleton.parents)[0]
 
 
-def test_left_is_plus_x_and_a_left_turn_makes_the_heading_grow() -> None:
+def test_a_left_turn_makes_the_heading_grow_and_its_mirror_image_turns_right() -> None:
     joints = walk(np.pi / 2)
     angle = heading(joints, FPS)
     assert BODY.rest_joints[BODY.index("left_hip"), 0] > 0
@@ -55,9 +55,6 @@ def test_left_is_plus_x_and_a_left_turn_makes_the_heading_grow() -> None:
     assert angle[0] == pytest.approx(0.0, abs=1e-9)
     assert angle[-1] == pytest.approx(np.pi / 2, abs=1e-9)
     assert joints[-1, 0, 0] > 2.0, "the path must bend towards +X"
-
-
-def test_the_mirror_image_of_a_left_turn_turns_right() -> None:
     joints = walk(2.0)
     mirrored = mirror(joints, BODY)
     np.testing.assert_allclose(heading(mirrored, FPS), -heading(joints, FPS), atol=1e-9)
@@ -173,15 +170,11 @@ def test_retargeting_gives_the_wanted_bones_and_keeps_directions() -> None:
     np.testing.assert_allclose(np.cross(before, after), 0.0, atol=1e-9)
     legs = [np.linalg.norm(o[[5, 8]], axis=-1).sum() for o in (BODY.offsets, offsets)]
     np.testing.assert_allclose(out[:, 0], joints[:, 0] * legs[1] / legs[0], atol=1e-9)
-
-
-def test_retargeting_to_the_same_skeleton_changes_nothing_and_batches_agree() -> None:
-    joints = walk(1.0)
     np.testing.assert_allclose(retarget(joints, BODY), joints, atol=1e-9)
     batch = np.stack([joints, 1.3 * joints])
     np.testing.assert_allclose(retarget(batch, BODY), np.stack([joints, joints]), atol=1e-9)
     assert np.isfinite(retarget(np.zeros_like(joints), BODY)).all()
-    with pytest.raises(UserError, match=r"needs joints \[\.\.\., 22, 3\]"):
+    with pytest.raises(UserError, match=r"\[\.\.\., 22, 3\]"):
         retarget(joints[:, :21], BODY)
 
 
@@ -281,7 +274,7 @@ def test_of_the_rest_pose_only_the_fingers_bend() -> None:
     np.testing.assert_allclose(made, np.stack([wanted, wanted]), atol=1e-9)
 
 
-def test_bones_keep_their_length_and_the_body_its_place() -> None:
+def test_hands_keep_their_bones_and_go_with_their_forearms() -> None:
     body = posed(3, size=1.25)
     made = with_resting_hands(body)
     np.testing.assert_array_equal(made[:, :22], body)
@@ -289,12 +282,9 @@ def test_bones_keep_their_length_and_the_body_its_place() -> None:
     bones = np.linalg.norm(made[:, 22:] - made[:, parents], axis=-1)
     wanted = 1.25 * np.linalg.norm(WHOLE.offsets[22:], axis=-1)
     np.testing.assert_allclose(bones, np.broadcast_to(wanted, bones.shape), rtol=1e-9)
-
-
-def test_a_hand_goes_with_its_forearm() -> None:
-    """A hand points on from the forearm, whatever the pose; the mirror image has the mirrored hands."""
-    body = posed(4)
-    made = with_resting_hands(body)
+    with pytest.raises(UserError, match=r"\[2, 52, 3\]"):
+        with_resting_hands(np.zeros((2, 52, 3)))
+    # A hand points on from the forearm, whatever the pose; the mirror image has the mirrored hands.
     for side in ("left", "right"):
         elbow, wrist, knuckle = (WHOLE.index(f"{side}_{name}") for name in ("elbow", "wrist", "middle1"))
         forearm, palm = made[:, wrist] - made[:, elbow], made[:, knuckle] - made[:, wrist]
@@ -303,8 +293,3 @@ def test_a_hand_goes_with_its_forearm() -> None:
     flip = np.array([-1.0, 1.0, 1.0])
     other = with_resting_hands(body[:, BODY.mirror] * flip)
     np.testing.assert_allclose(other, made[:, WHOLE.mirror] * flip, atol=1e-7)
-
-
-def test_other_skeletons_are_refused() -> None:
-    with pytest.raises(UserError, match=r"joints \[T, 22, 3\], not to \[2, 52, 3\]"):
-        with_resting_hands(np.zeros((2, 52, 3)))

@@ -121,7 +121,7 @@ def test_face_columns() -> None:
 
 def test_errors_name_the_layout_and_the_fix() -> None:
     joints = clip(BODY, 20, 0.0)
-    with pytest.raises(UserError, match=r"wholebody313 needs joints \[\.\.\., T, 52, 3\]"):
+    with pytest.raises(UserError, match=r"wholebody313.*T, 52, 3\]"):
         encode(joints, MotionLayout.named("wholebody313"))
     with pytest.raises(UserError, match="only the h3d family"):
         encode(joints, MotionLayout.named("h3d263", family="exact"))
@@ -266,7 +266,7 @@ def test_columns_give_back_the_joints(name: str) -> None:
 
 
 def test_columns_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(UserError, match=r"smpl75 has 75 columns, but .* \[4, 74\]"):
+    with pytest.raises(UserError, match=r"smpl75 has 75.*\[4, 74\]"):
         joints_of(np.zeros((4, 74)), MotionLayout.named("smpl75"))
     raw = MotionLayout.named("smplx322")
     with pytest.raises(UserError, match="322"):
@@ -294,13 +294,3 @@ def test_chunks_are_the_whole_to_the_bit(layout: MotionLayout, dtype: type) -> N
     flow = JointFlow(layout)
     made = [flow(features[a:b]) for a, b in pairwise(cuts)]
     np.testing.assert_array_equal(np.concatenate(made), joints_of(features, layout))
-
-
-def test_columns_of_body_and_hands_alone() -> None:
-    layout = MotionLayout.named("wholebody363")
-    features = np.random.default_rng(1).normal(size=(20, layout.dim)).astype(np.float32)
-    body = features[:, layout.part("bodyhand")]
-    flow = JointFlow(layout)
-    np.testing.assert_array_equal(np.concatenate([flow(body[:7]), flow(body[7:])]), joints_of(body, layout))
-    with pytest.raises(UserError, match="363 columns"):
-        flow(features[:, :5])

@@ -292,7 +292,7 @@ def test_npz_reads_headers_and_refuses_what_does_not_fit(tmp_path: Path) -> None
         archive.writestr("text.npy", b"hello")
         archive.writestr("bad.npy", header + b"\x05\x00(((((")
     with NpzFile(path, "label") as file:
-        with pytest.raises(UserError, match=r"^label: array 'huge': truncated array: 80000"):
+        with pytest.raises(UserError, match=r"^label: array 'huge'.* 80000"):
             file.array("huge")
         for name in ("text", "bad"):
             with pytest.raises(UserError, match=f"^label: array '{name}'"):

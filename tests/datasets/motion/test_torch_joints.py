@@ -34,14 +34,11 @@ def test_they_are_those_of_numpy_and_have_gradients(name: str) -> None:
     assert float((features.grad * step).sum()) == pytest.approx(slope, rel=1e-5, abs=1e-10)
 
 
-def test_joints_that_a_clip_holds() -> None:
+def test_joints_that_a_clip_holds_and_layouts_that_have_none() -> None:
     layout = MotionLayout.named("wholebody363")
     present = torch.from_numpy(layout.present_columns[:, layout.part("bodyhand")])
     assert present_joints(present, layout).sum(1).tolist() == [22, 52, 22, 52]
     assert present_joints(torch.ones(1, 75, dtype=torch.bool), MotionLayout.named("smpl75")).sum() == 22
-
-
-def test_what_has_no_joints_is_refused() -> None:
     for name, dim in (("wholebody363", 50), ("smplx322", 322)):
         with pytest.raises(UserError, match=name):
             torch_joints_of(torch.zeros(2, 5, dim), MotionLayout.named(name))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import pickle
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -59,14 +58,6 @@ def test_few_shards_stay_open_and_views_survive(
     assert len(dataset._access.maps) == 2
     for i, view in enumerate(views):
         np.testing.assert_array_equal(view, made.clip_motion(int(dataset.ids[i].rpartition("-")[2])))
-
-
-def test_pickled_dataset_reads_on(root: Path) -> None:
-    dataset = ShardDataset.open(root, "val")
-    dataset.motion(0)
-    sent = pickle.dumps(dataset)
-    assert len(sent) < 1000
-    np.testing.assert_array_equal(pickle.loads(sent).motion(5), dataset.motion(5))
 
 
 def test_damage_is_named(root: Path) -> None:

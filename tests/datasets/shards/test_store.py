@@ -58,21 +58,18 @@ def test_other_schemes_are_refused_before_anything_opens(
     assert not list(tmp_path.iterdir())
 
 
-def test_urls_that_carry_more_than_a_place_are_refused() -> None:
+def test_urls_that_carry_more_than_a_place_are_refused_and_file_urls_are_folders(root: Path) -> None:
     for place in ("https://me:secret@host/data", "s3://key:secret@bucket/data"):
         with pytest.raises(UserError, match="credentials") as raised:
             open_store(place)
         assert "secret" not in str(raised.value)
     for place in ("https://host/data?token=1", "https://host/data#x", "s3://bucket/../other", "s3:///data"):
-        with pytest.raises(UserError, match=r"without '\?', '#' and '\.\.'"):
+        with pytest.raises(UserError, match=r"'\?', '#'"):
             open_store(place)
     with pytest.raises(UserError, match="file:///folder"):
         open_store("file://host/share")
     with pytest.raises(UserError, match="file:///folder"):
         open_store("file:data")
-
-
-def test_file_urls_are_folders(root: Path) -> None:
     assert isinstance(open_store(f"file://{root}"), LocalStore)
     same(ShardDataset.open(f"file://{root}", "val"), ShardDataset.open(root, "val"))
 

@@ -187,7 +187,7 @@ def test_joints_bend_the_right_way(clips: list[Clip]) -> None:
             assert (reach / arm).max() < 0.99
 
 
-def test_bones_keep_their_length_and_motion_is_smooth(clips: list[Clip]) -> None:
+def test_bones_keep_their_length_motion_is_smooth_and_hands_keep_out_of_the_body(clips: list[Clip]) -> None:
     skeleton = Skeleton.named("smplx52")
     parents = np.array(skeleton.parents[1:])
     rest = np.linalg.norm(skeleton.offsets[1:], axis=-1)
@@ -201,11 +201,7 @@ def test_bones_keep_their_length_and_motion_is_smooth(clips: list[Clip]) -> None
         assert speed.max() < 12.0, clip.texts[0]
         seconds = len(clip.joints) / FPS
         assert CONFIG.min_seconds - 0.1 <= seconds <= CONFIG.max_seconds + 0.1
-
-
-def test_hands_keep_out_of_the_body(clips: list[Clip]) -> None:
-    """Wrists stay outside a 9 cm cylinder around the spine."""
-    for clip in clips:
+        # Wrists stay outside a 9 cm cylinder around the spine.
         a, b = clip.joints[:, None, 3], clip.joints[:, None, 12]
         wrists = clip.joints[:, 20:22]
         along = ((wrists - a) * (b - a)).sum(-1) / ((b - a) ** 2).sum(-1)

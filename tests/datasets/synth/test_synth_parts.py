@@ -15,7 +15,7 @@ from motionloom.datasets.actions.signals import signals_of, tempo
 from motionloom.datasets.motion.body.expressions import BASIS, FACES, emotion_of
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.synth import face
-from motionloom.datasets.synth.actions.pose import OFFSETS, SKELETON, Track
+from motionloom.datasets.synth.actions.pose import OFFSETS, SKELETON
 from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, Span, Truth, draw
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions, words
 from motionloom.datasets.synth.dances import dance
@@ -132,16 +132,6 @@ def test_dances_without_music_have_their_tempo_and_style() -> None:
         joints = dance(truth, Span(4.0, 6.0), 60.0, rng).solve()
         assert abs(tempo(signals_of(joints, 60.0)) - (truth.bpm or 0)) < 4
         assert measure_dance(joints, 60.0).style == truth.style
-
-
-def test_rest_track_is_the_rest_skeleton() -> None:
-    track = Track(np.arange(8) / 30, 30.0)
-    joints = track.solve()
-    np.testing.assert_allclose(joints[:, (10, 11), 1], 0.0, atol=1e-3)
-    np.testing.assert_allclose(joints[0, 15, 0], 0.0, atol=1e-9)
-    assert (joints[:, 20, 1] < joints[:, 18, 1]).all() and (joints[:, 18, 1] < joints[:, 16, 1]).all()
-    mirrored = joints[:, SKELETON.mirror] * np.array([-1.0, 1.0, 1.0])
-    np.testing.assert_allclose(mirrored[:, 12:], joints[:, 12:], atol=1e-9)
 
 
 KEPT = Path(__file__).resolve().parents[3] / "benchmarks" / "synthetic_wordings.json"

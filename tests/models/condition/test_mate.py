@@ -137,9 +137,9 @@ def test_sizes_of_the_paper() -> None:
 
 
 def test_mistakes_are_named(mate: Mate) -> None:
-    with pytest.raises(UserError, match=r"built for \['text', 'audio'\], not for \['video'\]"):
+    with pytest.raises(UserError, match=r"\['text', 'audio'\].*\['video'\]"):
         mate({"video": condition(5, 6, [6])})
-    with pytest.raises(UserError, match="7 audio features, the data has 5"):
+    with pytest.raises(UserError, match=r"7 audio.* 5"):
         mate({"audio": condition(5, 6, [6])})
     with pytest.raises(ValueError, match="multiple of heads"):
         MateConfig(dim=10, heads=4)

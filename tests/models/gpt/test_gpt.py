@@ -52,7 +52,7 @@ def test_cached_equals_uncached(gpt: InterleavedGPT) -> None:
         assert cache.length == 14
         cached = gpt.logits(torch.cat(parts, dim=1), seq.kinds, legal)
         torch.testing.assert_close(cached, full, rtol=1e-5, atol=1e-5)
-    with pytest.raises(ValueError, match="holds 14 positions, 15 were asked"):
+    with pytest.raises(ValueError, match=r"14 positions.* 15"):
         gpt.hidden(x[:, :1], cache)
 
 
@@ -235,12 +235,12 @@ def test_hand_over_is_checked() -> None:
     module, batch = align_module()
     tokenizer, tma = module.tokenizer.module, module.tma.module
     keywords = {"seed": 0, "max_steps": 1}
-    with pytest.raises(UserError, match="needs a trained tokenizer"):
+    with pytest.raises(UserError, match="trained tokenizer"):
         GptModule(module.net, OptimConfig(), **keywords)
     with pytest.raises(UserError, match="not the tokenizer's"):
         wrong = InterleavedGPT(TINY, STREAMS, PATTERN, 16)
         GptModule(wrong, OptimConfig(), tokenizer=tokenizer, tma=tma, **keywords)
-    with pytest.raises(UserError, match="313 columns to a TMA of 133"):
+    with pytest.raises(UserError, match=r"313 columns.* 133"):
         small = Tma(TmaConfig(latent=16, ff=32, layers=1, heads=2), 133, 10)
         GptModule(module.net, OptimConfig(), tokenizer=tokenizer, tma=small, **keywords)
     wide = {**batch, "text": torch.randn(4, 16), "tma_text": torch.randn(4, 12)}

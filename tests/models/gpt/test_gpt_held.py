@@ -49,10 +49,6 @@ def test_hand_codes_of_clips_without_hands_change_nothing() -> None:
     told = batch_of(module, garbage=True)
     del told["known"], told["present"]
     assert (losses(module, told)[0]["ce"] - one[0]["ce"]).abs() > 1e-4, "else they would"
-
-
-def test_all_recorded_is_the_same_as_not_told() -> None:
-    module, _ = made()
     batch = batch_of(module, lacks=torch.zeros(4, dtype=torch.bool))
     told = losses(module, batch)
     del batch["known"], batch["present"]

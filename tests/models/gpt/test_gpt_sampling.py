@@ -137,7 +137,7 @@ def test_top_k_and_top_p() -> None:
 
 def test_bad_settings_are_refused(gpt: InterleavedGPT) -> None:
     text = torch.randn(2, 6)
-    with pytest.raises(UserError, match="1 seeds were given for 2 texts"):
+    with pytest.raises(UserError, match="1 seeds"):
         generate(gpt, text, seed=[1])
     with pytest.raises(UserError, match="condition_dropout"):
         generate(toy_gpt(condition_dropout=0.0), text, cfg_scale=2.0)

@@ -66,13 +66,7 @@ def test_by_hand() -> None:
     assert rouge_l([], [cat]) == 0 and rouge_l(cat, [cat]) == pytest.approx(1)
     assert cider_d([cat, ["dog"]], [[cat], [["dog"]]]) == pytest.approx([10, 2.5])  # of one word, one of four
     assert cider_d([cat], [[cat]]) == [0]
-    assert words_of("A counter-clockwise TURN, the man's!") == [
-        "a",
-        "counter-clockwise",
-        "turn",
-        "the",
-        "man's",
-    ]
+    assert words_of("A counter-clockwise TURN, man's!") == ["a", "counter-clockwise", "turn", "man's"]
 
 
 def test_cider_d_is_its_definition_written_out() -> None:

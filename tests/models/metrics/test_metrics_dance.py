@@ -30,18 +30,16 @@ def golden(shared: Path) -> dict[str, np.ndarray]:
         return {name: file[name] for name in file.files}
 
 
-def test_kinetic_features_are_the_published_ones(golden: dict[str, np.ndarray]) -> None:
+def test_features_and_the_foot_contact_score_are_the_published_ones(golden: dict[str, np.ndarray]) -> None:
     joints = golden["joints24_60fps"]
     # The published code adds up in float32.
     assert np.allclose(kinetic_features(joints), golden["kinetic72"], rtol=2e-4)
     assert np.allclose(kinetic_features(zero_start(joints)), golden["kinetic72_zero"], rtol=2e-4)
     assert np.allclose(kinetic_features(joints[::3]), golden["kinetic72_20fps_input"], rtol=2e-4)
-
-
-def test_geometric_features_are_the_published_ones(golden: dict[str, np.ndarray]) -> None:
-    joints = golden["joints24_60fps"]
     assert np.allclose(manual_features(joints), golden["manual32"], atol=1e-6)
     assert np.allclose(manual_features(zero_start(joints)), golden["manual32_zero"], atol=1e-6)
+    assert np.isclose(foot_contact_score(joints[::2], 30.0), golden["pfc_edge"], rtol=1e-4)
+    assert foot_contact_score(np.zeros((9, 12, 3)), 30.0) == 0
 
 
 @pytest.mark.parametrize("kind", ["k", "m"])
@@ -110,12 +108,6 @@ def test_alignment_without_beats() -> None:
         beat_align(still, np.array([0.5]), 60.0, "beatles")
 
 
-def test_the_foot_contact_score_is_the_published_one(golden: dict[str, np.ndarray]) -> None:
-    joints = golden["joints24_60fps"]
-    assert np.isclose(foot_contact_score(joints[::2], 30.0), golden["pfc_edge"], rtol=1e-4)
-    assert foot_contact_score(np.zeros((9, 12, 3)), 30.0) == 0
-
-
 def test_sliding_feet_are_counted() -> None:
     joints = np.zeros((21, 12, 3))
     joints[:, 0, 1] = 1.0
@@ -168,11 +160,14 @@ def standing(frames: int = 40) -> NDArray[np.float64]:
     return joints
 
 
-def test_one_who_stands_does_nothing_wrong() -> None:
-    assert physics(standing(), FPS) == (0.0, 0.0, 0.0, 0.0)
+def test_one_who_stands_does_nothing_wrong_and_sliding_is_not_standing() -> None:
+    joints = standing()
+    assert physics(joints, FPS) == (0.0, 0.0, 0.0, 0.0)
+    joints[..., 0] += (np.arange(40) / FPS)[:, None]  # a metre a second
+    assert physics(joints, FPS).skating == 1.0
 
 
-def test_height_and_depth_are_millimetres() -> None:
+def test_height_and_depth_are_millimetres_and_jitter_is_the_third_derivative() -> None:
     up, down, both = standing(), standing(), standing()
     up[..., 1] += 0.03
     down[..., 1] -= 0.02
@@ -182,10 +177,7 @@ def test_height_and_depth_are_millimetres() -> None:
     assert physics(up, FPS)[1:3] == pytest.approx((30.0, 0.0))
     assert physics(down, FPS)[1:3] == pytest.approx((0.0, 20.0))
     assert physics(both, FPS)[1:3] == pytest.approx((7.5, 5.0))
-
-
-def test_jitter_is_the_third_derivative() -> None:
-    """x = t^3 has the jerk 6 everywhere; a parabola has none."""
+    # x = t^3 has the jerk 6 everywhere; a parabola has none.
     t = np.arange(40) / FPS
     joints = standing()
     joints[..., 0] += t[:, None] ** 3
@@ -195,13 +187,7 @@ def test_jitter_is_the_third_derivative() -> None:
     assert physics(joints, FPS).jitter == pytest.approx(0.0, abs=1e-9)
 
 
-def test_sliding_is_not_standing() -> None:
-    joints = standing()
-    joints[..., 0] += (np.arange(40) / FPS)[:, None]  # a metre a second
-    assert physics(joints, FPS).skating == 1.0
-
-
 def test_what_is_no_body_is_refused() -> None:
     for shape in ((3, 22, 3), (40, 8, 3), (40, 22), (40, 22, 2)):
-        with pytest.raises(UserError, match=r"needs joints \[T >= 4, N >= 12, 3\]"):
+        with pytest.raises(UserError, match=r"\[T >= 4"):
             physics(np.zeros(shape), FPS)

@@ -22,17 +22,14 @@ def test_equal_public_ones_under_their_seed(golden: dict[str, torch.Tensor]) -> 
     assert mine == pytest.approx(golden["multimodality"].item(), rel=1e-5)
 
 
-def test_small_sets() -> None:
-    assert diversity(torch.ones(5, 3)).item() == 0
-    with pytest.raises(UserError, match="two samples of each text"):
-        multimodality(torch.zeros(2, 1, 3))
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_of_few_repeats_all_pairs_count_whatever_the_seed(seed: int) -> None:
     """A drawn pair of two repeats would be of one with itself every second time."""
     assert multimodality(torch.tensor([[[0.0], [3.0]], [[1.0], [2.0]]]), seed=seed).item() == 2
     assert multimodality(torch.tensor([[[0.0], [1.0], [5.0]]]), seed=seed).item() == pytest.approx(10 / 3)
+    assert diversity(torch.ones(5, 3)).item() == 0
+    with pytest.raises(UserError, match="two samples"):
+        multimodality(torch.zeros(2, 1, 3))
 
 
 def commuting(spread: torch.Tensor, other: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, float]:

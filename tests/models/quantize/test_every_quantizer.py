@@ -49,19 +49,3 @@ def test_masked_batch_equals_truncated_batch(make: Callable[[], nn.Module], padd
             assert wide.grad is not None and (wide.grad[:, 12:] == 0).all()
     for name, value in plain.state_dict().items():
         torch.testing.assert_close(padded.state_dict()[name], value)
-
-
-@pytest.mark.parametrize("how", ["eval", "frozen", "update=False"])
-def test_never_updates(make: Callable[[], nn.Module], how: str) -> None:
-    quantizer = make()
-    quantizer(torch.randn(2, 20, 4))
-    before = {k: v.clone() for k, v in quantizer.state_dict().items()}
-    if how == "eval":
-        quantizer.eval()
-    elif how == "frozen":
-        quantizer.freeze()
-        quantizer.train()
-        assert not (isinstance(quantizer, GradientQuantizer) and quantizer.codebook.requires_grad)
-    for _ in range(3):
-        quantizer(torch.randn(2, 20, 4), update=how != "update=False")
-    assert all(torch.equal(v, before[k]) for k, v in quantizer.state_dict().items())

@@ -55,8 +55,6 @@ def test_frame_stride_sees_every_nth_frame_only(stride: int) -> None:
 
 def test_paper_config() -> None:
     config = TmaConfig()
-    sizes = (config.latent, config.ff, config.layers, config.heads, config.frame_stride)
-    assert sizes == (256, 1024, 6, 4, 1)
     with torch.device("meta"):
         count = sum(p.numel() for p in Tma(config, 313, 384).parameters())
     per_layer = 4 * 256 * 256 + 2 * 256 * 1024

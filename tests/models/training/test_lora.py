@@ -40,13 +40,6 @@ def learn(net: InterleavedGPT, steps: int = 3) -> None:
             parameter.data -= 0.5 * slope
 
 
-def test_at_first_the_logits_are_those_of_the_network() -> None:
-    net = network()
-    before = net(*inputs())
-    add_lora(net, LoraConfig(rank=4))
-    assert torch.equal(net(*inputs()), before)
-
-
 def test_merged_weights_give_what_the_adapters_gave() -> None:
     """And W + (alpha / rank) B A is what they are."""
     net = network()
@@ -54,6 +47,7 @@ def test_merged_weights_give_what_the_adapters_gave() -> None:
     before = net.stack.blocks[1].ff_in.weight.clone()
     start = net(*inputs())
     add_lora(net, LoraConfig(rank=4, alpha=6))
+    assert torch.equal(net(*inputs()), start), "nothing changes at first"
     learn(net)
     adapted = net(*inputs())
     finite = start.isfinite()
@@ -85,7 +79,7 @@ def test_only_adapters_and_what_is_whole_learn() -> None:
 
 
 def test_names_that_no_layer_has_are_refused() -> None:
-    with pytest.raises(UserError, match=r"no linear layer of this network is called 'key'"):
+    with pytest.raises(UserError, match="'key'"):
         add_lora(network(), LoraConfig(layers=("key",)))
-    with pytest.raises(UserError, match=r"lora.whole: this network has no 'body'; it has embeddings, heads"):
+    with pytest.raises(UserError, match=r"lora.whole: .*'body'.* embeddings"):
         add_lora(network(), LoraConfig(whole=("body",)))

@@ -268,12 +268,9 @@ def test_conditions_bring_the_cross_entropy_below_the_entropy_of_the_codes(adver
     def batch(seed: int, kind: str) -> dict[str, Any]:
         codes = torch.randint(6, (16, 4), generator=torch.Generator().manual_seed(seed))
         motion = codes.repeat_interleave(4, dim=1).float()[..., None].expand(-1, -1, 2)
-        there = (
-            torch.arange(16) % 2 == (kind == "audio")
-            if kind == "mixed"
-            else torch.full((16,), kind == "text")
-        )
-        heard = ~there if kind == "mixed" else torch.full((16,), kind == "audio")
+        even = torch.arange(16) % 2 == 0  # of a mixed batch: text and audio take turns
+        there = even if kind == "mixed" else torch.full((16,), kind == "text")
+        heard = ~even if kind == "mixed" else torch.full((16,), kind == "audio")
         return {
             "motion": motion.contiguous(),
             "length": torch.full((16,), 16),

@@ -158,40 +158,25 @@ def test_join_of_rows_of_different_lengths() -> None:
     assert (both.codes["body"][2, 6:] == 0).all()
 
 
-@pytest.mark.parametrize("scale", [1.0, 2.5])
-def test_alone_equals_in_a_batch(utt: Utt, scale: float) -> None:
+@pytest.mark.parametrize("scale", [1.0, 2.5, [1.0, 3.0, 1.0, 1.5, 2.5, 1.0]])
+def test_alone_equals_in_a_batch(utt: Utt, scale: float | list[float]) -> None:
+    """Also where every row has its own guidance."""
     condition, seeds = conditions(6, [5, 0, 2, 5, 1, 3]), sample_seeds(3, 6)
     start = random_codes([2, 0, 1, 3, 5, 0])
-    settings: dict[str, Any] = {"cfg_scale": scale, "max_groups": 8}
-    together = generate(utt, condition, null=null(6), start=start, seed=3, **settings)
+    settings: dict[str, Any] = {"null": null(6), "start": start, "max_groups": 8, "cfg_scale": scale}
+    together = generate(utt, condition, seed=3, **settings)
     assert len(set(together.groups.tolist())) > 1
     assert together.groups.min() >= 1
     for index in range(6):
         mine = slice(index, index + 1)
         codes = Codes({name: values[mine] for name, values in start.codes.items()}, start.groups[mine])
-        alone = generate(
-            utt, condition.rows(mine), null=null(1), start=codes, seed=[seeds[index]], **settings
-        )
+        own = scale[index] if isinstance(scale, list) else scale
+        settings |= {"null": null(1), "start": codes, "cfg_scale": own}
+        alone = generate(utt, condition.rows(mine), seed=[seeds[index]], **settings)
         assert row(alone, 0) == row(together, index)
-    other = generate(utt, condition, null=null(6), start=start, seed=4, **settings)
+    settings |= {"null": null(6), "start": start, "cfg_scale": scale}
+    other = generate(utt, condition, seed=4, **settings)
     assert any(row(other, i) != row(together, i) for i in range(6))
-
-
-def test_every_row_may_have_its_own_guidance(utt: Utt) -> None:
-    condition, seeds, scales = conditions(4, [5, 0, 2, 3]), sample_seeds(3, 4), [1.0, 3.0, 1.0, 1.5]
-    together = generate(utt, condition, null=null(4), seed=3, max_groups=8, cfg_scale=scales)
-    for index, scale in enumerate(scales):
-        alone = generate(
-            utt,
-            condition.rows(slice(index, index + 1)),
-            null=null(1),
-            seed=[seeds[index]],
-            max_groups=8,
-            cfg_scale=scale,
-        )
-        assert row(alone, 0) == row(together, index)
-    with pytest.raises(UserError, match="3 strengths of guidance were given for 4 conditions"):
-        generate(utt, condition, null=null(4), cfg_scale=scales[:3])
 
 
 def test_guidance_equals_the_slow_mix(utt: Utt) -> None:
@@ -235,6 +220,7 @@ def test_bad_settings_are_refused(utt: Utt) -> None:
         ({"groups": torch.tensor([1])}, "requested lengths were given for 2"),
         ({"groups": torch.tensor([1, 9]), "max_groups": 4}, "must be 1 to 4 groups; got 1 to 9"),
         ({"cfg_scale": 2.0}, "guidance needs"),
+        ({"cfg_scale": [2.0] * 3, "null": null(2)}, "3 strengths"),
         ({"start": random_codes([1])}, "1 starts were given for 2"),
     ):
         with pytest.raises(UserError, match=message):
