@@ -44,9 +44,9 @@ COLUMNS = (
 NEAR = 0.07
 RUN = 4
 SECONDS = 90.0
-"""Of each real song."""
+"""Seconds of each real song."""
 SEED = 99
-"""Of the rendered songs; the recipe `beats` has another."""
+"""Seed of the rendered songs; the recipe `beats` has another."""
 
 
 def hits(truth: Times, found: Times) -> int:

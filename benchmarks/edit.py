@@ -149,7 +149,7 @@ def obeyed(joints: Joints, words: Truth, fps: float, start: int) -> dict[str, fl
 
 
 def asked_of(clip: Joints, fps: float, gap: slice, words: Truth) -> dict[str, dict[str, object]]:
-    """What the model is asked for, by the row's title."""
+    """The requests to the model, by the row's title."""
     pin, path = tasks_of(clip, fps, gap)
     out = {"**the model**": {"keep": pin["keep"]}}
     out[OTHER_WORDS] = {

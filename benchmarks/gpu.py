@@ -1,4 +1,4 @@
-"""What a GPU makes of the paper's sizes: speed, share of its peak, memory against the estimate, sampling.
+"""The paper's sizes on a GPU: speed, share of its peak, memory against the estimate, sampling.
 
     python benchmarks/gpu.py WORK
     python benchmarks/gpu.py WORK --size tiny --device cpu --steps 20
@@ -96,7 +96,7 @@ def recipe(size: str, steps: int, device: str, profile: int) -> dict[str, Any]:
 
 
 def flops(stage: CompletedStage) -> int:
-    """Of a step: forward and backward pass over the first batch that it trained on."""
+    """FLOPs of a step: forward and backward pass over the first batch that it trained on."""
     stage_cache, kind, config = StageCache(), stage.kind, stage.config
     dry: Any = kind
     given = dry.inputs.of(stage_cache.given(stage.inputs))

@@ -1,4 +1,4 @@
-"""What a model of synthetic clips knows, measured: the card of its exported folder, and its figures again.
+"""Measure what a model of synthetic clips knows: the card of its exported folder, and its figures again.
 
     motionloom run humantomato-synthetic
     motionloom export runs/humantomato-synthetic -o model --half --set cfg_scale=1.5
@@ -171,7 +171,7 @@ def lookups(truths: Sequence[Truth], config: SynthConfig) -> dict[str, list[Trut
 
 
 def noted(model: Path) -> dict[str, Any]:
-    """What the card beside a model holds; empty where there is none."""
+    """The figures of the card beside a model; empty where there is none."""
     path = model / CARD_FIGURES
     return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
 
@@ -301,7 +301,7 @@ def choice(sampling: Mapping[str, Any]) -> str:
 
 
 def single_draws(single: Mapping[str, Shares]) -> str:
-    """What the first draw is worth, where TMA chooses among several."""
+    """A sentence on the first draw, where TMA chooses among several."""
     if not single:
         return ""
     rows = [

@@ -1,4 +1,4 @@
-"""What a training survives, measured: kills at random moments, preemption on SLURM, damaged files.
+"""Measure what a training survives: kills at random moments, preemption on SLURM, damaged files.
 
     python benchmarks/reliability.py WORK [--parts kills,preemption,...] [--kills 20] [--cells '*-1-0']
 

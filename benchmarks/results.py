@@ -36,7 +36,7 @@ TABLE = re.compile(r"(<!--(\w+)-->\n)(?:\|.*\n)*(?:\n\*Measured .*\n)?")
 
 
 class Table(NamedTuple):
-    """What becomes of some stages: row -> (stage without its seed, row of its figures)."""
+    """A table of some stages: row -> (stage without its seed, row of its figures)."""
 
     title: str
     rows: Mapping[str, tuple[str, str]]
@@ -167,7 +167,7 @@ COMMANDS = {
     "rivals": "motionloom run baselines-tiny",
     **dict.fromkeys(("rivals_ude_text", "rivals_ude_music"), "motionloom run baselines-tiny-ude"),
 }
-"""What was run before `--collect`; otherwise the script of UDE's ingredients."""
+"""The command that was run before `--collect`; otherwise the script of UDE's ingredients."""
 
 
 def collect(run: Path, names: Iterable[str]) -> None:
@@ -205,7 +205,7 @@ def row_of(run: Path, table: Table, title: str) -> Record:
 
 
 def logged(run: Path, stage: str, seed: int, column: Column) -> float | None:
-    """What the training that a stage of figures measures has logged in the end: a mean of five values."""
+    """The last logged value of the training that a stage of figures measures: a mean of five."""
     kind, _, name = column.figure.partition(":")
     if kind != "log":
         return None

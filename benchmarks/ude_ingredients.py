@@ -50,7 +50,7 @@ def trained(steps: int, batch: int, lr: float, seed: int, warmup: int = 50) -> d
 
 
 def base(clips: Path) -> Stages:
-    """What all arms share: the data, the judge, and the tokenizer of the first seed."""
+    """The stages that all arms share: the data, the judge, and the tokenizer of the first seed."""
     dances = {"songs": 150, "song_seconds": 12.0, "conditions": {"audio": 1.0, "both": 0.0}}
     return {
         "clips": {

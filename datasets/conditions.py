@@ -1,4 +1,4 @@
-"""What a motion is conditioned on: one `Condition` a modality, in one mapping from shards to networks.
+"""The conditions of a motion: one `Condition` a modality, in one mapping from shards to networks.
 
 A row of a batch that lacks a modality has no true position in that modality's mask, so clips with text, with
 music, with both and with neither share one batch. `datasets/modalities/` says what there is.

@@ -47,7 +47,7 @@ EXPRESSIONS: dict[str, Look] = {
     "talk_wide": Look(smile=0.25, mouth_open=0.1),
     "talk_purse": Look(purse=1.0, mouth_open=0.1),
 }
-"""What each column of the synthetic basis looks like at its apex, in the basis' order."""
+"""The look of each column of the synthetic basis at its apex, in the basis' order."""
 
 _WIDE_EYE = 1.6
 CONTROLS: dict[str, Look] = {
@@ -282,7 +282,7 @@ def _strip(
 
 @dataclass(frozen=True)
 class Shape:
-    """What of a look belongs to a shape: one side of the face, its upper or lower half, or all."""
+    """The part of a look that belongs to a shape: one side of the face, its upper or lower half, or all."""
 
     look: Look
     side: Literal["", "Left", "Right"] = ""

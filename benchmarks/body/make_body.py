@@ -67,7 +67,7 @@ COLOURS = {
     "lip": (194, 124, 108),
     "mouth": (82, 34, 38),
 }
-"""What a vertex is painted with; the page's style names them in this order."""
+"""The paint of a vertex; the page's style names them in this order."""
 CONTROL_SHAPES = {name: Shape(look) for name, look in CONTROLS.items()}
 SHAPES = {
     "near": CONTROL_SHAPES
@@ -197,7 +197,7 @@ def _cut(piece: Piece, value: Floats) -> tuple[Piece, NDArray[np.bool_]]:
 
 
 def _seen(vertices: Floats, triangles: NDArray[np.int64], over: Sequence[Field]) -> NDArray[np.int64]:
-    """Those triangles that are not deep inside one of the fields."""
+    """The triangles that are not deep inside one of the fields."""
     for field in over:
         triangles = triangles[(field.value(vertices) > -HIDDEN)[triangles].any(axis=1)]
     return triangles

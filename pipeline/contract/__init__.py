@@ -1,1 +1,1 @@
-"""What a stage answers for itself, and what the rest of the pipeline asks of it."""
+"""The interfaces of stages, generators and captioners that the rest of the pipeline relies on."""

@@ -1,4 +1,4 @@
-"""What a captioner of motions is asked, and what it answers."""
+"""The interface of a motion captioner."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from motionloom.datasets.motion.layout import MotionLayout, Part
 
 @dataclass(frozen=True)
 class Sentence:
-    """What a captioner says of a motion."""
+    """A sentence about a motion, with its probability."""
 
     text: str
     log_probability: float
-    """Of the whole sentence, as the captioner has it; natural logarithm."""
+    """Natural logarithm of the probability of the whole sentence."""
 
     @property
     def probability(self) -> float:
@@ -43,7 +43,7 @@ class MotionCaptioner(Protocol):
 
     @property
     def max_frames(self) -> int:
-        """Of longer motions, what comes after is not read."""
+        """Most frames that are read; the rest of a longer motion is ignored."""
 
     def reads(self, present: int) -> bool:
         """Whether it can read motions that hold only what these bits of `ClipMeta.present` say."""
@@ -51,7 +51,7 @@ class MotionCaptioner(Protocol):
     def caption(
         self, motions: Sequence[NDArray[np.float32]], count: int, present: Sequence[int] | None = None
     ) -> list[list[Sentence]]:
-        """Of each motion [T, C], its columns in their own units, up to `count` sentences, likeliest first.
+        """Return up to `count` sentences for each motion [T, C] in its own units, likeliest first.
 
         `present` [n] says by the bits of `ClipMeta.present` what each holds; None = all.
         """

@@ -53,14 +53,14 @@ class RecordedClip:
 
 
 class Kept(Config):
-    """What stays as it is in the clip, from `start` up to `end`."""
+    """The parts that stay as they are in the clip, from `start` up to `end`."""
 
     start: Seconds = Field(0.0, ge=0)
     end: Seconds | None = None
     """None: to the clip's end."""
     parts: tuple[FigurePart, ...] = ("all",)
     but: tuple[FigurePart, ...] = ()
-    """What of these is free after all: `parts: [all], but: [right_hand]` makes the right hand anew."""
+    """Exceptions that are free after all: `parts: [all], but: [right_hand]` makes the right hand anew."""
 
     @model_validator(mode="after")
     def _forward(self) -> Self:
@@ -99,7 +99,7 @@ class Pin(Config):
 
 
 class Words(Config):
-    """What the person does from `start` to `end`, in place of the caption."""
+    """A description of the person from `start` to `end`, in place of the caption."""
 
     start: Seconds
     end: Seconds
@@ -115,12 +115,12 @@ class Words(Config):
 
 
 class EditTask(Config):
-    """What to keep of a clip, and what the rest must do."""
+    """An edit: the parts of a clip to keep, and the constraints on the rest."""
 
     caption: str = ""
-    """What the person does where no `words` say otherwise; empty: whatever fits."""
+    """Describes the motion where no `words` do; empty: whatever fits."""
     face: str = ""
-    """What the face does; empty takes the caption."""
+    """Describes the face; empty takes the caption."""
     lead: Seconds = Field(0.0, ge=0)
     """Seconds to make before the clip."""
     seconds: Seconds | None = Field(None, gt=0)
@@ -187,7 +187,7 @@ class EditReport:
     clip_skating: float
 
     def lines(self) -> list[str]:
-        """What there is to say, one line each."""
+        """The report for people, one line a figure."""
         out = []
         if not math.isnan(self.kept_cm):
             out.append(f"kept joints: {self.kept_cm:.2f} cm at most from the clip")

@@ -1,4 +1,4 @@
-"""What a generator of motion is asked, and what it answers.
+"""The interface of a motion generator.
 
 A generator makes one group of columns of a layout (`part`): body and hands, the face, or all. It says which
 modalities it can be conditioned on and which sampling settings it takes notice of.
@@ -35,16 +35,16 @@ _JUDGED = 3.0
 
 @dataclass(frozen=True)
 class Prompt:
-    """What one motion is conditioned on, as a person gives it and a viewer shows it."""
+    """The conditions of one motion, as a person gives it and a viewer shows it."""
 
     text: str = ""
-    """What the person does; empty without words."""
+    """Describes the motion; empty without words."""
     face_text: str = ""
-    """What the face does; empty takes `text`."""
+    """Describes the face; empty takes `text`."""
     sound: Sound | None = None
     """The music."""
     conditions: Mapping[str, object] = field(default_factory=dict)
-    """What else it is conditioned on, by modality; of "audio" the features [T, 438], where they are known."""
+    """Further conditions by modality; under "audio" the features [T, 438], where they are known."""
 
     @property
     def given(self) -> dict[str, object]:
@@ -98,7 +98,7 @@ class Prompt:
 
 @dataclass(frozen=True)
 class GenerationRequest:
-    """What a generator is asked for: one motion for each row of the conditions."""
+    """A request to a generator: one motion for each row of the conditions."""
 
     conditions: Conditions
     """Encoded and on the generator's device; rows that lack a modality have no true position in its mask."""
@@ -108,10 +108,10 @@ class GenerationRequest:
     """One per motion, so that results do not depend on batching."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     noise_seeds: Sequence[int] | None = None
-    """Of the noise of a diffusion decoder; None takes `seeds`. Others take no notice of it."""
+    """Seeds of a diffusion decoder's noise; None takes `seeds`. Other generators ignore them."""
     seed_motions: Sequence[Motion] | None = None
-    """What a generator with `seed_frames` goes on from, as long as these: its columns [T0, C] in their own
-    units; None takes motions of its own. Others take no notice of it."""
+    """Motions that a generator with `seed_frames` continues, of that length: its columns [T0, C] in their own
+    units; None takes motions of its own. Other generators ignore them."""
 
     def text(self, who: str) -> Condition:
         """The encoded texts; `who` is conditioned on them, for the message where there are none."""
@@ -185,7 +185,7 @@ class Streaming:
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What a generator can do besides `generate`; the default of each field says that it cannot."""
+    """A generator's abilities besides `generate`; the default of each field says that it cannot."""
 
     streaming: Streaming | None = None
     drive: Callable[[Sequence[Stretch], Sequence[int], SamplingConfig], list[Motion]] | None = None
@@ -221,7 +221,7 @@ class MotionGenerator(Protocol):
 
     @property
     def prepared(self) -> Mapping[str, object]:
-        """What the stages of its modalities give, by name, such as the text source and music statistics."""
+        """Outputs of the stages of its modalities, by name, such as the text source and music statistics."""
 
     @property
     def settings(self) -> frozenset[str]:
@@ -241,7 +241,7 @@ class MotionGenerator(Protocol):
 
     @property
     def capabilities(self) -> Capabilities:
-        """What it can do besides `generate`."""
+        """Its abilities besides `generate`."""
 
     def generate(self, request: GenerationRequest) -> list[Motion]:
         """Features of the part in their own units, [T, C] each, in the order of the rows."""

@@ -70,7 +70,7 @@ class StreamConfig(Config):
     hop_frames: int = Field(20, ge=1)
     """Frames that UDE draws at a time: another caption takes effect after them."""
     decoder: Literal["diffusion", "tokenizer"] | None = None
-    """What makes frames of a UDE's tokens: the diffusion decoder, which is better and needs the tokens of a
+    """The decoder of a UDE's tokens: the diffusion decoder, which is better and needs the tokens of a
     window before its first frame, or the tokenizer's own, which needs some groups. None takes the first
     where the model has it."""
     ahead_seconds: float = Field(0.5, ge=0)

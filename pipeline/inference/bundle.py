@@ -130,7 +130,7 @@ class Bundle:
         return self._generators[stage.folder]
 
     def encoder(self, stage: CompletedStage) -> PromptEncoder:
-        """What encodes prompts for a stage."""
+        """The encoder of prompts for a stage."""
         if stage.folder not in self._encoders:
             self._encoders[stage.folder] = PromptEncoder(self.of(stage).prepared, self.stage_cache.device)
         return self._encoders[stage.folder]
@@ -170,7 +170,7 @@ class Bundle:
 
     @cached_property
     def captioner(self) -> MotionCaptioner:
-        """What says what motions show: the recipe's first."""
+        """The captioner: the recipe's first."""
         if not self.captioners:
             raise UserError("no finished stage here captions motion; add one of kind captioner to the recipe")
         return self.stage_cache.captioner(self.captioners[0])

@@ -236,7 +236,7 @@ class MotionModel(
 
     @property
     def modalities(self) -> frozenset[str]:
-        """What it can be conditioned on: "text", "audio" or both."""
+        """Modalities of its conditions: "text", "audio" or both."""
         return self.bundle.generator.modalities
 
     @property

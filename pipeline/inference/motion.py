@@ -33,7 +33,7 @@ class GeneratedMotion:
     """Expression [T, 50], or None where the model makes no face."""
     layout: MotionLayout
     segments: tuple[Segment, ...] = ()
-    """What drove which seconds, of a motion made from a script."""
+    """The segments that drove a motion made from a script, with their seconds."""
     beats: tuple[float, ...] | None = None
     """Seconds of the beats of its music, as the model heard them; None: not looked for."""
     seed: int | None = None
@@ -43,12 +43,12 @@ class GeneratedMotion:
 
     @property
     def caption(self) -> str:
-        """What the person does, in words; empty without."""
+        """The caption; empty without words."""
         return self.prompt.text
 
     @property
     def face_caption(self) -> str:
-        """What the face does, in words."""
+        """The caption of the face."""
         return self.prompt.words
 
     @property
@@ -89,7 +89,7 @@ class EditedMotion(GeneratedMotion):
     report: EditReport = field(kw_only=True)
     """How near it is to its task."""
     remarks: tuple[str, ...] = ()
-    """What there is to know of how the clip was read."""
+    """Remarks on how the clip was read."""
 
 
 @dataclass(frozen=True)

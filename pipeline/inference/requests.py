@@ -1,4 +1,4 @@
-"""What a user asks of a model, checked before it is made, and encoded as networks take it."""
+"""Check a user's request to a model, and encode it as networks take it."""
 
 from __future__ import annotations
 

@@ -29,9 +29,9 @@ class ScriptSegment(Config):
     """One entry of a script."""
 
     text: str = ""
-    """What the person does."""
+    """Describes the motion."""
     face: str = ""
-    """What the face does; as `text` where it is empty."""
+    """Describes the face; empty takes `text`."""
     music: str | None = None
     """A sound file, seen from the script's folder."""
     seconds: float | None = Field(None, gt=0, allow_inf_nan=False)

@@ -32,7 +32,7 @@ class ShippedModel:
 
     @property
     def description(self) -> str:
-        """What it is, in one line; empty where its card does not say."""
+        """The model in one line; empty where its card does not say."""
         try:
             facts = json.loads((self.folder / CARD_FIGURES).read_text(encoding="utf-8"))
         except (OSError, ValueError):

@@ -45,7 +45,7 @@ class ShownMotion:
 
     @property
     def joints(self) -> NDArray[np.float64]:
-        """What page, film and npz show [T, N, 3], metres."""
+        """Joints that page, film and npz show [T, N, 3], metres."""
         return self.figure.joints
 
     @property

@@ -297,7 +297,7 @@ def segments_of(
     sound: Sound | None = None,
     seconds: float | None = None,
 ) -> Iterator[DrivenSegment]:
-    """What drives the motion, one segment after another."""
+    """Yield the segments that drive the motion, one after another."""
     if seconds is not None and not 0 < seconds < math.inf:
         raise UserError(f"{seconds:g} s: give a length above 0, or none for a stream without an end")
     if isinstance(captions, Script):

@@ -38,7 +38,7 @@ class OutputClip:
     options: FigureOptions
     seed: int | None = None
     label: str = "generated"
-    """What the page says above it."""
+    """Title of the page."""
     arkit: bool = False
     """Whether GLB files carry ARKit's 52 shapes of the face, instead of the synthetic source's own."""
 
@@ -82,7 +82,7 @@ class Writer:
     """One format."""
 
     suffix: str
-    """What follows the name of a motion: `.npz`, `_smplx.npz`."""
+    """Suffix behind the name of a motion: `.npz`, `_smplx.npz`."""
     mime: str
     help: str
     write: Callable[[Path, Outputs], object] = field(repr=False)
@@ -241,7 +241,7 @@ WRITERS: dict[str, Writer] = {
 
 
 def default_formats() -> list[str]:
-    """What is written unless other formats are asked for."""
+    """The default formats."""
     return [name for name, writer in WRITERS.items() if writer.default]
 
 

@@ -153,7 +153,7 @@ def _name_of(facts: dict[str, object]) -> str:
 
 
 def received(name: str, motion: GeneratedMotion, remarks: list[str]) -> dict[str, object]:
-    """What a client is told of a clip that it sent."""
+    """The answer about a clip that a client sent."""
     return {
         "clip": name,
         "caption": motion.caption,

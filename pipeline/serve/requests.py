@@ -1,4 +1,4 @@
-"""What is asked of a server, and the answers: plain JSON, the viewer's data, or a file."""
+"""Requests to the server and its answers: plain JSON, the viewer's data, or a file."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ class MotionRequest(Config):
     """One motion, as a client asks for it."""
 
     caption: str = ""
-    """What the person does."""
+    """Describes the motion."""
     face: str = ""
-    """What the face does; as `caption` where it is empty."""
+    """Describes the face; empty takes `caption`."""
     sound: str | None = Field(None, max_length=64)
     """Name of a sound that was sent before."""
     seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
@@ -141,7 +141,7 @@ class Answer:
 def notes_of(
     model: MotionModel, asked: MotionRequest, sound: Sound | None, motion: GeneratedMotion | None = None
 ) -> dict[str, list[str]]:
-    """What a person should know of the motion: captions that are unlike all that the model knows, what could
+    """Notes for the person on the motion: captions that are unlike all that the model knows, what could
     be said of the body instead, that a sound has no beat, and that the motion does something else.
     """
     unknown = model.unknown(asked.captions, asked.faces)
@@ -222,7 +222,7 @@ def lines(
 
 
 def facts_of(motion: GeneratedMotion, request: str, seed: int) -> dict[str, object]:
-    """What a motion is, and which request it answers."""
+    """A motion as JSON, and the request that it answers."""
     return {
         "request": request,
         "caption": motion.caption,
@@ -262,7 +262,7 @@ T = TypeVar("T")
 
 
 class Recent(Generic[T]):
-    """What was used last, by name, for several threads; `what` it is in messages."""
+    """A cache of the last used, by name, for several threads; messages call them `what`."""
 
     def __init__(self, most: int, what: str) -> None:
         self._most, self._what = most, what

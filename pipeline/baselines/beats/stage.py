@@ -35,7 +35,7 @@ class BeatsConfig(TrainedStageConfig):
 
     net: BeatNetConfig = BeatNetConfig()
     window_seconds: float = Field(10.0, gt=0)
-    """Of a song, in training."""
+    """Seconds of a song, in training."""
     optim: OptimConfig = OptimConfig(lr=2e-3, warmup_steps=50, schedule="cosine")
     train: TrainConfig = TrainConfig(steps=2000, batch_size=16)
 

@@ -64,9 +64,9 @@ class EditFrames:
     pieces: NDArray[np.bool_]
     """Which `figure_parts.PIECES` are kept [T, P]."""
     anchor: RootPath
-    """Of one frame: the one that `places` and `model_pins` are seen from."""
+    """The anchor frame: the one that `places` and `model_pins` are seen from."""
     places: Places
-    """What is known of the root, one row."""
+    """Known values of the root, one row."""
     path: NDArray[np.complex128]
     """Where the root must be [T], z + i x; NaN elsewhere."""
     pins: dict[tuple[int, int], tuple[float, float, float]]
@@ -217,7 +217,7 @@ class _TimedTask:
         return frame
 
     def pieces(self, clip_frames: int) -> NDArray[np.bool_]:
-        """What is kept [T, P]."""
+        """Mask of the pieces that are kept [T, P]."""
         task, fps = self.task, self.layout.fps
         out = np.zeros((self.frames, len(PIECES)), dtype=np.bool_)
         clip_end = self.lead + clip_frames
@@ -314,7 +314,7 @@ def _root_path(features: NDArray[np.float32], layout: MotionLayout, scale: float
 def _known_places(
     clip: RootPath, lead: int, rooted: NDArray[np.bool_], path: NDArray[np.complex128], scale: float
 ) -> tuple[Places, RootPath]:
-    """What is known of the root, on the model's figure and seen from an anchor; and that anchor's frame, in
+    """Known values of the root, on the model's figure and seen from an anchor; and that anchor's frame, in
     the clip's size.
 
     The anchor is the first frame whose root is kept. Without one it is where the path begins, facing along

@@ -32,7 +32,7 @@ class DenoisedMotion(WholeMotion):
     @property
     @abstractmethod
     def schedule(self) -> ScheduleConfig:
-        """Of the training."""
+        """The noise schedule of the training."""
 
     @property
     def capabilities(self) -> Capabilities:

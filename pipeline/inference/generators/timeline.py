@@ -81,7 +81,7 @@ class TokenTimeline:
         number: int,
         sampling: SamplingConfig,
     ) -> Codes:
-        """What is there with `wanted` [B] groups more."""
+        """The timeline extended by `wanted` [B] groups."""
         made, done, turn = before, torch.zeros_like(wanted), 0
         while bool((done < wanted).any()):
             rows = torch.nonzero(done < wanted)[:, 0]
