@@ -121,11 +121,11 @@ class GenerationRequest:
         return text
 
     def lengths(self, who: str) -> Sequence[int]:
-        """The frames of each motion; `who` makes a length that it is given."""
+        """Frames of each motion; `UserError` where the request has none, since `who` cannot decide a length."""
         if self.frames is None:
             raise UserError(
-                f"{who} makes a motion of a length that it is given, and none was; give --seconds, in a "
-                f"recipe seconds, or to evaluate it lengths: recorded"
+                f"{who} needs an explicit length: pass --seconds, in a recipe seconds, or to evaluate it "
+                f"lengths: recorded"
             )
         return self.frames
 

@@ -38,7 +38,7 @@ class OutputClip:
     options: FigureOptions
     seed: int | None = None
     label: str = "generated"
-    """Title of the page."""
+    """Heading of its figure on the page."""
     arkit: bool = False
     """Whether GLB files carry ARKit's 52 shapes of the face, instead of the synthetic source's own."""
 

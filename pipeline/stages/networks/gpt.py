@@ -61,7 +61,7 @@ class GptStageConfig(TrainedStageConfig):
     network of plain weights either way."""
 
     def require_fit(self, hardware: Hardware) -> None:
-        """A model that samples as it trains is neither one graph nor cut over ranks, nor are adapters."""
+        """Reject settings that compile and FSDP do not support: sampling inside the loss, and LoRA."""
         super().require_fit(hardware)
         if self.lora is not None:
             require_peft()
