@@ -121,7 +121,7 @@ class GenerationRequest:
         return text
 
     def lengths(self, who: str) -> Sequence[int]:
-        """Frames of each motion; `UserError` where the request has none, since `who` cannot decide a length."""
+        """Frames of each motion; `UserError` where the request has none and `who` cannot decide."""
         if self.frames is None:
             raise UserError(
                 f"{who} needs an explicit length: pass --seconds, in a recipe seconds, or to evaluate it "
