@@ -124,7 +124,7 @@ class GenerationRequest:
         """Frames of each motion; `UserError` where the request has none and `who` cannot decide."""
         if self.frames is None:
             raise UserError(
-                f"{who} needs an explicit length: pass --seconds, in a recipe seconds, or to evaluate it "
+                f"{who} needs an explicit length: give --seconds, in a recipe seconds, or to evaluate it "
                 f"lengths: recorded"
             )
         return self.frames

@@ -64,7 +64,7 @@ def test_a_stopped_training_goes_on_exactly_and_its_export_generates(
         sampling = {"denoising_steps": 3, "sampler": "ddim"}
         made.append(model.generate(["a person walks"] * 2, seconds=[0.5, 1.2], sampling=sampling))
         assert [motion.features.shape for motion in made[-1]] == [(10, 313), (24, 313)]
-        with pytest.raises(UserError, match="explicit length: pass --seconds"):
+        with pytest.raises(UserError, match="give --seconds"):
             model.generate(["a person walks"])
     np.testing.assert_array_equal(made[0][1].features, made[1][1].features)
     if kind == "motiondiffuse":
