@@ -167,10 +167,10 @@ def test_learns_a_toy_grammar() -> None:
     groups = torch.tensor([length for _, length in pairs])
     seq = interleave(codes, PATTERN, ends=ENDS, groups=groups)
     net = toy_gpt(text_dim=9, pkeep=0.95)
-    module = GptModule(net, OptimConfig(), seed=0, max_steps=300, loss=GptLossConfig(align_weight=0))
+    module = GptModule(net, OptimConfig(), seed=0, max_steps=600, loss=GptLossConfig(align_weight=0))
     optimizer = torch.optim.AdamW(net.parameters(), lr=3e-3)
     batch = {**seq._asdict(), "text": text}
-    for _ in range(300):
+    for _ in range(600):
         optimizer.zero_grad()
         module.losses(batch)["loss"].backward()
         optimizer.step()
