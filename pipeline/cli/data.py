@@ -179,28 +179,6 @@ def joints(
 
 
 @data_app.command()
-def face(
-    source: Annotated[
-        Path, typer.Argument(help="A take of Live Link Face or ARKit (.csv), or columns (.npz).")
-    ],
-    out: Annotated[Path, typer.Argument(help="The columns (.npz), or the take (.csv).")],
-    arkit_bases: Annotated[
-        Path | None,
-        typer.Option(help="Your expression and ARKit bases (.npz: source, arkit); default the package's."),
-    ] = None,
-) -> None:
-    """A recorded face as expression columns, and back, with the angles of head and eyes.
-
-    Example: `motionloom data face take.csv take.npz`
-    """
-    from motionloom.pipeline.render.body.face import convert_face
-
-    require_file_place(out)
-    frames, fps = convert_face(source, out, arkit_bases)
-    say(make_console(), f"{out}: {frames} frames at {fps:g} fps")
-
-
-@data_app.command()
 def report(
     root: Root,
     out: Annotated[

@@ -1,4 +1,4 @@
-"""Expression values <-> the 52 blend shapes of ARKit, by least squares on two bases of one face.
+"""Expression values -> the 52 blend shapes of ARKit, by least squares on two bases of one face.
 
 What a face does is the displacement of its vertices. A source basis says it for expression values
 (`source` [K, V, 3]: the displacement of each vertex for each value), an ARKit basis for the 52 shapes
@@ -86,16 +86,6 @@ class ArkitBases:
         gram = shapes @ shapes.T
         wanted = np.asarray(values, np.float64) @ (source @ shapes.T)
         return bounded_least_squares(gram, wanted)
-
-    def expressions(self, weights: NDArray[np.floating]) -> Floats:
-        """Expression values [T, K] whose displacement is nearest to that of ARKit weights [T, 52]."""
-        if weights.ndim != 2 or weights.shape[1] != len(ARKIT):
-            raise UserError(f"ARKit weights must be [T, {len(ARKIT)}], not {list(weights.shape)}")
-        shapes, source = self.arkit.reshape(len(ARKIT), -1), self.source.reshape(len(self.source), -1)
-        gram = source @ source.T
-        firm = gram + _RIDGE * float(np.trace(gram)) / len(gram) * np.eye(len(gram))
-        wanted = source @ shapes.T @ np.asarray(weights, np.float64).T
-        return np.asarray(np.linalg.solve(firm, wanted).T, dtype=np.float64)
 
 
 def bounded_least_squares(gram: Floats, wanted: Floats) -> Floats:

@@ -19,17 +19,15 @@ THRESHOLD = 0.35 * APEX
 """Below this length along every emotion a face is neutral."""
 
 
-def _basis(count: int) -> NDArray[np.float64]:
+def _basis() -> NDArray[np.float64]:
     index = np.arange(FACE_DIMS)
-    waves = [np.cos(np.pi * (index + 0.5) * (k + 1) / 24) * np.exp(-index / 18) for k in range(count)]
+    waves = [np.cos(np.pi * (index + 0.5) * (k + 1) / 24) * np.exp(-index / 18) for k in range(8)]
     q, r = np.linalg.qr(np.stack(waves).T)
     return np.asarray(q * np.sign(np.diag(r)))
 
 
-BASIS = _basis(8)
+BASIS = _basis()
 """Orthonormal columns [50, 8]; see the module's description."""
-DETAIL = _basis(22)[:, 8:]
-"""Orthonormal columns [50, 14] across those of `BASIS`, for what recorded faces do beside them."""
 
 
 def emotion_of(face: NDArray[np.floating]) -> str:

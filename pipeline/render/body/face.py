@@ -12,19 +12,13 @@ own expressions, or ARKit's 52 shapes.
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import atomic_file
-from motionloom.datasets.motion.body.arkit import ARKIT, ArkitBases, bounded_least_squares
-from motionloom.datasets.motion.body.expressions import APEX, BASIS, DETAIL
-from motionloom.datasets.motion.body.live_link import ANGLES, FaceTake, read_face, write_face
-from motionloom.datasets.motion.layout import FACE_DIMS
-from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.motion.body.arkit import ARKIT, ArkitBases
+from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.mesh import body_for
 
 Floats = NDArray[np.float64]
@@ -41,8 +35,6 @@ _EYE_OPEN = np.array([0.75, 0.7, 0.8, 1.6])
 BLINK_HEIGHT = 1.6
 """Length of a full blink along its column of the synthetic basis."""
 _WIDE_EYE = 1.6
-DETAIL_METRES = 0.02
-"""Displacement over all vertices of 1 along a column of `DETAIL`: recorded faces reach a few of it."""
 
 
 def synthetic_face_controls(expression: Values) -> Floats:
@@ -106,67 +98,6 @@ def own_bases() -> ArkitBases:
     return ArkitBases(np.stack([shapes[n] for n in EXPRESSIONS]), np.stack([shapes[n] for n in ARKIT]))
 
 
-@cache
-def _with_detail() -> ArkitBases:
-    """The own bases, with the strongest movements of ARKit's shapes beside the expressions."""
-    bases = own_bases()
-    source, arkit = (basis.reshape(len(basis), -1) for basis in (bases.source, bases.arkit))
-    _, directions = np.linalg.eigh(arkit @ arkit.T)
-    strongest = directions[:, ::-1][:, : DETAIL.shape[1]].T @ arkit
-    strongest *= DETAIL_METRES / np.linalg.norm(strongest, axis=-1, keepdims=True)
-    return ArkitBases(np.concatenate([source, strongest]).reshape(-1, *bases.source.shape[1:]), bases.arkit)
-
-
 def synthetic_arkit(expression: Values) -> Floats:
     """ARKit weights [T, 52] of synthetic expression values [T, 50], by the bases of the body's own head."""
-    detail = np.asarray(expression, np.float64) @ DETAIL
-    return _with_detail().weights(np.concatenate([expression_weights(expression), detail], axis=1))
-
-
-def recorded_expression(weights: Values) -> Floats:
-    """Synthetic expression values [T, 50] of ARKit weights [T, 52]: the way back of `synthetic_arkit`.
-
-    The mixture of expressions that is nearest on the body's head, then what is left along `DETAIL`.
-    """
-    bases = _with_detail()
-    source, arkit = (basis.reshape(len(basis), -1) for basis in (bases.source, bases.arkit))
-    expressions, detail = source[: len(EXPRESSIONS)], source[len(EXPRESSIONS) :]
-    moved = np.asarray(weights, np.float64) @ arkit
-    mixed = bounded_least_squares(expressions @ expressions.T, moved @ expressions.T)
-    left = (moved - mixed @ expressions) @ detail.T / DETAIL_METRES**2
-    emotions, blink, talk = mixed[:, :4], mixed[:, 4], mixed[:, 5:]
-    opened = np.maximum(1 + emotions @ (_EYE_OPEN - 1), 1e-6)
-    along = np.concatenate(
-        [emotions * APEX, (np.clip(blink / opened, 0, 1) * BLINK_HEIGHT)[:, None], talk], axis=1
-    )
-    return np.asarray(along @ BASIS.T + left @ DETAIL.T)
-
-
-def convert_face(source: Path, out: Path, bases: Path | None = None) -> tuple[int, float]:
-    """Write expression columns (.npz) of a take (.csv), or a take of columns; returns frames and frame rate.
-
-    The npz holds `expression` [T, K], `angles` [T, 9] of head and eyes in radians, and `fps`. By the bases of
-    the package K is 50. `UserError` for other suffixes and for what the files hold wrongly.
-    """
-    own = None if bases is None else ArkitBases.read(bases)
-    if (source.suffix.lower(), out.suffix.lower()) == (".csv", ".npz"):
-        take = read_face(source)
-        values = recorded_expression(take.weights) if own is None else own.expressions(take.weights)
-        with atomic_file(out) as file:
-            np.savez(file, expression=values.astype(np.float32), angles=take.angles, fps=take.fps)
-        return len(values), take.fps
-    if (source.suffix.lower(), out.suffix.lower()) != (".npz", ".csv"):
-        raise UserError(f"{source} -> {out}: a take (.csv) becomes columns (.npz), or columns a take")
-    with NpzFile(source) as arrays:
-        values, angles = arrays.numbers("expression"), arrays.numbers("angles")
-        fps = float(arrays.numbers("fps"))
-    if values.ndim != 2 or angles.shape != (len(values), len(ANGLES)) or not np.isfinite(values).all():
-        raise UserError(
-            f"{source}: expression {list(values.shape)} and angles {list(angles.shape)} must be finite, "
-            f"[T, K] and [T, {len(ANGLES)}]"
-        )
-    if own is None and values.shape[1] != FACE_DIMS:
-        raise UserError(f"{source}: {values.shape[1]} expression values, not {FACE_DIMS}, need --arkit-bases")
-    weights = synthetic_arkit(values) if own is None else own.weights(values)
-    write_face(out, FaceTake(weights, angles, fps))
-    return len(values), fps
+    return own_bases().weights(expression_weights(expression))

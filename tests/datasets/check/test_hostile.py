@@ -22,7 +22,6 @@ from motionloom.datasets.audio.sound import MAX_RATE, read_sound
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.files import check_file
 from motionloom.datasets.convert.captions.read import read_captions
-from motionloom.datasets.motion.body.live_link import read_face
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.schema import Manifest, ShardInfo, UserError
@@ -82,7 +81,6 @@ HOSTILE: dict[str, Callable[[Path], object]] = {
     "a shard's index that is a pipe": lambda f: Manifest.load_json(pipe(f / "x.index.json")),
     "captions that are a pipe": lambda f: read_captions(pipe(f / "c.csv")),
     "captions that are a device": lambda f: read_captions(Path("/dev/zero")),
-    "a face that is a pipe": lambda f: read_face(pipe(f / "a.csv")),
     "a joint map that is a pipe": lambda f: JointMap.load(pipe(f / "m.json")),
     "a shard that is a pipe": lambda f: check_or_raise(pipe(f / "x.tar")),
     "a shard of too many clips": lambda f: scan_tar(tar_of(f / "x.tar", MOST_CLIPS + 1)),

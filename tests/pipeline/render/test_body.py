@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.body.arkit import ARKIT
-from motionloom.datasets.motion.body.expressions import APEX, BASIS, emotion_of
-from motionloom.datasets.motion.body.live_link import read_face
+from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.body.rigid import fit_rigid, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -27,10 +26,8 @@ from motionloom.pipeline.render.body.face import (
     CONTROLS,
     EXPRESSIONS,
     control_weights,
-    convert_face,
     expression_weights,
     own_bases,
-    recorded_expression,
     synthetic_arkit,
     synthetic_face_controls,
 )
@@ -214,31 +211,6 @@ def test_synthetic_faces_become_the_arkit_shapes_that_mean_them() -> None:
     meant = expression_weights(rows) @ bases.source.reshape(len(bases.source), -1)
     missed = meant - weights @ bases.arkit.reshape(len(bases.arkit), -1)
     assert np.square(missed).mean() < 0.35**2 * np.square(meant).mean()
-
-
-def test_recorded_faces_become_columns_and_come_back(shared: Path, tmp_path: Path) -> None:
-    """Two real takes: the head's vertices return, and what the columns say are faces that readers know."""
-    shapes = own_bases().arkit.reshape(len(ARKIT), -1)
-    for name, share in (("Sad_167", 0.015), ("Neutral", 0.02)):
-        rows = (shared / f"data/real/arkit_livelink/{name}.csv").read_text().splitlines()
-        (tmp_path / "a.csv").write_text("\n".join([rows[0], *rows[400:410]]))
-        frames, fps = convert_face(tmp_path / "a.csv", tmp_path / "a.npz")
-        assert convert_face(tmp_path / "a.npz", tmp_path / "b.csv") == (frames, fps)
-        take, again = read_face(tmp_path / "a.csv"), read_face(tmp_path / "b.csv")
-        moved, missed = take.weights @ shapes, (again.weights - take.weights) @ shapes
-        assert np.square(missed).sum() < share**2 * np.square(moved).sum()
-        np.testing.assert_allclose(again.angles, take.angles, atol=1e-9)
-    smile = np.zeros((1, 52))
-    smile[0, [ARKIT.index("mouthSmileLeft"), ARKIT.index("mouthSmileRight")]] = 1
-    assert emotion_of(np.repeat(recorded_expression(smile), 3, axis=0)) == "happy"
-    for source, out, says in (
-        ("a.csv", "b.csv", "a take"),
-        ("a.npz", "b.npz", "a take"),
-        ("c.npz", "c.csv", "c.npz"),
-    ):
-        np.savez(tmp_path / "c.npz", expression=np.zeros((3, 49)), angles=np.zeros((3, 9)), fps=60.0)
-        with pytest.raises(UserError, match=says):
-            convert_face(tmp_path / source, tmp_path / out)
 
 
 def unpacked(packed: NDArray[np.uint32]) -> NDArray[np.float64]:

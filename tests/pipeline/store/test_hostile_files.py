@@ -26,7 +26,6 @@ from motionloom.datasets.check.files import check_file
 from motionloom.datasets.convert.common.arrays import load_array
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import FrameStats
-from motionloom.datasets.motion.body.live_link import read_face
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
@@ -170,7 +169,6 @@ ARRAYS: dict[str, Callable[[Path], object]] = {
     "an expression basis": lambda f: read_basis(put(f, "basis.npy", objects((9, 3, 50)))),
     "a basis that is a pickle": lambda f: read_basis(put(f, "basis.npy", pickle.dumps(Payload()))),
     "a body's poses": lambda f: NpzFile(put(f, "a.npz", archive("poses"))).numbers("poses"),
-    "a face that is a pickle": lambda f: read_face(put(f, "a.csv", pickle.dumps(Payload()))),
     "a body model": lambda f: BodyModel.load(put(f, "model.npz", archive("kintree_table")), "smpl22"),
     "a body model's pickle": lambda f: BodyModel.load(put(f, "model.pkl", pickle.dumps(Payload())), "smpl22"),
     "an index of shards": lambda f: read_index(
