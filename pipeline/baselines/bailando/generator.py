@@ -18,7 +18,7 @@ from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.pipeline.baselines.bailando.codes import DanceVq
 from motionloom.pipeline.baselines.bailando.network import CrossGpt
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
-from motionloom.pipeline.stages.networks.dances import music_of
+from motionloom.pipeline.stages.networks.clips import music_of
 from motionloom.pipeline.store.networks import device_of
 
 

@@ -25,7 +25,7 @@ from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.networks.dances import dance_batches, spread_dances
+from motionloom.pipeline.stages.networks.clips import MUSIC, clip_batches, spread_dances
 from motionloom.pipeline.stages.networks.tokenizer import require_uses
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.weights import ModelFacts, Release, load_facts
@@ -109,7 +109,7 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
         self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, seed: int, log: Log
     ) -> Batches:
         frames = {"max_frames": config.window, "min_frames": config.window}
-        return dance_batches(inputs.data, JointCrops, None, seed, frames=frames)
+        return clip_batches(inputs.data, JointCrops, {}, seed, clips=frames)
 
     def example(self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, batch: int) -> Example:
         codes = config.window // config.net.code_frames
@@ -177,9 +177,10 @@ class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt])
     def batches(
         self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, seed: int, log: Log
     ) -> Batches:
-        return dance_batches(
-            inputs.data, JointCrops, inputs.audio, seed, frames=window_of(net, inputs.dance_vq)
-        )
+        return clip_batches(
+            inputs.data, JointCrops, {"audio": inputs.audio}, seed, clips=window_of(net, inputs.dance_vq),
+            balance=MUSIC,
+        )  # fmt: skip
 
     def example(
         self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, batch: int
@@ -265,10 +266,11 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, seed: int, log: Log
     ) -> Batches:
         data, audio, fps = inputs.data, inputs.audio, inputs.data.layout.fps
-        test = config.reward_songs == "test"
-        found = dance_batches(
-            data, JointCrops, audio, seed, test_songs=test, frames=window_of(net.gpt, inputs.dance_vq)
-        )
+        songs = data.held_out(prefer="test") if config.reward_songs == "test" else None
+        found = clip_batches(
+            data, JointCrops, {"audio": audio}, seed, clips=window_of(net.gpt, inputs.dance_vq),
+            dataset=songs, balance=MUSIC,
+        )  # fmt: skip
 
         def train(batch: int, rank: int, world: int) -> Dataset[object]:
             return BeatBatches(found.train(batch, rank, world), audio, fps)  # type: ignore[arg-type, return-value]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.pipeline.baselines.fact.network import Fact
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
-from motionloom.pipeline.stages.networks.dances import music_of
+from motionloom.pipeline.stages.networks.clips import music_of
 from motionloom.pipeline.store.networks import device_of
 
 

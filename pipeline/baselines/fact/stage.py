@@ -18,7 +18,7 @@ from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.stages.networks.captions import part_columns, part_of
-from motionloom.pipeline.stages.networks.dances import dance_batches, spread_dances
+from motionloom.pipeline.stages.networks.clips import MUSIC, clip_batches, motion_example, spread_dances
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
@@ -88,20 +88,16 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
     def batches(self, config: FactStageConfig, net: Fact, inputs: FactInputs, seed: int, log: Log) -> Batches:
         columns = inputs.data.layout.part(config.part)
         frames = {"max_frames": config.net.window_frames, "min_frames": config.net.clip_frames}
-        return dance_batches(
-            inputs.data, lambda _: inputs.stats, inputs.audio, seed, frames={"columns": columns, **frames}
+        readers = {"audio": inputs.audio}
+        return clip_batches(
+            inputs.data, inputs.stats, readers, seed, clips={"columns": columns, **frames}, balance=MUSIC
         )
 
     def example(self, config: FactStageConfig, net: Fact, inputs: FactInputs, batch: int) -> Example:
         frames, width = config.net.window_frames, len(inputs.data.layout.part(config.part))
-        return Example(
-            {
-                "motion": torch.empty(batch, frames, width),
-                "length": torch.full((batch,), frames),
-                "conditions": {"audio": MODALITIES["audio"].example(batch, frames, inputs.audio.dim)},
-            },
-            f"{config.net.motion_frames} frames of motion + {config.net.music_frames} of music",
-        )
+        music = MODALITIES["audio"].example(batch, frames, inputs.audio.dim)
+        note = f"{config.net.motion_frames} frames of motion + {config.net.music_frames} of music"
+        return Example(motion_example(batch, frames, width, conditions={"audio": music}), note)
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return FactGenerator(self.load(stage, given, device), given["stats"].layout, stage.config.part, given)

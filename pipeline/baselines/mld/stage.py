@@ -28,10 +28,11 @@ from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     CaptionStage,
     CaptionStageConfig,
-    clip_batches,
+    clips_of,
     part_columns,
     part_statistics,
 )
+from motionloom.pipeline.stages.networks.clips import clip_batches, motion_example
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.weights import ModelFacts, Release
 from motionloom.pipeline.training.config import TrainConfig
@@ -108,16 +109,14 @@ class MotionVaeStage(TrainedStage[MotionVaeStageConfig, MotionVaeInputs, MotionV
     def batches(
         self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs, seed: int, log: Log
     ) -> Batches:
-        return clip_batches(config, inputs.data, inputs.stats, seed)
+        clips = clips_of(config, inputs.data.layout, None)
+        return clip_batches(inputs.data, inputs.stats, {}, seed, clips=clips)
 
     def example(
         self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs, batch: int
     ) -> Example:
-        frames = config.max_frames
-        return Example(
-            {"motion": torch.empty(batch, frames, net.motion_dim), "length": torch.full((batch,), frames)},
-            f"{net.config.latent_tokens} latents of {net.config.dim} a motion",
-        )
+        note = f"{net.config.latent_tokens} latents of {net.config.dim} a motion"
+        return Example(motion_example(batch, config.max_frames, net.motion_dim), note)
 
     def loaded(self, net: MotionVae, facts: ModelFacts, inputs: MotionVaeInputs) -> LoadedMotionVae:
         return LoadedMotionVae(net, facts.layout.layout(), facts.fact("max_frames", int))

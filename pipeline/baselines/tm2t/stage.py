@@ -27,7 +27,7 @@ from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import CAPTIONER, GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.networks.tokens import Tokens
+from motionloom.pipeline.stages.networks.tokens import Tokens, token_batches, token_example
 from motionloom.pipeline.store.data import Data, DataPreview, captions_of
 from motionloom.pipeline.store.networks import TrainedTokenizer, require_streams, stream_facts
 from motionloom.pipeline.store.text import TextSource
@@ -55,49 +55,6 @@ class CaptionerStageConfig(TrainedStageConfig):
     """Captions about fewer frames are left out where the clip has a longer one."""
     beam: int = Field(4, ge=1)
     """Unfinished sentences that the search keeps; as many as sentences are asked for, at least."""
-
-
-@dataclass(frozen=True)
-class _TokenSource:
-    """Tokens of captioned clips, and with each caption its row of a table."""
-
-    data: Data
-    tokens: Tokens
-    tokenizer: TrainedTokenizer
-    net: Captioner | Seq2Seq
-    min_frames: int
-    seed: int
-    table: Callable[[GptClips], Tensor]
-    """One row for each caption of a split, [m, E]."""
-
-    def training(self, batch: int, rank: int, world: int) -> TokenBatches:
-        return self.batches("train", batch, rank, world)
-
-    def validation(self) -> TokenBatches:
-        return self.batches(self.data.held_out().split, 32)
-
-    def batches(self, split: str, batch: int, rank: int = 0, world: int = 1) -> TokenBatches:
-        clips, net = self.clips(split), self.net
-        return TokenBatches(
-            clips.store,
-            clips.captions,
-            self.table(clips),
-            torch.zeros(len(clips.texts), 0),  # nothing here asks which captions are alike
-            net.pattern,
-            net.num_codes,
-            net.max_groups,
-            batch,
-            self.seed,
-            rank,
-            world,
-            split == "train",
-            clips.sources,
-            present=clips.present,
-        )
-
-    def clips(self, split: str) -> GptClips:
-        dataset, store = self.data.split(split), self.tokens.open(split)
-        return gpt_clips(dataset, store, self.tokenizer.net, face=False, min_frames=self.min_frames)
 
 
 class CaptionerInputs(Inputs):
@@ -150,25 +107,19 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
         if len(vocabulary.words) == config.vocabulary:
             log(f"the {config.vocabulary} most frequent words of the training captions are kept")
 
-        def words(clips: GptClips) -> Tensor:
-            return vocabulary.encode(clips.texts, net.config.max_words)
+        def words(clips: GptClips) -> dict[str, Tensor]:
+            return _unlike(clips, vocabulary.encode(clips.texts, net.config.max_words))
 
-        data, tokens = inputs.data, inputs.tokens
-        source = _TokenSource(data, tokens, inputs.tokenizer, net, config.min_frames, seed, words)
-        return Batches(source.training, source.validation)
+        return token_batches(net, _clips(config, inputs), inputs.data.held_out().split, seed, words)
 
     def example(
         self, config: CaptionerStageConfig, net: Captioner, inputs: CaptionerInputs, batch: int
     ) -> Example:
-        groups, words = net.max_groups, config.net.max_words + 1
-        order = torch.tensor([net.names.index(name) for name in (net.pattern * groups + net.names)])
-        tensors = {
-            "tokens": torch.zeros(batch, len(order), dtype=torch.int64),
-            "kinds": order.expand(batch, -1),
-            "text": torch.ones(batch, words, dtype=torch.int64),
-        }
-        frames = groups * inputs.tokenizer.net.group_frames
-        return Example(tensors, f"{len(order)} tokens for {frames} frames, {words - 1} words")
+        longest = config.net.max_words
+        words = torch.ones(batch, longest + 1, dtype=torch.int64)
+        tensors, frames = token_example(net, batch), net.max_groups * inputs.tokenizer.net.group_frames
+        count = tensors["tokens"].shape[1]
+        return Example(tensors | {"text": words}, f"{count} tokens for {frames} frames, {longest} words")
 
     def captioner(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionCaptioner:
         loaded: TokenCaptioner = self.load(stage, given, device)
@@ -268,45 +219,49 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
     ) -> Batches:
         judge, text = _captioner(config, net, inputs), inputs.text.cache
 
-        def numbers(clips: GptClips) -> Tensor:
-            return torch.arange(len(clips.texts))[:, None]
+        def numbers(clips: GptClips) -> dict[str, Tensor]:
+            return _unlike(clips, torch.arange(len(clips.texts))[:, None])
 
-        source = _TokenSource(
-            inputs.data, inputs.tokens, inputs.tokenizer, net, config.min_frames, seed, numbers
-        )
-
-        def worded(split: str, batches: TokenBatches) -> _WordBatches:
-            texts, said = source.clips(split).texts, None
+        def worded(clips: GptClips, batches: TokenBatches) -> _WordBatches:
+            said = None
             if judge is not None:
-                said = judge.vocabulary.encode(texts, judge.net.config.max_words)
-            return _WordBatches(batches, texts, text, said)
+                said = judge.vocabulary.encode(clips.texts, judge.net.config.max_words)
+            return _WordBatches(batches, clips.texts, text, said)
 
         held_out = inputs.data.held_out().split
-        return Batches(
-            lambda batch, rank, world: worded("train", source.training(batch, rank, world)),
-            lambda: worded(held_out, source.validation()),
-        )
+        return token_batches(net, _clips(config, inputs), held_out, seed, numbers, worded)
 
     def example(self, config: Seq2SeqStageConfig, net: Seq2Seq, inputs: Seq2SeqInputs, batch: int) -> Example:
-        order = torch.tensor([net.names.index(name) for name in (net.pattern * net.max_groups + net.names)])
         words = MODALITIES["text"].example(batch, 0, inputs.text.dim)
         judge = _captioner(config, net, inputs)
-        tensors = {
-            "tokens": torch.zeros(batch, len(order), dtype=torch.int64),
-            "kinds": order.expand(batch, -1),
-            "words": words.features,
-            "mask": words.mask,
-        }
+        tensors = token_example(net, batch) | {"words": words.features, "mask": words.mask}
         if judge is not None:
             tensors["said"] = torch.ones(batch, judge.net.config.max_words + 1, dtype=torch.int64)
         frames = net.max_groups * inputs.tokenizer.net.group_frames
-        return Example(tensors, f"{len(order)} tokens for {frames} frames")
+        return Example(tensors, f"{tensors['tokens'].shape[1]} tokens for {frames} frames")
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return Seq2SeqGenerator(self.load(stage, given, device), given)
 
     def exported(self, config: Seq2SeqStageConfig) -> tuple[str, ...]:
         return ("tokenizer", "text")
+
+
+def _clips(
+    config: CaptionerStageConfig | Seq2SeqStageConfig, inputs: CaptionerInputs | Seq2SeqInputs
+) -> Callable[[str], GptClips]:
+    """Return what opens the captioned clips of a split with their tokens."""
+
+    def clips_of(split: str) -> GptClips:
+        dataset, store = inputs.data.split(split), inputs.tokens.open(split)
+        return gpt_clips(dataset, store, inputs.tokenizer.net, face=False, min_frames=config.min_frames)
+
+    return clips_of
+
+
+def _unlike(clips: GptClips, prior: Tensor) -> dict[str, Tensor]:
+    """Tables of batches in which nothing asks which captions are alike."""
+    return {"prior": prior, "similarity": torch.zeros(len(clips.texts), 0)}
 
 
 def _captioner(config: Seq2SeqStageConfig, net: Seq2Seq, inputs: Seq2SeqInputs) -> TokenCaptioner | None:

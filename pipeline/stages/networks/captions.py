@@ -9,9 +9,8 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 from torch import nn
-from torch.utils.data import Dataset
 
-from motionloom.datasets.loading.condition_batches import Captioned, ConditionBatches, EvalBatches
+from motionloom.datasets.loading.condition_batches import Captioned
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
@@ -21,6 +20,7 @@ from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs
 from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
+from motionloom.pipeline.stages.networks.clips import clip_batches, motion_example
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import ModelFacts, load_facts
@@ -57,19 +57,15 @@ class CaptionStage(TrainedStage[C, I, N]):
 
     def batches(self, config: C, net: N, inputs: I, seed: int, log: Log) -> Batches:
         captioned: Captioned = "face" if config.part == "face" else "body"
-        return clip_batches(config, inputs.data, inputs.stats, seed, inputs.text, captioned)
+        clips = clips_of(config, inputs.data.layout, captioned)
+        return clip_batches(inputs.data, inputs.stats, {"text": inputs.text.cache}, seed, clips=clips)
 
     def example(self, config: C, net: N, inputs: I, batch: int) -> Example:
         frames, width = config.max_frames, inputs.text.dim
         dim = len(part_columns(inputs.data.layout, config.part))
-        return Example(
-            {
-                "motion": torch.empty(batch, frames, dim),
-                "length": torch.full((batch,), frames),
-                "conditions": {"text": MODALITIES["text"].example(batch, frames, width)},
-                "similarity": torch.empty(batch, width),
-            }
-        )
+        conditions = {"text": MODALITIES["text"].example(batch, frames, width)}
+        similarity = torch.empty(batch, width)
+        return Example(motion_example(batch, frames, dim, conditions=conditions, similarity=similarity))
 
     def exported(self, config: C) -> tuple[str, ...]:
         return ("stats", "text")
@@ -105,33 +101,14 @@ class DenoiserStage(CaptionStage[D, CaptionInputs, T]):
         return DiffusionMotion(given["stats"].layout, part, given, net, window)
 
 
-def clip_batches(
-    config: CaptionStageConfig,
-    data: Data,
-    stats: FeatureStats,
-    seed: int,
-    text: TextSource | None = None,
-    captioned: Captioned | None = None,
-) -> Batches:
-    """Whole clips, those with captions or, without `text`, all."""
-    readers = {} if text is None else {"text": text.cache}
-    dataset = data.split("train", training=True)
-    clips: dict[str, Any] = {
+def clips_of(config: CaptionStageConfig, layout: MotionLayout, captioned: Captioned | None) -> dict[str, Any]:
+    """Return lengths, columns and kind of captions, as `clip_batches` takes them."""
+    return {
         "max_frames": config.max_frames,
         "min_frames": config.min_frames,
-        "columns": part_columns(dataset.layout, config.part),
+        "columns": part_columns(layout, config.part),
         "captioned": captioned,
     }
-
-    def train(batch: int, rank: int, world: int) -> Dataset[object]:
-        return ConditionBatches(
-            dataset, stats, readers, batch_size=batch, seed=seed, rank=rank, world=world, **clips
-        )
-
-    def validation() -> Dataset[object]:
-        return EvalBatches(data.held_out(), stats, readers, batch_size=32, **clips)
-
-    return Batches(train, validation)
 
 
 def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:

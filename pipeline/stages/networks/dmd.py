@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
 from pydantic import Field
 
 from motionloom.datasets.schema import UserError
@@ -13,6 +12,7 @@ from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import register
+from motionloom.pipeline.stages.networks.clips import motion_example
 from motionloom.pipeline.stages.networks.tokenizer import WindowInputs, WindowStageConfig, window_batches
 from motionloom.pipeline.store.networks import LoadedDmd, TrainedTokenizer, require_streams, stream_facts
 from motionloom.pipeline.store.weights import ModelFacts
@@ -80,12 +80,7 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
         )
 
     def example(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, batch: int) -> Example:
-        return Example(
-            {
-                "motion": torch.empty(batch, config.window, net.motion_dim),
-                "length": torch.full((batch,), config.window),
-            }
-        )
+        return Example(motion_example(batch, config.window, net.motion_dim))
 
     def loaded(self, net: Dmd, facts: ModelFacts, inputs: DmdInputs) -> LoadedDmd:
         return LoadedDmd(net, facts.fact("window", int), inputs)

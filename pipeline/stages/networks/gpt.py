@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 from pydantic import Field
-from torch.utils.data import Dataset
+from torch import Tensor
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.losses import GptLossConfig
@@ -19,7 +19,7 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, Stage, filled_by, register
 from motionloom.pipeline.inference.generators.gpt import GptGenerator
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.stages.networks.tokens import Tokens
+from motionloom.pipeline.stages.networks.tokens import Tokens, token_batches, token_example
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import (
     LoadedGpt,
@@ -30,7 +30,7 @@ from motionloom.pipeline.store.networks import (
 )
 from motionloom.pipeline.store.run_folder import is_place
 from motionloom.pipeline.store.text import TextSource
-from motionloom.pipeline.store.tokens import GptClips, TokenBatches, gpt_clips
+from motionloom.pipeline.store.tokens import GptClips, gpt_clips
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
@@ -170,39 +170,17 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
                 log(f"{split}: {clips.uncaptioned} clips without a {kind} are left out")
             return clips
 
-        def batches(split: str, batch: int, rank: int = 0, world: int = 1, *, training: bool) -> TokenBatches:
-            clips = clips_of(split)
+        def tables(clips: GptClips) -> dict[str, Tensor | None]:
             # All captions are embedded once, before the first batch.
             latents = tma.embed_captions(clips.texts, text) if tma is not None else None
             if config.prior == "tma" and latents is not None:
-                prior = latents
+                prior, latents = latents, None
             else:
                 prior = torch.as_tensor(text.sentence(clips.texts))
-            return TokenBatches(
-                clips.store,
-                clips.captions,
-                prior,
-                torch.as_tensor(text.similarity(clips.texts)),
-                net.pattern,
-                net.num_codes,
-                net.max_groups,
-                batch,
-                seed,
-                rank,
-                world,
-                training,
-                clips.sources,
-                latents=latents if config.aligned and config.prior != "tma" else None,
-                present=clips.present,
-            )
+            similarity = torch.as_tensor(text.similarity(clips.texts))
+            return {"prior": prior, "similarity": similarity, "latents": latents}
 
-        def train(batch: int, rank: int, world: int) -> Dataset[object]:
-            return batches("train", batch, rank, world, training=True)
-
-        def validation() -> Dataset[object]:
-            return batches(data.held_out().split, 32, training=False)
-
-        return Batches(train, validation)
+        return token_batches(net, clips_of, data.held_out().split, seed, tables)
 
     def dry_module(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs) -> GptModule:
         """Without the judge of sampled motions, which keeps nothing for the backward pass, and without
@@ -218,14 +196,10 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         if config.aligned_on_samples:
             batch *= 1 + config.loss.samples
         tokenizer, groups, ends = inputs.tokenizer.net, net.max_groups, len(net.names)
-        length = groups * len(net.pattern) + ends
-        order = torch.tensor([net.names.index(name) for name in (net.pattern * groups + net.names)])
-        tensors = {
-            "tokens": torch.zeros(batch, length, dtype=torch.int64),
-            "kinds": order.expand(batch, -1),
-            "text": torch.empty(batch, net.text_dim),
-            "similarity": torch.empty(batch, inputs.text.dim),
-        }
+        tensors = token_example(net, batch)
+        length = tensors["tokens"].shape[1]
+        tensors["text"] = torch.empty(batch, net.text_dim)
+        tensors["similarity"] = torch.empty(batch, inputs.text.dim)
         if config.aligned and inputs.tma is not None:
             tensors["tma_text"] = torch.empty(batch, inputs.tma.net.config.latent)
         parts = " + ".join(f"{groups * s.per_group} {s.name}" for s in tokenizer.streams)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydantic import Field
 from torch.utils.data import Dataset
@@ -21,6 +20,7 @@ from motionloom.models.tokenizer.single import FsqConfig, MqConfig, RvqConfig, V
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Inputs, Stage, filled_by, register
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.stages.networks.clips import motion_example
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import TrainedTokenizer
 from motionloom.pipeline.store.weights import ModelFacts
@@ -174,13 +174,8 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
         self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, batch: int
     ) -> Example:
         per_group = " + ".join(f"{s.per_group} {s.name}" for s in net.streams)
-        return Example(
-            {
-                "motion": torch.empty(batch, config.window, net.dim),
-                "length": torch.full((batch,), config.window),
-            },
-            f"{per_group} per {GROUP_FRAMES} frames, {net.bits_per_second:.0f} bit/s",
-        )
+        note = f"{per_group} per {GROUP_FRAMES} frames, {net.bits_per_second:.0f} bit/s"
+        return Example(motion_example(batch, config.window, net.dim), note)
 
     def loaded(self, net: Tokenizer, facts: ModelFacts, inputs: TokenizerInputs) -> TrainedTokenizer:
         return TrainedTokenizer(net.freeze(), inputs)

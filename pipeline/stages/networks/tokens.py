@@ -1,15 +1,19 @@
-"""Token export: every clip of every split through the trained tokenizer, once."""
+"""Token export: every clip of every split through the trained tokenizer, once; batches of these tokens."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field
+from torch import Tensor
+from torch.utils.data import Dataset
 
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.loading.statistics import FeatureStats
@@ -27,7 +31,8 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.contract.units import Arrays
 from motionloom.pipeline.store.networks import device_of
-from motionloom.pipeline.store.tokens import TokenStore
+from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore
+from motionloom.pipeline.training.trained_stage import Batches
 
 
 class TokensConfig(StageConfig):
@@ -160,6 +165,53 @@ def encode_split(
     """Codes of all clips in order, in this process."""
     encoded = EncodedSplit(tokenizer, dataset, stats, batch_frames)
     return encoded.store(encoded.codes(batch) for batch in range(len(encoded.batches)))
+
+
+class OverTokens(Protocol):
+    """A network over interleaved codes."""
+
+    names: tuple[str, ...]
+    pattern: tuple[str, ...]
+    num_codes: dict[str, int]
+
+    @property
+    def max_groups(self) -> int: ...
+
+
+def token_batches(
+    net: OverTokens,
+    clips_of: Callable[[str], GptClips],
+    held_out: str,
+    seed: int,
+    tables: Callable[[GptClips], dict[str, Any]],
+    wrap: Callable[[GptClips, TokenBatches], Dataset[Any]] = lambda _, batches: batches,
+) -> Batches:
+    """Batches of the tokens of captioned clips.
+
+    Args:
+        clips_of: The clips of a split.
+        held_out: The split of validation.
+        tables: What captions are read as: `prior`, `similarity` and `latents` of `TokenBatches`.
+        wrap: Makes other batches of these.
+    """
+
+    def batches(split: str, training: bool, batch: int, rank: int = 0, world: int = 1) -> Dataset[Any]:
+        clips = clips_of(split)
+        found = TokenBatches(
+            clips.store, clips.captions, pattern=net.pattern, ends=net.num_codes, max_groups=net.max_groups,
+            batch_size=batch, seed=seed, rank=rank, world=world, training=training, sources=clips.sources,
+            present=clips.present, **tables(clips),
+        )  # fmt: skip
+        return wrap(clips, found)
+
+    return Batches(partial(batches, "train", True), partial(batches, held_out, False, 32))
+
+
+def token_example(net: OverTokens, batch: int) -> dict[str, Tensor]:
+    """Return the longest sequences of a network, closed: tokens without meaning and their kinds."""
+    order = torch.tensor([net.names.index(name) for name in (net.pattern * net.max_groups + net.names)])
+    tokens = torch.zeros(batch, len(order), dtype=torch.int64)
+    return {"tokens": tokens, "kinds": order.expand(batch, -1)}
 
 
 def padded(

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from pydantic import Field, field_validator
-from torch.utils.data import Dataset
 
-from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
 from motionloom.datasets.loading.kinds import Balance, Drop
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
@@ -21,6 +19,7 @@ from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.network import ConditionedUtt, UttConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Every, Inputs, Role, Stage, register
+from motionloom.pipeline.stages.networks.clips import clip_batches, motion_example
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import LoadedUtt, TrainedTokenizer, require_streams, stream_facts
 from motionloom.pipeline.store.weights import ModelFacts
@@ -142,32 +141,13 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
     def batches(
         self, config: UttStageConfig, net: ConditionedUtt, inputs: UttInputs, seed: int, log: Log
     ) -> Batches:
-        data, stats = inputs.data, inputs.stats
         readers = {name: MODALITIES[name].reader(inputs[name]) for name in config.modalities}
-        columns = inputs.tokenizer.columns
-        dataset = data.split("train")
         frames: dict[str, Any] = {"max_frames": config.max_frames, "min_frames": config.min_frames}
-
-        def train(batch: int, rank: int, world: int) -> Dataset[object]:
-            return ConditionBatches(
-                dataset,
-                stats,
-                readers,
-                batch_size=batch,
-                balance=config.balance,
-                drop=config.drop,
-                homogeneous=config.homogeneous,
-                seed=seed,
-                rank=rank,
-                world=world,
-                columns=columns,
-                **frames,
-            )
-
-        def validation() -> Dataset[object]:
-            return EvalBatches(data.held_out(), stats, readers, batch_size=32, columns=columns, **frames)
-
-        return Batches(train, validation)
+        return clip_batches(
+            inputs.data, inputs.stats, readers, seed, clips={"columns": inputs.tokenizer.columns, **frames},
+            dataset=inputs.data.split("train"), balance=config.balance, drop=config.drop,
+            homogeneous=config.homogeneous,
+        )  # fmt: skip
 
     def example(self, config: UttStageConfig, net: ConditionedUtt, inputs: UttInputs, batch: int) -> Example:
         tokenizer = inputs.tokenizer.net
@@ -177,15 +157,11 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
             for name in config.modalities
         }
         parts = " + ".join(f"{groups * s.per_group} {s.name}" for s in tokenizer.streams)
-        return Example(
-            {
-                "motion": torch.empty(batch, config.max_frames, tokenizer.dim),
-                "length": torch.full((batch,), config.max_frames),
-                "closed": torch.ones(batch, dtype=torch.bool),
-                "conditions": conditions,
-            },
-            f"{parts} + {len(net.utt.names)} End for {config.max_frames} frames",
+        closed = torch.ones(batch, dtype=torch.bool)
+        example = motion_example(
+            batch, config.max_frames, tokenizer.dim, closed=closed, conditions=conditions
         )
+        return Example(example, f"{parts} + {len(net.utt.names)} End for {config.max_frames} frames")
 
     def loaded(self, net: ConditionedUtt, facts: ModelFacts, inputs: UttInputs) -> LoadedUtt:
         return LoadedUtt(net, facts.fact("max_frames", int), inputs)

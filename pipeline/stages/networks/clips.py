@@ -1,18 +1,18 @@
-"""Windows of clips with music, clips to begin with, and the music of a request."""
+"""Batches of clips with their conditions, dances to begin with, and the music of a request."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import Crops
 from motionloom.datasets.loading.statistics import FeatureStats
-from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
@@ -20,38 +20,53 @@ from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.training.trained_stage import Batches
 
+if TYPE_CHECKING:
+    from motionloom.models.training.stage_module import Batch
 
-def dance_batches(
+
+MUSIC = {"audio": 1.0}
+"""Balance of trainings on dances: clips with music alone."""
+
+
+def clip_batches(
     data: Data,
-    read: Callable[[ClipDataset], FeatureStats | Crops],
-    audio: FrameStats | None,
+    read: FeatureStats | Callable[[ClipDataset], Crops],
+    readers: Mapping[str, object],
     seed: int,
     *,
-    frames: Mapping[str, Any],
-    test_songs: bool = False,
+    clips: Mapping[str, Any],
+    dataset: ClipDataset | None = None,
+    **draws: Any,
 ) -> Batches:
-    """Windows of dances with their music, or without `audio` of any clips.
+    """Batches of windows or whole clips, and of held-out ones in order.
 
     Args:
-        read: What normalises or reads the motion of a data set.
-        frames: Lengths and columns, as `ConditionBatches` takes them.
-        test_songs: Train on the test split.
+        read: What normalises the motion of a data set, or makes the reader of it.
+        readers: What reads the conditions, by modality.
+        clips: Lengths, columns and kind of captions, as `ConditionBatches` takes them.
+        dataset: Trained on in place of the training split.
+        draws: How clips are drawn in training alone.
     """
-    readers = {} if audio is None else {"audio": audio}
-    balance = {"audio": 1.0} if readers else None
-    dataset = data.held_out(prefer="test") if test_songs else data.split("train", training=True)
+    dataset = data.split("train", training=True) if dataset is None else dataset
+
+    def of(some: ClipDataset) -> FeatureStats | Crops:
+        return read(some) if callable(read) else read
 
     def train(batch: int, rank: int, world: int) -> Dataset[object]:
-        return ConditionBatches(
-            dataset, read(dataset), readers, batch_size=batch, balance=balance, seed=seed, rank=rank,
-            world=world, **frames,
-        )  # fmt: skip
+        at: dict[str, Any] = {"batch_size": batch, "rank": rank, "world": world}
+        return ConditionBatches(dataset, of(dataset), readers, seed=seed, **at, **clips, **draws)
 
     def validation() -> Dataset[object]:
         held_out = data.held_out()
-        return EvalBatches(held_out, read(held_out), readers, batch_size=32, **frames)
+        return EvalBatches(held_out, of(held_out), readers, batch_size=32, **clips)
 
     return Batches(train, validation)
+
+
+def motion_example(batch: int, frames: int, columns: int, **more: object) -> Batch:
+    """Return a batch of motion of the largest shape, [B, T, D] without numbers, and `more`."""
+    motion = torch.empty(batch, frames, columns)
+    return {"motion": motion, "length": torch.full((batch,), frames), **more}
 
 
 def spread_dances(dataset: ClipDataset, count: int, least: int) -> list[int]:
