@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.actions.hands import Array
+from motionloom.datasets.motion.canonical import runs
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 
@@ -66,12 +67,6 @@ class Signals:
     def longest(self, mask: NDArray[np.bool_]) -> float:
         """Longest time a condition [T] holds without a break, seconds."""
         return max((b - a for a, b in runs(mask)), default=0) / self.fps
-
-
-def runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Start and end (exclusive) of each run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def signals_of(joints: NDArray[np.floating], fps: float) -> Signals:

@@ -166,6 +166,12 @@ def _source_frames(
     return left, np.clip(at - left, 0.0, 1.0)
 
 
+def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the start and the end (exclusive) of each run of true of flags [T]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+
+
 def retarget(
     joints: NDArray[np.floating], skeleton: Skeleton, offsets: NDArray[np.floating] | None = None
 ) -> NDArray[np.float64]:

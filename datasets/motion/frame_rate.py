@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.canonical import runs
 from motionloom.datasets.motion.skeleton import Skeleton
 
 GRAVITY = 9.81
@@ -72,7 +73,7 @@ def _falls(joints: Floats, fps: float) -> list[float]:
     feet = feet - np.percentile(feet, 5)
     height = joints[:, : len(_WEIGHTS), 1] @ _WEIGHTS
     accelerations = []
-    for first, end in _runs(feet > 0.04):
+    for first, end in runs(feet > 0.04):
         seconds = (end - first) / fps
         if first == 0 or end == len(feet) or end - first < 5 or not 0.08 < seconds < 1.3:
             continue
@@ -91,14 +92,8 @@ def _swings(joints: Floats, fps: float) -> list[float]:
     for ankle in _ANKLES:
         path = joints[:, ankle][:, [0, 2]]
         speed = np.linalg.norm(np.diff(path, axis=0), axis=-1) * fps
-        for first, end in _runs(speed > 0.25 * np.percentile(speed, 99)) if len(speed) else ():
+        for first, end in runs(speed > 0.25 * np.percentile(speed, 99)) if len(speed) else ():
             stride = float(np.linalg.norm(path[end] - path[first]))
             if first > 0 and end < len(speed) and _STRIDE_METRES[0] < stride < _STRIDE_METRES[1]:
                 seconds.append((end - first) / fps)
     return seconds
-
-
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return first index and end of every run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

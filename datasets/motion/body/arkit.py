@@ -39,8 +39,6 @@ ARKIT: tuple[str, ...] = tuple(
 
 _RIDGE = 1e-6
 """Ridge, as a share of the mean squared shape: far below what any vertex shows."""
-_SWEEPS = 2000
-_STILL = 1e-7
 _BASIS_BYTES = 2**29
 
 
@@ -89,28 +87,13 @@ class ArkitBases:
 
 
 def bounded_least_squares(gram: Floats, wanted: Floats) -> Floats:
-    """The w in 0..1 with the least `w' G w / 2 - b' w`, for each row b of `wanted` [T, M]; gram G is [M, M].
+    """Return the w in 0..1 with the least `w' G w / 2 - b' w`, for each row b of `wanted` [T, M]."""
+    from scipy.optimize import lsq_linear
 
-    Coordinate descent over all rows at once: the problem is convex and the bounds are each coordinate's own,
-    so it ends at the minimum.
-    """
     count = len(gram)
-    firm = gram + max(_RIDGE * float(np.trace(gram)) / count, 1e-300) * np.eye(count)
-    out = np.zeros(wanted.shape)
-    slope = -wanted.astype(np.float64).copy()  # G w - b, kept up to date
-    for _ in range(_SWEEPS):
-        most = 0.0
-        for column in range(count):
-            new = np.clip(out[:, column] - slope[:, column] / firm[column, column], 0.0, 1.0)
-            step = new - out[:, column]
-            largest = float(np.abs(step).max(initial=0.0))
-            if largest:
-                slope += step[:, None] * firm[column]
-                out[:, column] = new
-                most = max(most, largest)
-        if most < _STILL:
-            break
-    return out
+    root = np.linalg.cholesky(gram + max(_RIDGE * float(np.trace(gram)) / count, 1e-300) * np.eye(count))
+    aims = np.linalg.solve(root, wanted.T).T
+    return np.array([lsq_linear(root.T, aim, (0, 1), method="bvls").x for aim in aims])
 
 
 def write_arkit_csv(path: Path, weights: NDArray[np.floating], fps: float) -> None:

@@ -18,6 +18,7 @@ from pydantic import Field
 
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.rigid import FitError, RigidMotion
+from motionloom.datasets.motion.canonical import runs
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config
@@ -150,12 +151,12 @@ def _slide(balls: NDArray[np.float64], contacts: NDArray[np.bool_], fps: float) 
 def _correction(ball: NDArray[np.float64], standing: NDArray[np.bool_], blend: int) -> NDArray[np.float64]:
     """Displacement [T, 3] along the floor that keeps a ball of the foot [T, 3] still while it stands."""
     out = np.zeros_like(ball)
-    runs = _runs(standing)
-    for start, end in runs:
+    stands = runs(standing)
+    for start, end in stands:
         anchor = np.median(ball[start:end], axis=0)
         out[start:end, [0, 2]] = (anchor - ball[start:end])[:, [0, 2]]
     frames = np.arange(len(ball))
-    ends = [0, *(edge for run in runs for edge in run), len(ball)]
+    ends = [0, *(edge for run in stands for edge in run), len(ball)]
     for free_start, free_end in zip(ends[::2], ends[1::2], strict=True):
         free = frames[free_start:free_end]
         if not len(free):
@@ -175,16 +176,10 @@ def _fade(way: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(1 - x * x * (3 - 2 * x), dtype=np.float64)
 
 
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Start and end of every run of true."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
 def _without_short_runs(flags: NDArray[np.bool_], shortest: int, *, gaps: bool) -> NDArray[np.bool_]:
     """Runs of true shorter than `shortest` frames removed; with `gaps` those of false between two of true."""
     out = flags.copy()
-    for start, end in _runs(~flags if gaps else flags):
+    for start, end in runs(~flags if gaps else flags):
         inside = start > 0 and end < len(flags)
         if end - start < shortest and (inside or not gaps):
             out[start:end] = gaps

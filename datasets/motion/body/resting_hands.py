@@ -50,9 +50,9 @@ def with_resting_hands(joints: NDArray[np.floating]) -> NDArray[np.float64]:
     out = np.empty((frames, len(_WHOLE), 3))
     out[:, : len(_BODY)] = body
     left = relaxed_fingers()
-    for side, fingers in (("left", left), ("right", left * _MIRROR)):
+    for side, fingers, first in (("left", left, 22), ("right", left * _MIRROR, 22 + _FINGERS)):
         wrist, elbow = _WHOLE.index(f"{side}_wrist"), _WHOLE.index(f"{side}_elbow")
-        own = _hand_joints(wrist)
+        own = list(range(first, first + _FINGERS))
         place = {wrist: 0} | {joint: number for number, joint in enumerate(own, start=1)}
         parents = [-1, *(place[_WHOLE.parents[joint]] for joint in own)]
         bone = float(np.median(np.linalg.norm(body[:, wrist] - body[:, elbow], axis=-1)))
@@ -61,13 +61,4 @@ def with_resting_hands(joints: NDArray[np.floating]) -> NDArray[np.float64]:
         local[:, 0], local[:, 1:] = world[:, wrist], fingers
         offsets = np.concatenate([np.zeros((1, 3)), _WHOLE.offsets[own] * size])
         out[:, own] = forward_kinematics(local, body[:, wrist], offsets, parents)[0][:, 1:]
-    return out
-
-
-def _hand_joints(wrist: int) -> list[int]:
-    """The finger joints below a wrist, in order."""
-    out: list[int] = []
-    for joint, parent in enumerate(_WHOLE.parents):
-        if parent == wrist or parent in out:
-            out.append(joint)
     return out

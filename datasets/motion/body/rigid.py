@@ -82,24 +82,20 @@ class RigidMotion:
 
 
 def fit_rigid(
-    joints: NDArray[np.floating],
-    skeleton: Skeleton,
-    *,
-    rotations: NDArray[np.floating] | None = None,
-    symmetric: bool = False,
+    joints: NDArray[np.floating], skeleton: Skeleton, *, rotations: NDArray[np.floating] | None = None
 ) -> RigidMotion:
     """The rigid motion nearest to joints [T, N, 3] in metres.
 
-    `skeleton` names the joints and gives the rest directions. With `symmetric`, left and right bones have one
-    length. `rotations` [T, N, 3, 3] are local rotations where they are known: the search starts there.
+    `skeleton` names the joints and gives the rest directions. `rotations` [T, N, 3, 3] are local rotations
+    where they are known: the search starts there.
     """
     _check(joints, skeleton, rotations)
     points = np.asarray(joints, dtype=np.float64)
     if rotations is None:
-        own = measured_skeleton(points, skeleton, symmetric=symmetric)
+        own = measured_skeleton(points, skeleton)
         start = joints_to_rotations(points, own)
     else:
-        own = _lengths_only(points, skeleton, symmetric)
+        own = skeleton.with_lengths_of(points)
         start = np.asarray(rotations, dtype=np.float64)
     turned, root = solve_poses(points, own.offsets, own.parents, start, points[:, 0])
     if rotations is None:
@@ -107,16 +103,14 @@ def fit_rigid(
     return RigidMotion.posed(own, turned, root, points)
 
 
-def measured_skeleton(
-    joints: NDArray[np.floating], skeleton: Skeleton, *, symmetric: bool = False
-) -> Skeleton:
+def measured_skeleton(joints: NDArray[np.floating], skeleton: Skeleton) -> Skeleton:
     """The skeleton with the bones of a motion [T, N, 3]: median lengths, and its own pelvis, chest and palms.
 
     Bones of joints with one child keep the rest pose's direction, so that the rest stays a T-pose.
     """
     points = np.asarray(joints, dtype=np.float64)
     parents = np.asarray(skeleton.parents)
-    own = _lengths_only(points, skeleton, symmetric)
+    own = skeleton.with_lengths_of(points)
     # Medians settle long before that; motions of many minutes would take as long again as their poses.
     points = points[:: max(1, len(points) // _MEASURED)]
     lengths = np.linalg.norm(own.offsets, axis=-1, keepdims=True)
@@ -136,8 +130,6 @@ def measured_skeleton(
             offsets[ends] = _turned_back(middle, skeleton.offsets[ends])
         size = np.linalg.norm(offsets, axis=-1, keepdims=True)
         offsets *= lengths / np.where(size > _NO_BONE, size, 1.0)
-        if symmetric:
-            offsets = (offsets + offsets[skeleton.mirror] * [-1, 1, 1]) / 2
         own = with_offsets(skeleton, offsets)
     return own
 
@@ -195,15 +187,6 @@ def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
 def with_offsets(skeleton: Skeleton, offsets: NDArray[np.floating]) -> Skeleton:
     """The skeleton with other rest offsets [N, 3]."""
     return replace(skeleton, rest=tuple((float(x), float(y), float(z)) for x, y, z in offsets))
-
-
-def _lengths_only(points: Floats, skeleton: Skeleton, symmetric: bool) -> Skeleton:
-    own = skeleton.with_lengths_of(points)
-    if not symmetric:
-        return own
-    lengths = np.linalg.norm(own.offsets, axis=-1)
-    mean = (lengths + lengths[skeleton.mirror]) / 2
-    return with_offsets(own, own.offsets * (mean / np.where(lengths > _NO_BONE, lengths, 1.0))[:, None])
 
 
 def _turned_back(bones: Floats, rest: Floats) -> Floats:

@@ -20,18 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.motion.bvh.text import (
-    Floats,
-    find_motion,
-    load_text,
-    parse_hierarchy,
-    read_header,
-    read_values,
-)
+from motionloom.datasets.motion.bvh.text import Floats, find_motion, load_text, parse_hierarchy, read_values
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-
-__all__ = ["BvhMotion", "read_bvh", "read_header", "write_bvh"]
 
 WRITTEN_ORDER = "ZXY"
 """Rotation channels of written files: the usual order of motion-capture tools."""
@@ -94,9 +85,7 @@ class BvhMotion:
         list six channels on every joint and fill three.
         """
         out = np.repeat(self.offsets[None], self.frames, axis=0)
-        joints, axes, columns = (
-            np.array(one, dtype=int) for one in _channel_columns(self.channels).positions
-        )
+        joints, axes, columns = np.array(_channel_columns(self.channels)[0], dtype=int).reshape(-1, 3).T
         inner = np.array(self.parents)[joints] >= 0
         if inner.any() and not self.values[:, columns[inner]].any():
             joints, axes, columns = joints[~inner], axes[~inner], columns[~inner]
@@ -111,7 +100,7 @@ class BvhMotion:
         from scipy.spatial.transform import Rotation  # half a second, which reading a header need not take
 
         out = np.broadcast_to(np.eye(3), (len(wanted), self.frames, 3, 3)).copy()
-        turns = _channel_columns(self.channels).rotations
+        turns = _channel_columns(self.channels)[1]
         groups: dict[str, list[int]] = {}
         for row, joint in enumerate(wanted):
             if turns[joint][0]:
@@ -140,33 +129,27 @@ class BvhMotion:
         return np.ascontiguousarray(np.moveaxis(world, -1, 0))
 
 
-@dataclass(frozen=True)
-class _ChannelColumns:
-    """Places of each kind of channel in a row of values."""
-
-    positions: tuple[list[int], list[int], list[int]]
-    """Joints, axes and columns of all position channels."""
-    rotations: list[tuple[str, list[int]]]
-    """Per joint the order of its rotations (`ZXY`) and their columns."""
-
-
 @lru_cache(maxsize=8)
-def _channel_columns(channels: tuple[tuple[str, ...], ...]) -> _ChannelColumns:
-    """Kept, because the files of a collection mostly share their channels."""
-    joints, axes, columns = [], [], []
+def _channel_columns(
+    channels: tuple[tuple[str, ...], ...],
+) -> tuple[list[tuple[int, int, int]], list[tuple[str, list[int]]]]:
+    """Return joint, axis and column of each position channel, and for each joint the order of its rotations
+    (`ZXY`) and their columns. Kept, because the files of a collection mostly share their channels.
+    """
+    positions: list[tuple[int, int, int]] = []
     rotations: list[tuple[str, list[int]]] = []
-    start = 0
+    column = 0
     for joint, names in enumerate(channels):
-        rotations.append(("", []))
-        for column, name in enumerate(names, start=start):
+        order, columns = "", []
+        for name in names:
             if name.endswith("position"):
-                joints.append(joint)
-                axes.append("XYZ".index(name[0]))
-                columns.append(column)
+                positions.append((joint, "XYZ".index(name[0]), column))
             else:
-                rotations[-1] = (rotations[-1][0] + name[0], [*rotations[-1][1], column])
-        start += len(names)
-    return _ChannelColumns((joints, axes, columns), rotations)
+                order += name[0]
+                columns.append(column)
+            column += 1
+        rotations.append((order, columns))
+    return positions, rotations
 
 
 def read_bvh(source: Path | str | bytes, *, name: str | None = None) -> BvhMotion:

@@ -71,12 +71,6 @@ def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]
     return data.removeprefix(b"\xef\xbb\xbf"), where
 
 
-def read_header(source: Path | str | bytes, *, name: str | None = None) -> MotionSection:
-    """Frame count and frame rate of a clip; the hierarchy and the values are not checked."""
-    data, where = load_text(source, name)
-    return find_motion(data, where)
-
-
 def find_motion(data: bytes, where: str) -> MotionSection:
     """Locate the MOTION section and read its frame count and frame time."""
     if not data.strip():
@@ -178,13 +172,13 @@ def parse_hierarchy(text: bytes, where: str) -> Hierarchy:
     """Parse everything before MOTION. The files of a collection mostly share one hierarchy, so it is kept."""
     try:
         return _parse_hierarchy(text)
-    except UserError:
-        return _HierarchyParser(where).parse(text)  # fails again, with the name of the file
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
 
 
 @lru_cache(maxsize=8)
 def _parse_hierarchy(text: bytes) -> Hierarchy:
-    return _HierarchyParser("").parse(text)
+    return _HierarchyParser().parse(text)
 
 
 def require_all_frames(data: bytes, section: MotionSection, where: str) -> None:
@@ -198,8 +192,7 @@ def require_all_frames(data: bytes, section: MotionSection, where: str) -> None:
 
 
 class _HierarchyParser:
-    def __init__(self, where: str) -> None:
-        self.where = where
+    def __init__(self) -> None:
         self.line = 0
         self.out = Hierarchy()
         self.offsets: dict[int, list[float]] = {}
@@ -231,7 +224,7 @@ class _HierarchyParser:
         for joint, name in enumerate(self.out.names):
             if joint not in self.offsets or joint not in self.channels:
                 lacks = "CHANNELS" if joint in self.offsets else "OFFSET"
-                raise UserError(f"{self.where}: joint '{name}' has no {lacks} line")
+                raise UserError(f"joint '{name}' has no {lacks} line")
         self.out.offsets = [self.offsets[j] for j in range(len(self.out.names))]
         self.out.channels = [self.channels[j] for j in range(len(self.out.names))]
         return self.out
@@ -268,7 +261,7 @@ class _HierarchyParser:
             raise self._error(f"'{piece[:60]}' is not expected here")
 
     def _error(self, reason: str) -> UserError:
-        return UserError(f"{self.where}: line {self.line}: {reason}")
+        return UserError(f"line {self.line}: {reason}")
 
     def _decode(self, raw: bytes) -> str:
         try:
