@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import json
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
@@ -34,6 +35,13 @@ CLEANED_FILE = "cleaned.json"
 
 class UserError(Exception):
     """A mistake the user can fix. The command line prints the sentence alone, never a traceback."""
+
+
+def nearest(name: str, valid: Sequence[str], shown: Sequence[str] | None = None, what: str = "names") -> str:
+    """A hint to append: did you mean 'x'?, or the list of valid names, or else of those `shown`."""
+    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
+    names = valid if shown is None else shown
+    return f"; did you mean '{near[0]}'?" if near else f"; valid {what}: {', '.join(names)}"
 
 
 MOST_JSON_BYTES = 2**28
@@ -89,9 +97,7 @@ def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
         key = ".".join(loc) or "(top level)"
         if item["type"] == "extra_forbidden":
             names = field_names(model, loc[:-1])
-            near = difflib.get_close_matches(loc[-1], names, n=1, cutoff=0.5)
-            hint = f"did you mean '{near[0]}'?" if near else f"valid keys: {', '.join(sorted(names))}"
-            lines.append(f"{where}: unknown key '{key}'; {hint}")
+            lines.append(f"{where}: unknown key '{key}'{nearest(loc[-1], sorted(names), what='keys')}")
         elif item["type"] == "missing":
             lines.append(f"{where}: key '{key}' is required")
         else:

@@ -9,9 +9,8 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import Dropped, UserError
-from motionloom.pipeline.cli.convert import say
 from motionloom.pipeline.cli.options import AsJson, Device, ModelFolder, print_json
-from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place
 
 

@@ -23,12 +23,11 @@ from rich.table import Table
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.registry import converter_named, names
-from motionloom.datasets.schema import MANIFEST_FILE, Manifest, UserError
+from motionloom.datasets.schema import MANIFEST_FILE, Manifest, UserError, nearest
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.pipeline.cli.options import AsJson, Workers, fields_of, print_json, set_option
-from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
 
 if typing.TYPE_CHECKING:
@@ -61,8 +60,6 @@ class ConverterGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that `args` name; a misspelt one is answered with the nearest."""
         if args and args[0] not in names() and not args[0].startswith("-"):
-            from motionloom.pipeline.runs.resolve import nearest
-
             raise UserError(f"data convert {args[0]}: no such source{nearest(args[0], list(names()))}")
         return super().resolve_command(ctx, args)
 
@@ -285,8 +282,3 @@ def _say_left_out(manifest: Manifest, out: Path, console: Console) -> None:
         say(console, f"  {group}")
     if len(groups) > _REASONS:
         console.print(f"  … and {len(groups) - _REASONS} more reasons")
-
-
-def say(console: Console, text: str) -> None:
-    """Print text from a stranger's file: one line, and no control characters for the terminal to obey."""
-    console.print(printable(text), markup=False, highlight=False, soft_wrap=True)

@@ -13,9 +13,9 @@ from rich.text import Text
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Dropped, Manifest, UserError
 from motionloom.datasets.shards.left_out import grouped
-from motionloom.pipeline.cli.convert import convert_app, say, say_manifest
+from motionloom.pipeline.cli.convert import convert_app, say_manifest
 from motionloom.pipeline.cli.options import AsJson, Workers, fields_of, plain, print_json, set_option
-from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.render.charts import label
 from motionloom.pipeline.store.files import require_file_place, require_folder
 

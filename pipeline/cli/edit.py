@@ -8,9 +8,11 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.cli.generate import formats_of, open_model, print_note, write_files
 from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
 from motionloom.pipeline.inference.writers import formats_help
-from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.launch.console import make_console, say
+from motionloom.pipeline.store.files import require_folder
 
 
 def edit(
@@ -54,8 +56,8 @@ def edit(
     """
     from motionloom.pipeline.contract.editing import EditTask
     from motionloom.pipeline.contract.sampling import SamplingConfig
+    from motionloom.pipeline.inference.outputs import page_note
     from motionloom.pipeline.inference.shown import FigureOptions
-    from motionloom.pipeline.runs.generation import edit_clip_file
     from motionloom.pipeline.store.yaml import read_yaml
 
     sampling, figure, fields = settings_of(
@@ -70,11 +72,30 @@ def edit(
         fields["keep"] = [*(before if isinstance(before, list) else ()), *map(_kept, keep)]
     if caption is not None:
         fields["caption"] = caption
-    edit_clip_file(
-        run_folder, clip, EditTask.parse(fields, "task" if task is None else str(task)), samples=samples,
-        out=out, formats=formats, seed=seed, sampling=SamplingConfig.parse(sampling, "--set"), figure=figure,
-        device=device, console=make_console(),
-    )  # fmt: skip
+    edits = EditTask.parse(fields, "task" if task is None else str(task))
+    wanted, posing = formats_of(formats), FigureOptions.parse(figure, "--set")
+    require_folder(out)
+    aside = make_console(aside=True)  # standard output is the list of files
+    model = open_model(run_folder, device, aside)
+    drawn = SamplingConfig.parse(sampling, "--set")
+    motions = model.edit(clip, edits, samples=samples, seed=seed, sampling=drawn)
+    remarks = motions[0].remarks
+    for remark in remarks:
+        print_note(aside, remark)
+    for number, motion in enumerate(motions, start=1):
+        for line in motion.report.lines():
+            say(aside, f"{number}: {line}" if samples > 1 else line)
+    write_files(
+        out,
+        [motions[0].original, *motions],
+        wanted,
+        title=f"{clip.name}, edited",
+        note=page_note(len(motions), run_folder.resolve().name, seed, remarks),
+        seed=seed,
+        names=[clip.stem, *[f"{clip.stem} edited" for _ in motions]],
+        labels=["the clip", *["edited" for _ in motions]],
+        figure=posing,
+    )
 
 
 def _kept(text: str) -> dict[str, object]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from pydantic_core import to_jsonable_python
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, nearest
 
 ModelFolder = Annotated[
     Path,
@@ -62,8 +62,6 @@ def fields_of(words: Sequence[str] | None, option: str) -> dict[str, Any]:
 
 def settings_of(words: Sequence[str] | None, *groups: Iterable[str]) -> list[dict[str, object]]:
     """The fields of `--set` options, one mapping for each group of keys; a key of no group is refused."""
-    from motionloom.pipeline.runs.resolve import nearest
-
     fields, known = fields_of(words, "--set"), [list(group) for group in groups]
     for key in fields:
         if not any(key in group for group in known):

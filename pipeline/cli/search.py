@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.cli.convert import say
 from motionloom.pipeline.cli.options import AsJson, print_json
-from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.launch.console import make_console, say
 
 _CLIPS = 12
 """Clips that are listed."""

@@ -73,5 +73,3 @@ class StreamConfig(Config):
     """The decoder of a UDE's tokens: the diffusion decoder, which is better and needs the tokens of a
     window before its first frame, or the tokenizer's own, which needs some groups. None takes the first
     where the model has it."""
-    ahead_seconds: float = Field(0.5, ge=0)
-    """How far a stream whose captions come from a keyboard runs ahead of the clock."""

@@ -39,7 +39,7 @@ from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
-from motionloom.pipeline.inference.stream import MotionStream, stream_of
+from motionloom.pipeline.inference.stream import MotionStream, segments_of
 from motionloom.pipeline.launch.hardware import choose_device, threads_for
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
@@ -157,10 +157,7 @@ class MotionModel(
 
         `script` is a file, or a `Script` whose sound files are seen from the current folder.
         """
-        if isinstance(script, Script):
-            segments = script.open(Path())
-        else:
-            segments = Script.read(Path(script)).open(Path(script).parent, str(script))
+        segments = script.open() if isinstance(script, Script) else Script.read(Path(script))
         for remark in remarks_of(segment.prompt for segment in segments):
             warnings.warn(remark, stacklevel=2)
         return self.bundle.perform(segments, samples=samples, seed=seed, sampling=SamplingConfig.of(sampling))
@@ -193,10 +190,10 @@ class MotionModel(
 
         As `generate`, it warns of a caption that the model does not know, when its turn has come.
         """
-        return stream_of(
-            self.bundle, captions, face=face, sound=sound, seconds=seconds, seed=seed,
-            sampling=SamplingConfig.of(sampling), streaming=streaming, notice=_warn,
-        )  # fmt: skip
+        config = StreamConfig.parse({} if streaming is None else streaming, "streaming")
+        segments = segments_of(self.bundle, captions, face=face, sound=sound, seconds=seconds)
+        drawn = SamplingConfig.of(sampling)
+        return MotionStream(self.bundle, segments, seed=seed, sampling=drawn, config=config, notice=_warn)
 
     def edit(
         self,

@@ -73,14 +73,14 @@ class Script(Config):
     segments: list[ScriptSegment] = Field(min_length=1)
 
     @staticmethod
-    def read(path: Path) -> Script:
-        """A YAML file; `UserError` names file, key and fix."""
+    def read(path: Path) -> list[DrivenSegment]:
+        """The segments of a YAML file with their sounds, which lie beside it."""
         data = read_yaml(path)
         if not isinstance(data, dict):
             raise UserError(f"{path}: a script is a mapping with a list 'segments'")
-        return Script.parse(data, str(path))
+        return Script.parse(data, str(path)).open(path.parent, str(path))
 
-    def open(self, folder: Path, name: str = "script") -> list[DrivenSegment]:
+    def open(self, folder: Path = Path(), name: str = "script") -> list[DrivenSegment]:
         """The segments with their sounds; `folder` is where files are looked for, `name` is for errors."""
         sounds: dict[Path, Sound] = {}
         out = []

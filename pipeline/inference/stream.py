@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -69,17 +68,22 @@ class MotionStream(Iterator[MotionChunk]):
     def __init__(
         self,
         bundle: Bundle,
-        segments: Iterator[DrivenSegment],
+        segments: Iterable[DrivenSegment],
         *,
         seed: int,
         sampling: SamplingConfig,
-        config: StreamConfig,
+        config: StreamConfig | None = None,
         notice: Callable[[Unknown | str], object] | None = None,
     ) -> None:
         require_seed(seed)
+        require_used(bundle, None, sampling)
+        if sampling.candidates > 1:
+            raise UserError(
+                "a stream shows its motion as it is drawn, so there is none to choose: leave candidates out"
+            )
         self.layout, self.seed = bundle.layout, seed
-        seeds = sample_seeds(seed, 2)
-        self._segments, self._said = segments, deque[DrivenSegment]()
+        seeds, config = sample_seeds(seed, 2), config or StreamConfig()
+        self._segments, self._said = iter(segments), deque[DrivenSegment]()
         sampling = drawing(bundle, sampling)
         self._bundle, self._face_model = bundle, sampling.face_model
         self._notice, self._noticed = notice, set[str]()
@@ -265,30 +269,6 @@ def _streaming_face(bundle: Bundle, sampling: SamplingConfig) -> CompletedStage 
 Captions = str | Iterable[str | tuple[str, float]] | Script | None
 
 
-def stream_of(
-    bundle: Bundle,
-    captions: Captions,
-    *,
-    face: str = "",
-    sound: Sound | None = None,
-    seconds: float | None = None,
-    seed: int = 0,
-    sampling: SamplingConfig | None = None,
-    streaming: StreamConfig | Mapping[str, object] | None = None,
-    notice: Callable[[Unknown | str], object] | None = None,
-) -> MotionStream:
-    """A stream of `MotionModel.stream`'s arguments; `notice` is given captions that are unknown."""
-    sampling = sampling or SamplingConfig()
-    require_used(bundle, [face] if face else None, sampling)
-    if sampling.candidates > 1:
-        raise UserError(
-            "a stream shows its motion as it is drawn, so there is none to choose: leave candidates out"
-        )
-    segments = segments_of(bundle, captions, face=face, sound=sound, seconds=seconds)
-    config = StreamConfig.parse({} if streaming is None else streaming, "streaming")
-    return MotionStream(bundle, segments, seed=seed, sampling=sampling, config=config, notice=notice)
-
-
 def segments_of(
     bundle: Bundle,
     captions: Captions,
@@ -297,16 +277,18 @@ def segments_of(
     sound: Sound | None = None,
     seconds: float | None = None,
 ) -> Iterator[DrivenSegment]:
-    """Yield the segments that drive the motion, one after another."""
+    """Yield the segments that drive the motion of `MotionModel.stream`'s arguments, one after another."""
     if seconds is not None and not 0 < seconds < math.inf:
         raise UserError(f"{seconds:g} s: give a length above 0, or none for a stream without an end")
     if isinstance(captions, Script):
         if face or sound is not None or seconds is not None:
             raise UserError("a script says everything: leave face, sound and seconds out")
-        opened = captions.open(Path())
+        opened = captions.open()
         require_driven(bundle.generator, [segment.prompt for segment in opened])
         return iter(opened)
     if captions is None or isinstance(captions, str):
+        if face and bundle.choose_face(None) is None:
+            raise UserError("this model makes no face: leave the face caption out")
         prompt = Prompt(captions or "", face, sound)
         if captions is not None or sound is None:
             _require_text(captions or "", 0)

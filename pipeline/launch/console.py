@@ -30,6 +30,11 @@ def make_console(*, aside: bool = False) -> Console:
     return SafeConsole(stderr=aside, quiet=process_rank() > 0, width=width, highlight=False)
 
 
+def say(console: Console, text: object, style: str | None = None) -> None:
+    """Print one line without markup: names and captions may be a stranger's, for no terminal to obey."""
+    console.print(printable(str(text)), style=style, markup=False, highlight=False, soft_wrap=True)
+
+
 def quiet_libraries() -> None:
     """Keep the libraries' chatter out of the way of our own lines."""
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")

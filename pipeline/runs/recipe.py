@@ -24,7 +24,7 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import Config, UserError, nearest
 from motionloom.pipeline.contract.stage import (
     VARIABLE,
     CompletedStage,
@@ -36,7 +36,7 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.inputs import Sources, as_stages
-from motionloom.pipeline.runs.resolve import TRAINED, Tree, find_recipe, nearest, resolve
+from motionloom.pipeline.runs.resolve import TRAINED, Tree, find_recipe, resolve
 from motionloom.pipeline.store.run_folder import STAGE_NAME, place_from
 from motionloom.pipeline.store.yaml import dump_yaml
 from motionloom.pipeline.training.config import TrainedStageConfig

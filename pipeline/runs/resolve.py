@@ -23,7 +23,6 @@ tokenizer, its TMA. Data come in the model's layout and frame rate, and `generat
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -33,7 +32,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError, explain
+from motionloom.datasets.schema import UserError, explain, nearest
 from motionloom.pipeline.contract.stage import CompletedStage, Every, StageConfig, stage_kinds
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, is_place
 from motionloom.pipeline.store.weights import load_facts
@@ -88,13 +87,6 @@ def find_recipe(name_or_path: str) -> Path:
     if name not in shipped:
         raise UserError(f"no recipe '{name_or_path}'{nearest(name, list(shipped))} (or give a .yaml file)")
     return shipped[name]
-
-
-def nearest(name: str, valid: Sequence[str], shown: Sequence[str] | None = None) -> str:
-    """A hint to append: did you mean 'x'?, or the list of valid names, or else of those `shown`."""
-    near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
-    names = valid if shown is None else shown
-    return f"; did you mean '{near[0]}'?" if near else f"; valid names: {', '.join(names)}"
 
 
 def resolve(path: Path, overrides: Sequence[str] = ()) -> Resolved:

@@ -23,7 +23,7 @@ from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
 from motionloom.pipeline.inference.requests import remarks_of
-from motionloom.pipeline.inference.stream import MotionStream, stream_of
+from motionloom.pipeline.inference.stream import MotionStream, segments_of
 from motionloom.pipeline.inference.writers import WRITERS, cell_of, frame_lines, heading, rounded
 from motionloom.pipeline.render.viewer import viewer_data
 
@@ -204,10 +204,8 @@ def stream(
         limits.max_seconds if sound is None else min(sound.seconds, limits.max_seconds)
     )
     caption = asked.caption if asked.caption.strip() else None
-    return stream_of(
-        model.bundle, caption, face=asked.face, sound=sound, seconds=seconds, seed=asked.seed,
-        sampling=asked.sampling,
-    )  # fmt: skip
+    segments = segments_of(model.bundle, caption, face=asked.face, sound=sound, seconds=seconds)
+    return MotionStream(model.bundle, segments, seed=asked.seed, sampling=asked.sampling)
 
 
 def lines(

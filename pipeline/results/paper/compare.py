@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -11,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, nearest
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.results.paper.fill import fill
 from motionloom.pipeline.results.paper.filled import FilledTable
@@ -74,8 +73,6 @@ def paper_table(name: str) -> PaperTable:
         return PaperTable.parse(read_yaml(Path(name)), name)
     shipped = shipped_tables()
     if name not in shipped:
-        near = difflib.get_close_matches(name.lower(), shipped, n=1, cutoff=0.5)
-        hint = f"did you mean '{near[0]}'?" if near else "motionloom evaluate --table list names them"
-        raise UserError(f"--table {name}: no such table; {hint}")
+        raise UserError(f"--table {name}: no such table{nearest(name.lower(), list(shipped))}")
     path = shipped[name]
     return PaperTable.parse(read_yaml(path), str(path))

@@ -10,13 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import soundfile
-from rich.console import Console
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.script import DrivenSegment, Script, sound_of
-from motionloom.pipeline.runs.generation import generate_motions
 
 Write = Callable[..., Path]
 
@@ -41,7 +39,7 @@ def write(tmp_path: Path) -> Write:
 
 
 def opened(path: Path) -> list[DrivenSegment]:
-    return Script.read(path).open(path.parent, str(path))
+    return Script.read(path)
 
 
 def test_all_forms_of_a_segment(write: Write) -> None:
@@ -128,19 +126,24 @@ def test_mistakes_are_one_sentence_that_names_file_and_key(text: str, write: Wri
     assert "\n" not in str(caught.value)
 
 
-def test_a_script_says_everything(write: Write, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["a person bows"],
+        ["--audio", "song.wav"],
+        ["--seconds", 3],
+        ["--set", "face=smiles"],
+        ["--samples", 0],
+    ],
+)
+def test_a_script_says_everything(
+    more: list[Any], write: Write, call: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Refused before a model is opened: there is none here."""
     path = write("segments: [{text: a person walks, seconds: 2}]")
-    song = tmp_path / "song.wav"
-    more: dict[str, Any] = {
-        "captions": ["a person bows"],
-        "audio": [song],
-        "seconds": 3.0,
-        "face": ["smiles"],
-    }
-    for key, value in (*more.items(), ("samples", 0)):
-        with pytest.raises(UserError, match=r"show\.yaml|--samples 0"):
-            generate_motions(tmp_path, script=path, out=tmp_path / "out", console=Console(), **{key: value})
+    monkeypatch.chdir(path.parent)
+    done = call("generate", "nowhere", path.name, *more)
+    assert done.code == 2 and ("show.yaml" in done.err or "--samples 0" in done.err)
 
 
 def driven(sound: Sound | None) -> DrivenSegment:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
 from collections.abc import Callable, Iterator
@@ -12,14 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import MotionChunk, joined
 from motionloom.pipeline.inference.script import Script, ScriptSegment
-from motionloom.pipeline.runs.generation import stream_motion
 
 pytestmark = pytest.mark.slow
 
@@ -221,14 +218,6 @@ def test_json_lines_of_the_command(
     made = whole(list(model.stream(["a person waves", "a person walks"], seconds=1.2, seed=3)))
     np.testing.assert_allclose([frame["joints"] for frame in frames], made.joints, rtol=0, atol=1.1e-5)
     np.testing.assert_allclose([frame["face"] for frame in frames], made.face, rtol=0, atol=1.1e-5)
-
-
-def test_captions_from_standard_input(small_run: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = io.StringIO("a person waves\n\na person walks\n")
-    said = Console(file=io.StringIO())
-    stream_motion(small_run.folder, ["-"], seconds=1.0, device="cpu", console=said, given=lines)
-    _, frames = read(capsys.readouterr().out)
-    assert [frame["caption"] for frame in frames] == ["a person waves"] * 20 + ["a person walks"] * 20
 
 
 @pytest.mark.parametrize(
