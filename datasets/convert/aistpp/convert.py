@@ -15,12 +15,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.splits import join_splits, read_ids
+from motionloom.datasets.convert.common.splits import read_ids
 from motionloom.datasets.convert.sets.shared.body import SOUND_SUFFIXES, BodyConfig, BodyRelease
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
@@ -37,8 +36,6 @@ grant; shards that hold sound, or features made from it, stand under both.
 _SEQUENCE = re.compile(r"g([A-Z]{2})_s([A-Z]{2})_c(?:All|\d\d)_d(\d+)_m([A-Z]{2}\d+)_ch(\d+)")
 """Genre, situation (BM basic, FM advanced), dancer, music, choreography."""
 _FACTS = ("genre", "situation", "dancer", "music", "choreography")
-_SUFFIXES = (".json", ".pkl")
-"""Suffixes that the lists may write behind a sequence."""
 
 GENRES = {
     "BR": "break dance",
@@ -64,16 +61,10 @@ class AistppConfig(BodyConfig):
     """`body133` or `h3d263` from the joints, or `smpl75`: UDE's translation and axis-angles."""
     splits: Path | None = None
     """Folder of crossmodal_train.txt, _val.txt and _test.txt; default: splits/ in the source."""
-    unlisted: Literal["drop", "hash"] = "drop"
-    """Sequences in no split file: left out, or split 80/5/15 by a hash of their music."""
-    ignore_list: Path | None = None
-    """List of bad sequences; default: ignore_list.txt in the source."""
     sound: Literal["optional", "require", "none"] = "require"
     """Whether a sequence needs its music; `none` converts the motion alone."""
     music_folder: Path | None = None
     """Folder of `<sequence>.wav` or `<music>.wav` (also flac, mp3, ogg); default: wavs/ in the source."""
-    music_offset: float = Field(default=0.0, ge=0)
-    """Second of the music at which the motion begins."""
     caption_genre: bool = False
     """Give every clip the caption "a dancer performs ...", by the genre in its name."""
 
@@ -93,11 +84,13 @@ class Aistpp(BodyRelease[AistppConfig]):
     config_class = AistppConfig
     terms = MOTION_LICENCE
     model = "SMPL"
+    lists = ("splits",)
 
     def __init__(self, config: AistppConfig) -> None:
         super().__init__(config)
         self.sound_folder = config.music_folder or config.source / "wavs"
-        self.sound_start = config.music_offset
+        self.ignored: set[str] = set()
+        """Sequences of `ignore_list.txt`."""
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         folder = self.config.source / MOTIONS
@@ -105,63 +98,36 @@ class Aistpp(BodyRelease[AistppConfig]):
             raise UserError(
                 f"{self.config.source}: no {MOTIONS}/ in it; give the folder of the AIST++ annotations"
             )
-        splits, ignored = self._lists(draft)
         music = self._music()
         here = sorted(path.stem for path in folder.glob("*.pkl") if path.name[0] != ".")
-        for name, split in splits.items():
-            if name not in ignored and name not in here:
-                draft.miss(f"{MOTIONS}/{name}.pkl", f"listed in split '{split}', but not here")
         for name in here:
             try:
                 facts = _facts(name)
             except UserError as error:
                 note_broken(draft, f"{MOTIONS}/{name}.pkl", error)
                 continue
-            problem = "on the ignore list" if name in ignored else ""
-            if name not in splits and splits and self.config.unlisted == "drop":
-                problem = problem or "in no split file"
             genre = GENRES.get(facts["genre"], f"{facts['genre']} dance")
             caption = Caption(text=f"a dancer performs {genre}", source="genre")
             # By music: pieces are shared by many dances, and one in two splits would leak.
             yield Entry(
                 name, f"{MOTIONS}/{name}.pkl", (caption,) if self.config.caption_genre else (),
-                splits.get(name), group=facts["music"], facts=dict(facts),
-                sound=music.get(name) or music.get(facts["music"]), problem=problem,
+                group=facts["music"], facts=dict(facts),
+                sound=music.get(name) or music.get(facts["music"]),
+                problem="on the ignore list" if name in self.ignored else "",
             )  # fmt: skip
 
-    def _lists(self, draft: ConversionPlan[ReleaseClip]) -> tuple[dict[str, Split], set[str]]:
-        """Splits of sequences, by `crossmodal_SPLIT.txt` or else `SPLIT.txt`; and the ignored sequences.
-
-        A sequence in two splits is a `UserError` that names both files. Absent lists are noted, or an error
-        where the options name them.
-        """
-        config = self.config
-        folder = config.splits or config.source / "splits"
-        choices = {split: (folder / f"crossmodal_{split}.txt", folder / f"{split}.txt") for split in SPLITS}
-        found = {split: [path for path in paths if path.is_file()] for split, paths in choices.items()}
-        lists = [(split, paths[0]) for split, paths in found.items() if paths]
-        splits, notes = join_splits(lists, _SUFFIXES)
-        absent = [choices[split][0].name for split, paths in found.items() if not paths]
-        if config.splits and not lists:
-            raise UserError(f"{folder}: no crossmodal_train.txt, crossmodal_val.txt or crossmodal_test.txt")
-        if not lists:
-            notes.append("no split files: split 80/5/15 by a hash of the music")
-        elif absent:
-            notes.append(f"no {', '.join(absent)} beside the other split files")
-        path, ignored = config.ignore_list or config.source / "ignore_list.txt", set[str]()
-        if path.is_file():
-            ids, more = read_ids(path, _SUFFIXES)
-            notes += more
-            ignored = set(ids)
-        elif config.ignore_list:
-            raise UserError(f"{path}: no such file")
-        else:
-            notes.append("no ignore_list.txt: bad sequences of the release are not left out")
-        if both := sorted(splits.keys() & ignored):
-            some = ", ".join(both[:3])
-            notes.append(f"{len(both)} sequences of the split files are on the ignore list: {some}")
+    def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
+        """Return the splits, without the sequences of `ignore_list.txt`."""
+        listed, path = super().split_lists(draft), self.config.source / "ignore_list.txt"
+        ids, notes = (
+            read_ids(path) if path.is_file() else ({}, ["no ignore_list.txt: bad sequences are not left out"])
+        )
         draft.notes += notes
-        return splits, ignored
+        self.ignored = set(ids)
+        if both := sorted(self.ignored & (listed or {}).keys()):
+            some = ", ".join(both[:3])
+            draft.notes.append(f"{len(both)} sequences of the split files are on the ignore list: {some}")
+        return listed and {name: split for name, split in listed.items() if name not in self.ignored}
 
     def _music(self) -> dict[str, str]:
         """Music files by name without suffix, with their folder."""
@@ -176,9 +142,6 @@ class Aistpp(BodyRelease[AistppConfig]):
             return {}
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SOUND_SUFFIXES)
         return {path.stem: path.name for path in reversed(files) if path.name[0] != "."}
-
-    def split_lists(self) -> dict[str, Split] | None:
-        return None  # read in `entries`
 
     def with_sound(
         self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]

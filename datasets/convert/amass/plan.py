@@ -22,7 +22,6 @@ from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id, inside, read_in_threads
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
 from motionloom.datasets.convert.common.splits import (
-    SplitNames,
     hash_split,
     keep_mirrors_together,
     original_of,
@@ -215,8 +214,7 @@ def _whole_clips(
 ) -> Iterator[tuple[AmassClip, str]]:
     """Every file as one clip, and why it must be left out."""
     headers = read_headers(files, settings, draft)
-    labels = [file.label for file in files]
-    listing = config.with_subjects(config.listing(labels), labels)
+    listing = config.listing([file.label for file in files])
     draft.notes += listing.notes
     for file, header in headers:
         fps = _rate(config, file, header, draft)
@@ -236,7 +234,7 @@ def _index_clips(
     rows = read_index(index)
     listed: dict[str, Split] = {}
     if config.splits is not None:
-        listed, notes = read_split_files(config.splits, SplitNames(config.splits_map))
+        listed, notes = read_split_files(config.splits)
         keep_mirrors_together(listed, config.splits)
         draft.notes += notes
     by_file = _rows_by_file(rows, files, draft)

@@ -326,8 +326,9 @@ def _decide(
 ) -> ConversionPlan[BvhClip]:
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
     refused = config.licence_problem(config.licence) if config.licence else ""
-    listing = config.listing([file.path for _, file in found])
-    listing = config.with_subjects(listing, [file.path for _, file in found if not file.problem])
+    listing = config.listing(
+        [file.path for _, file in found], [file.path for _, file in found if not file.problem]
+    )
     broken = [scan.problem for scan in scans if scan.problem is not None]
     draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes, audit=audit)
     contents: dict[str, str] = {}

@@ -13,14 +13,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from pydantic import field_validator
-
 from motionloom.datasets.base.files import sha256_of, sha256_of_json
 from motionloom.datasets.convert.captions.names import label_words, subject_splits
 from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, read_captions
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
-from motionloom.datasets.convert.common.splits import SplitNames, hash_split, read_split_files
+from motionloom.datasets.convert.common.splits import hash_split, read_split_files
 from motionloom.datasets.schema import Caption, Split, UserError
 
 
@@ -90,10 +88,7 @@ class Listing:
 
     def problem(self, path: str) -> str:
         """Return the reason that the lists leave a file out; empty when they do not."""
-        if self.splits is not None and path not in self.splits:
-            return "in no split file"
-        left_out = path in self.rows and self.rows[path].left_out
-        return "in a split that is left out (splits_map)" if left_out else ""
+        return "in no split file" if self.splits is not None and path not in self.splits else ""
 
     def nearest(self, row: CaptionRow) -> list[str]:
         return nearest(row.file or row.id, self.free)
@@ -175,10 +170,6 @@ class CaptionConfig(ConvertConfig):
     """Folder of train.txt, val.txt, test.txt, or `subjects` for all clips of a person in one split; else the
     captions' `split`, else 80/5/15 by hash of the id.
     """
-    splits_map: str = ""
-    """Meaning of other names of splits: `fold1=train,extra=drop`; `NAME=ignore` as if none were stated;
-    `ignore` or `drop` alone for all others. `valid`, `dev`, `training` and the like need none.
-    """
     uncaptioned: Literal["stop", "drop", "keep"] = "stop"
     """Clips that the given captions do not name: stop and say which, leave them out, or keep them.
     """
@@ -188,46 +179,31 @@ class CaptionConfig(ConvertConfig):
         """Whether captions are given."""
         return self.captions is not None
 
-    @field_validator("splits_map")
-    @classmethod
-    def _readable(cls, mapping: str) -> str:
-        SplitNames(mapping)
-        return mapping
-
     def options(self) -> dict[str, object]:
         """Return the fields that the output depends on; `stop` counts as `drop`: both write captions."""
         return super().options() | {"uncaptioned": "drop" if self.uncaptioned == "stop" else self.uncaptioned}
 
-    def listing(self, paths: Sequence[str]) -> Listing:
-        """Return the captions and splits of motion files, by their paths in the source."""
-        names = SplitNames(self.splits_map)
+    def listing(self, paths: Sequence[str], readable: Sequence[str] | None = None) -> Listing:
+        """Return the captions and splits of motion files, by their paths in the source; subjects are split by
+        those that are readable.
+        """
         rows: Iterable[CaptionRow] = ()
         if str(self.captions) == BY_NAMES and not Path(BY_NAMES).exists():
             rows = _rows_of_names(paths)
         elif self.captions is not None:
-            rows = read_captions(self.captions, names).values()
-        by_files = self.splits is not None and not self.by_subjects
-        listed, notes = read_split_files(self.splits, names) if self.splits and by_files else (None, [])
+            rows = read_captions(self.captions).values()
+        if str(self.splits) == BY_SUBJECTS and not Path(BY_SUBJECTS).exists():
+            splits, notes = subject_splits(paths if readable is None else readable)
+            return replace(list_clips(paths, rows, None, notes), splits=splits)
+        listed, notes = read_split_files(self.splits) if self.splits else (None, [])
         return list_clips(paths, rows, listed, notes)
-
-    @property
-    def by_subjects(self) -> bool:
-        """Whether all clips of a person go into one split."""
-        return str(self.splits) == BY_SUBJECTS and not Path(BY_SUBJECTS).exists()
-
-    def with_subjects(self, listing: Listing, readable: Sequence[str]) -> Listing:
-        """A listing with the readable files split by subject, where that is asked for."""
-        if not self.by_subjects:
-            return listing
-        splits, notes = subject_splits(readable)
-        return replace(listing, splits=splits, notes=[*listing.notes, *notes])
 
 
 def _rows_of_names(paths: Sequence[str]) -> Iterator[CaptionRow]:
     for path in paths:
         if words := label_words(path):
             texts = (Caption(text=words, source="file name"),)
-            yield CaptionRow(bare(path), texts, path, None, False, None, path)
+            yield CaptionRow(bare(path), texts, path, None, None, path)
 
 
 def digest_of(path: Path) -> dict[str, str]:

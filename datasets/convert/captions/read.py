@@ -19,7 +19,7 @@ from pydantic import AliasChoices, ConfigDict, Field, FiniteFloat
 
 from motionloom.datasets.convert.captions.humanml_text import parse_caption
 from motionloom.datasets.convert.common.files import check_id, read_text_file
-from motionloom.datasets.convert.common.splits import SplitNames
+from motionloom.datasets.convert.common.splits import split_named
 from motionloom.datasets.schema import Caption, Config, Split, UserError
 
 SOURCE = "captions"
@@ -48,8 +48,6 @@ class CaptionRow:
     file: str | None
     """Its path in the source, where the captions state one."""
     split: Split | None
-    left_out: bool
-    """The clip is in a split that is not wanted."""
     fps: float | None
     where: str
     """`FILE:LINE`, or the file and which of its records."""
@@ -76,16 +74,13 @@ def bare(name: str) -> str:
     return name[: -len(end[0])] if (end := _SUFFIX.search(name)) else name
 
 
-def read_captions(path: Path, splits: SplitNames | None = None) -> dict[str, CaptionRow]:
-    """The rows of a file or folder by clip id; `UserError` names file and line of anything malformed.
-
-    `splits` says what other names of splits mean.
-    """
-    names, rows, files = splits or SplitNames(), dict[str, CaptionRow](), dict[str, str]()
+def read_captions(path: Path) -> dict[str, CaptionRow]:
+    """The rows of a file or folder by clip id; `UserError` names file and line of anything malformed."""
+    rows, files = dict[str, CaptionRow](), dict[str, str]()
     # Two records of one clip are joined if each holds one caption, and a mistake if they hold whole lists.
     for where, values in _records(path):
         catalogue = bool(values.pop(_CATALOGUE, False))
-        row, is_list = _row(where, values, names)
+        row, is_list = _row(where, values)
         row = replace(row, catalogue=catalogue)
         before = rows.get(row.id)
         if row.file and files.setdefault(row.file, row.id) != row.id:
@@ -95,11 +90,10 @@ def read_captions(path: Path, splits: SplitNames | None = None) -> dict[str, Cap
         rows[row.id] = row if before is None else joined(before, row)
     if not rows:
         raise UserError(f"{path}: no captions in it")
-    names.require_known()
     return rows
 
 
-def _row(where: str, values: dict[str, object], splits: SplitNames) -> tuple[CaptionRow, bool]:
+def _row(where: str, values: dict[str, object]) -> tuple[CaptionRow, bool]:
     """The row of a record, and whether it holds all captions of its clip (a list) and not one of them."""
     keys = _text_keys(tuple(values))
     values = {key: value for key, value in values.items() if value is not None and str(value).strip()}
@@ -118,10 +112,9 @@ def _row(where: str, values: dict[str, object], splits: SplitNames) -> tuple[Cap
     if not is_list:
         shared |= {"start": about.start, "end": about.end}
     texts = [text for key in keys for text in _captions(f"{where}: '{key}'", values.get(key), shared)]
-    choice = splits.of(about.split, lambda: where) if about.split else None
-    stated = None if choice == "drop" else choice
+    stated = split_named(about.split, where) if about.split else None
     file = about.file and about.file.strip().replace("\\", "/").removeprefix("./")
-    row = CaptionRow(clip_id, tuple(texts), file, stated, choice == "drop", about.fps, where)
+    row = CaptionRow(clip_id, tuple(texts), file, stated, about.fps, where)
     return row, is_list
 
 
@@ -161,7 +154,6 @@ def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
         texts=before.texts + tuple(text for text in row.texts if text not in before.texts),
         file=before.file or row.file,
         split=before.split or row.split,
-        left_out=before.left_out or row.left_out,
         fps=before.fps or row.fps,
     )
 

@@ -31,13 +31,7 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
-from motionloom.datasets.convert.common.splits import (
-    SplitNames,
-    hash_splits,
-    keep_mirrors_together,
-    original_of,
-    read_split_files,
-)
+from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.motionx.files import (
     HUMANML,
     SOURCE,
@@ -45,7 +39,6 @@ from motionloom.datasets.convert.motionx.files import (
     MotionXFiles,
     find_files,
     official_id,
-    read_frame_texts,
     read_sentences,
     subset_of,
 )
@@ -61,7 +54,6 @@ from motionloom.datasets.convert.motionx.parameters import (
     scale_aist,
     value_limits,
     with_face,
-    z_up_to_y_up,
 )
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
@@ -87,7 +79,6 @@ LICENCES = {
 """Our reading, on the careful side: motion that the user gets from its own site keeps that site's licence,
 all that Motion-X hands out needs its agreement as well, and both count where it has a first owner."""
 
-_SPLIT_FOLDERS = ("", "split", "splits", "datasets")
 _LOOKED_AT = 8
 """Clips of `aist/` that the plan reads to tell their scale."""
 
@@ -109,12 +100,7 @@ class MotionXConfig(ReleaseConfig):
     and `datasets/`; else 80/5/15 by hash of the id."""
     body_model: Path | None = None
     """Your SMPL-X or SMPL-H model (.npz), for joints with each clip's own shape; else a neutral skeleton."""
-    up: Literal["y", "z"] = "y"
-    """Up axis of the source. The release is Y up; `z` is for own files that no script has turned yet."""
     uncaptioned: Literal["drop", "keep"] = "drop"
-    frame_texts: bool = False
-    """Add the sentences about single frames (body_texts, hand_texts) as captions of 1/30 s and longer, with
-    source `body` and `hand`. They are many: about one a frame."""
 
     @property
     def skeleton(self) -> SkeletonName:
@@ -129,13 +115,11 @@ class MotionXEntry(Entry):
     face_texts: tuple[Caption, ...] = ()
     face: str | None = None
     """Face motion to write in."""
-    frame_texts: tuple[tuple[str, str], ...] = ()
-    """(source of the captions, file) of sentences about frames."""
 
     @property
     def files(self) -> tuple[str, ...]:
         """Every file the sample is made of, but for texts."""
-        return (self.file, *([self.face] if self.face else []), *(file for _, file in self.frame_texts))
+        return (self.file, self.face) if self.face else (self.file,)
 
 
 _Found = tuple[MotionXEntry, list[Dropped], list[str]]
@@ -151,6 +135,7 @@ class MotionX(Release[MotionXConfig]):
     example = "Motion-X shards"
     config_class = MotionXConfig
     terms = LICENCE
+    lists = ("", "split", "splits", "datasets")
 
     def __init__(self, config: MotionXConfig) -> None:
         super().__init__(config)
@@ -164,12 +149,8 @@ class MotionX(Release[MotionXConfig]):
         if not ids:
             present = sorted({subset_of(clip_id) for clip_id in motion})
             raise UserError(f"{config.source}: none of {config.subsets} in it, but {', '.join(present)}")
-        splits, notes = self._splits(ids)
-        for clip_id, split in splits.items():
-            if clip_id not in motion:
-                draft.miss(clip_id, f"listed in {split}.txt, but its motion is not here")
         how = self.settings
-        read = partial(self._entry, files, splits)
+        read = partial(self._entry, files)
         made: list[_Found] = list(read_in_threads(read, ids, workers=how.workers, progress=how.progress))
         entries = [entry for entry, _, _ in made]
         unwanted = len(motion) - len(ids)
@@ -178,7 +159,6 @@ class MotionX(Release[MotionXConfig]):
         draft.broken += [*files.broken, *(problem for _, broken, _ in made for problem in broken)]
         draft.notes += [
             *files.notes(),
-            *notes,
             *self._subset_notes(entries),
             *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),
             *([f"{len(texts_alone)} caption files have no motion"] if texts_alone else []),
@@ -189,31 +169,18 @@ class MotionX(Release[MotionXConfig]):
     def _wanted(self, clip_id: str) -> bool:
         return not self.config.subsets or subset_of(clip_id) in self.config.subsets
 
-    def _splits(self, ids: list[str]) -> tuple[dict[str, Split], list[str]]:
-        """Split of every wanted id, and notes."""
-        config, names = self.config, SplitNames()
-        if config.splits is not None:
-            folder, origin = config.splits, "splits: from the folder given"
-        else:
-            here = [name for name in _SPLIT_FOLDERS if names.files(config.source / name)]
-            if not here:
-                return hash_splits(ids)
-            folder, origin = config.source / here[0], f"splits: {here[0] or '.'}/"
-        listed, notes = read_split_files(folder)
-        keep_mirrors_together(listed, folder)
+    def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
+        listed = super().split_lists(draft)
+        if listed is None:
+            return None
         splits: dict[str, Split] = {}
         for clip_id, split in listed.items():
-            official = official_id(clip_id.removesuffix(".npy"))
+            official = official_id(clip_id)
             if splits.setdefault(official, split) != split:
-                raise UserError(
-                    f"{folder}: '{official}' is in {splits[official]}.txt and {split}.txt; that leaks"
-                )
-        return {key: split for key, split in splits.items() if self._wanted(key)}, [origin, *notes]
+                raise UserError(f"'{official}' is in {splits[official]}.txt and {split}.txt; that leaks")
+        return {key: split for key, split in splits.items() if self._wanted(key)}
 
-    def split_lists(self) -> dict[str, Split] | None:
-        return None  # read in `entries`
-
-    def _entry(self, files: MotionXFiles, splits: dict[str, Split], clip_id: str) -> _Found:
+    def _entry(self, files: MotionXFiles, clip_id: str) -> _Found:
         """A clip with its texts. Segments of humanml's captions are checked when its length is known."""
         source, broken, problems = self.config.source, list[Dropped](), list[str]()
 
@@ -238,17 +205,14 @@ class MotionX(Release[MotionXConfig]):
             except UserError as error:
                 broken.append(drop(face, error))
                 face = None
-        by_frames = (("body", files.by_kind["body texts"]), ("hand", files.by_kind["hand texts"]))
-        frame_texts = tuple((kind, table[clip_id]) for kind, table in by_frames if clip_id in table)
         subset = subset_of(clip_id)
         entry = MotionXEntry(
             clip_id, files.by_kind["motion"][clip_id],
             read("captions", partial(captions, source=SOURCE)),
-            splits.get(clip_id), facts={"subset": subset}, mirror_of=original_of(clip_id),
-            licence=LICENCES.get(subset, LICENCE),
-            problem="" if clip_id in splits else "in no split file",
+            group=original_of(clip_id) or clip_id, facts={"subset": subset},
+            mirror_of=original_of(clip_id), licence=LICENCES.get(subset, LICENCE),
             face_texts=read("face texts", partial(read_sentences, source="face")),
-            face=face, frame_texts=frame_texts if self.config.frame_texts else (),
+            face=face,
         )  # fmt: skip
         return entry, broken, problems
 
@@ -321,19 +285,15 @@ class MotionX(Release[MotionXConfig]):
             hands=layout.num_joints > BODY_JOINTS and bool(values[:, HANDS].any()),
             face=layout.has("face") and has_face,
         )
-        texts = list(entry.texts)
-        for source, file in entry.frame_texts:
-            path = config.source / file
-            texts += read_frame_texts(path, source=source, frames=clip.last, fps=FPS, name=file)
         faces = list(entry.face_texts)
         # A clip with a face but no words about it takes the emotion that its captions name.
         emotion = None if faces or not meta.has_face else emotion_of(caption.text for caption in entry.texts)
         if emotion is not None:
             faces = [Caption(text=emotion, source="emotion")]
-        return Sample(meta=meta, motion=motion, texts=texts, face_texts=faces)
+        return Sample(meta=meta, motion=motion, texts=list(entry.texts), face_texts=faces)
 
     def parameters(self, clip: ReleaseClip) -> NDArray[np.float64]:
-        """The clip's columns [T, 322], repaired: metres, Y up, face motion written in."""
+        """The clip's columns [T, 322], repaired: metres, face motion written in."""
         entry, subset = _with_face(clip), subset_of(clip.id)
         values = self._load(entry.file).astype(np.float64)
         if len(values) != clip.last:
@@ -342,8 +302,6 @@ class MotionX(Release[MotionXConfig]):
             )
         if subset == AIST:
             values = scale_aist(values)
-        if self.config.up == "z":
-            values = z_up_to_y_up(values)
         if entry.face is not None:
             face = load_array(self.path_of(entry.face), width=FACE_WIDTH, name=entry.face, limit=1000.0)
             values = with_face(values, face, keep_jaw=subset == "GRAB")

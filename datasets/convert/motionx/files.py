@@ -12,7 +12,6 @@ loader takes 20). Everywhere else a file is plain sentences, one a line, some of
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections import Counter
@@ -46,35 +45,7 @@ def read_sentences(path: Path, *, source: str, name: str) -> tuple[list[Caption]
     return list(found.values()), problems
 
 
-def read_frame_texts(path: Path, *, source: str, frames: int, fps: float, name: str) -> list[Caption]:
-    """`{"frame": sentence}` as captions of the frames' seconds; equal sentences in a row become one.
-
-    Frames beyond the clip are left out: the sentences were made for the authors' own cut of it. `UserError`
-    for anything but such a table.
-    """
-    try:
-        table = json.loads(read_text_file(path, name))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{name}: not valid JSON ({error})") from None
-    if not isinstance(table, dict):
-        raise UserError(f"{name}: expected an object of frame numbers and sentences")
-    sentences: dict[int, str] = {}
-    for key, text in table.items():
-        if not (key.isdecimal() and key.isascii()) or not isinstance(text, str):
-            raise UserError(f"{name}: '{key[:20]}' is not a frame number with a sentence")
-        if int(key[:18]) < frames and usable_caption(text):
-            sentences[int(key)] = clean_caption(text)
-    captions: list[Caption] = []
-    for frame, text in sorted(sentences.items()):
-        start, end = frame / fps, (frame + 1) / fps
-        if captions and captions[-1].text == text and captions[-1].end == start:
-            captions[-1] = captions[-1].model_copy(update={"end": end})
-        else:
-            captions.append(Caption(text=text, start=start, end=end, source=source))
-    return captions
-
-
-Kind = Literal["motion", "face motion", "captions", "face texts", "body texts", "hand texts"]
+Kind = Literal["motion", "face motion", "captions", "face texts"]
 
 _SUBSETS = (
     "EgoBody", "GRAB", "HAA500", "aist", "animation", "dance", "fitness", "game_motion", "humanml", "humman",
@@ -88,8 +59,6 @@ _KINDS: dict[Kind, tuple[str, str]] = {
     "face motion": (rf"(?:motionx_)?face_motion(?:_data)?{_VERSION}", ".npy"),
     "captions": (rf"(?:semantic_(?:label|text)s?|motionx_seq_texts?){_VERSION}", ".txt"),
     "face texts": (rf"(?:motionx_)?face_texts?{_VERSION}", ".txt"),
-    "body texts": (rf"(?:motionx_)?body_texts?{_VERSION}", ".json"),
-    "hand texts": (rf"(?:motionx_)?hand_texts?{_VERSION}", ".json"),
 }
 """Names of the folder (any case) and of the files of each kind."""
 _PATTERNS = {kind: re.compile(names, re.IGNORECASE) for kind, (names, _) in _KINDS.items()}

@@ -19,7 +19,7 @@ RAW = MotionLayout.named("smplx322")
 FACE_WIDTH = 153
 """Columns of a face motion file: jaw 3, expression 50, face shape 100."""
 
-ROOT, HANDS, JAW = (RAW.slice(name) for name in ("root_orient", "pose_hand", "pose_jaw"))
+HANDS, JAW = RAW.slice("pose_hand"), RAW.slice("pose_jaw")
 EXPRESSION, FACE_SHAPE = RAW.slice("face"), RAW.slice("face_shape")
 TRANS, BETAS = RAW.slice("trans"), RAW.slice("betas")
 
@@ -62,21 +62,6 @@ def scale_aist(values: NDArray[np.float64]) -> NDArray[np.float64]:
     scaled = values.copy()
     scaled[:, TRANS] *= np.array([1.0, 1.0, -1.0]) / AIST_UNIT
     return scaled
-
-
-def z_up_to_y_up(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same motion with Y up, as Motion-X's scripts turn their Z-up sources: (x, y, z) -> (x, z, -y)."""
-    import roma
-    import torch
-
-    turn = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]], dtype=torch.float64)
-    out = values.copy()
-    root = roma.rotvec_to_rotmat(torch.from_numpy(np.ascontiguousarray(values[:, ROOT])))
-    out[:, ROOT] = roma.rotmat_to_rotvec(turn @ root).numpy()
-    # The root turns about the pelvis and the translation about the origin: a constant step aside, which the
-    # canonical place takes away.
-    out[:, TRANS] = values[:, TRANS] @ turn.numpy().T
-    return out
 
 
 def with_face(

@@ -1,7 +1,7 @@
 """HumanML3D: the published 263-column vectors as they are, or features made from the joints.
 
 The published folders hold the same motion twice: new_joints/ is new_joint_vecs/ decoded (both have one frame
-less than the motion had). So either can stand for the other, and where both are read they are compared.
+less than the motion had). So either can stand for the other.
 
 Layout `h3d263` at 20 fps keeps the vectors bit for bit. Made again from new_joints/ they are not the same:
 one more frame is lost, and the published code starts every clip with a forced heading, which decoding has
@@ -27,13 +27,7 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.files import check_id, inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.splits import (
-    SplitNames,
-    hash_splits,
-    keep_mirrors_together,
-    original_of,
-    read_split_files,
-)
+from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.sets.shared.release import (
     Entry,
     Figure,
@@ -46,15 +40,12 @@ from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample
 
 FPS = 20.0
 VECS, JOINTS = "new_joint_vecs", "new_joints"
 WIDTHS: dict[str, int | tuple[int, ...]] = {VECS: 263, JOINTS: (22, 3)}
-
-AGREEMENT = 0.01
-"""Metres by which new_joints/ may differ from decoded new_joint_vecs/; the published pairs agree to 1e-6."""
 
 
 class HumanMl3dConfig(ReleaseConfig):
@@ -67,9 +58,6 @@ class HumanMl3dConfig(ReleaseConfig):
     """`h3d263` keeps the published vectors; `body133` is made from the joints."""
     fps: float = Field(default=FPS, gt=0, le=240)
     """Frame rate of the shards. At any other than 20 the published vectors are made again from the joints."""
-    use: Literal["auto", "vecs", "joints"] = "auto"
-    """`vecs` reads new_joint_vecs/ only, `joints` new_joints/ only. `auto` takes what the layout needs least
-    work for, and where both are there, leaves out clips for which they differ."""
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton (published vectors are then made again)."""
     uncaptioned: Literal["drop", "keep"] = "drop"
@@ -81,9 +69,7 @@ class HumanMl3dConfig(ReleaseConfig):
 
     @property
     def folders(self) -> tuple[str, ...]:
-        """Folders of motion to read, the preferred one first."""
-        if self.use != "auto":
-            return (VECS,) if self.use == "vecs" else (JOINTS,)
+        """Folders of motion, the one that the layout needs less work for first."""
         return (VECS, JOINTS) if self.keeps_vectors else (JOINTS, VECS)
 
 
@@ -99,17 +85,13 @@ class HumanMl3d(Release[HumanMl3dConfig]):
         "HumanML3D: motion derived from AMASS (non-commercial research only, no redistribution) and "
         "HumanAct12; captions MIT"
     )
+    lists = ("",)
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         files, folder = self._motion(draft), self._texts()
-        splits = self._splits(sorted(files), draft)
         listed = {path.stem for path in (self.config.source / folder).glob("*.txt") if path.name[0] != "."}
         if folder and (strays := len(listed - files.keys())):
             draft.notes.append(f"{strays} caption files in {folder}/ belong to no motion file here")
-        for clip_id, split in splits.items():
-            if clip_id not in files:
-                wanted = "/ or ".join(self.config.folders)
-                draft.miss(clip_id, f"listed in {split}.txt, but not in {wanted}/")
         for clip_id, file in sorted(files.items()):
             texts: list[Caption] = []
             if folder and clip_id in listed:
@@ -122,9 +104,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
                     note_broken(draft, label, error)
             original = original_of(clip_id)
             yield Entry(
-                clip_id, file, tuple(texts), splits.get(clip_id), mirror_of=original,
+                clip_id, file, tuple(texts), group=original or clip_id, mirror_of=original,
                 facts={"mirrored": float(original is not None)},
-                problem="" if clip_id in splits else "in no split file",
             )  # fmt: skip
 
     def _motion(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, str]:
@@ -155,72 +136,34 @@ class HumanMl3d(Release[HumanMl3dConfig]):
         hint = "unpack texts.zip" if (source / "texts.zip").exists() else "clips would have no captions"
         raise UserError(f"{source}: no texts/ in it; {hint} (or --set uncaptioned=keep)")
 
-    def _splits(self, ids: list[str], draft: ConversionPlan[ReleaseClip]) -> dict[str, Split]:
-        folder = self.config.splits or self.config.source
-        if not SplitNames().files(folder):
-            splits, notes = hash_splits(ids)
-        else:
-            splits, notes = read_split_files(folder)
-            keep_mirrors_together(splits, folder)
-        draft.notes += notes
-        return splits
-
-    def split_lists(self) -> dict[str, Split] | None:
-        return None  # read in `entries`
-
     def path_of(self, file: str) -> Path:
         """A file of the set, whose folder may be a link: people keep parts of a release on several disks."""
         folder, name = file.split("/", 1)
         return inside(self.config.source / folder, name, file)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
-        lengths = {}
-        for file in self._files(label):
-            folder = file.split("/", 1)[0]
-            lengths[file] = check_array_header(self.path_of(file), width=WIDTHS[folder], name=file)
-        if len(set(lengths.values())) > 1:
-            listed = ", ".join(f"{file} {frames}" for file, frames in lengths.items())
-            raise UserError(f"frames differ ({listed}); choose one with --set use=vecs or --set use=joints")
-        return lengths[label], FPS
+        return check_array_header(path, width=WIDTHS[label.split("/", 1)[0]], name=label), FPS
 
     def frames(self, clip: ReleaseClip) -> int:
         kept = self.config.keeps_vectors and clip.entry.file.startswith(VECS)
         return clip.last if kept else super().frames(clip)
-
-    def depends_on(self, clip: ReleaseClip) -> list[object]:
-        files = self._files(clip.entry.file)
-        sizes = [(self.config.source / file).stat().st_size for file in files]
-        return [clip.id, files, sizes, [caption.dump() for caption in clip.entry.texts]]
 
     def figure(self, clip: ReleaseClip) -> Figure:
         return Figure(joints=_joints(self._load(clip.entry.file)))
 
     def convert(self, clip: ReleaseClip) -> Sample:
         config, layout = self.config, self.layout
-        stored = [self._load(file) for file in self._files(clip.entry.file)]
-        joints = _joints(stored[0])
+        stored = self._load(clip.entry.file)
+        joints = _joints(stored)
         require_human(joints, FPS)
-        for other, file in zip(stored[1:], self._files(clip.entry.file)[1:], strict=True):
-            away = np.linalg.norm(joints - _joints(other), axis=-1).max(axis=-1)
-            if not away.max() <= AGREEMENT:
-                raise UserError(
-                    f"{clip.label()}: differs from {file} by {away.max():.3g} m at frame "
-                    f"{int(away.argmax())}; choose one with --set use=vecs or --set use=joints"
-                )
-        if config.keeps_vectors and stored[0].ndim == 2:
-            motion = stored[0].astype(np.float32, copy=False)
+        if config.keeps_vectors and stored.ndim == 2:
+            motion = stored.astype(np.float32, copy=False)
         elif layout.family == "exact":
             motion = features_of(joints, FPS, layout, same_bones=config.retarget)
         else:
             bones = None if config.retarget else layout.skeleton.bones(joints[0])
             motion = encode_h3d(resample(joints, FPS, layout.fps), layout, bones)
         return Sample(self.clip_meta(clip, motion), motion, texts=list(clip.entry.texts))
-
-    def _files(self, file: str) -> list[str]:
-        """A motion file, and the one of the other folder to compare it with, if there is one."""
-        name = file.split("/", 1)[1]
-        others = [f"{folder}/{name}" for folder in self.config.folders if not file.startswith(f"{folder}/")]
-        return [file, *(other for other in others if (self.config.source / other).is_file())]
 
     def _load(self, file: str) -> NDArray[np.floating]:
         return load_array(self.path_of(file), width=WIDTHS[file.split("/", 1)[0]], name=file)

@@ -27,7 +27,7 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.facts import Fact, Published
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.splits import original_of, read_split_files
+from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.common.tables import captions_of
 from motionloom.datasets.convert.sets.shared.release import (
     Entry,
@@ -44,7 +44,6 @@ from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
 FPS, WIDTH = 30.0, 272
 _STEP, _TURN, _POSITIONS = slice(0, 2), slice(2, 8), slice(8, 8 + 3 * BODY_JOINTS)
 _MOTION = ("motion_data/vector_272", "motion_data")
-_LISTS = ("split/version1/t2m_60_300", "split", "splits")
 _STREAMED = re.compile(r"(?P<first>[^*]+)\*(?P<second>.+)#(?P<frames>\d+)\s*")
 
 
@@ -54,8 +53,6 @@ class Motion272Config(ReleaseConfig):
     name: str = "motion272"
     source_fps: float = Field(default=FPS, gt=0, le=240)
     """Frame rate of the files; a copy that was made at another than 30 does not say so."""
-    list_folder: str = ""
-    """Folder of the split lists in the source, such as split/version1/tokenizer_96; else the usual ones."""
 
 
 class Motion272(Release[Motion272Config]):
@@ -67,6 +64,7 @@ class Motion272(Release[Motion272Config]):
     example = "MotionMillion shards"
     config_class = Motion272Config
     terms = "272-column set: non-commercial, AMASS's terms where its motions are from there"
+    lists = ("split/version1/t2m_60_300", "split", "splits")
     published = Published("MotionMillion paper", {"clips": 2_000_000, "hours": 2000})
 
     def stated(self) -> Published | None:
@@ -86,31 +84,16 @@ class Motion272(Release[Motion272Config]):
         motion = next((name for name in _MOTION if (source / name).is_dir()), None)
         if motion is None:
             raise UserError(f"{source}: no {_MOTION[-1]}/ in it; unpack motion_data.zip, or give its folder")
-        lists = [self.config.list_folder] if self.config.list_folder else _LISTS
-        folder = next((source / name for name in lists if (source / name).is_dir()), None)
-        listed: dict[str, Split] = {}
-        if folder is None:
-            draft.notes.append("no split lists: split 80/5/15 by hash of the id")
-        else:
-            listed, notes = read_split_files(folder)
-            draft.notes += notes
         root = source / motion
         here = (path.relative_to(root).as_posix().removesuffix(".npy") for path in root.rglob("*.npy"))
-        for name in sorted({*here, *listed}):
-            yield self._entry(motion, "texts", name, listed.get(name), draft, unlisted=folder is not None)
+        for name in sorted(here):
+            yield self._entry(motion, "texts", name, None, draft)
 
     def _entry(
-        self,
-        motion: str,
-        texts: str,
-        name: str,
-        split: Split | None,
-        draft: ConversionPlan[ReleaseClip],
-        unlisted: bool = False,
+        self, motion: str, texts: str, name: str, split: Split | None, draft: ConversionPlan[ReleaseClip]
     ) -> Entry:
         original = original_of(name)
         captions = tuple(self._texts(f"{texts}/{name}.txt", draft))
-        problem = "in no split list" if unlisted and split is None else ""
         facts: dict[str, Fact] = {
             "subset": name.split("/")[0] if "/" in name else "",
             "mirrored": float(original is not None),
@@ -118,7 +101,7 @@ class Motion272(Release[Motion272Config]):
         stem = f"{motion}/{name}" if motion.endswith("_stream") else name
         return Entry(
             stem, f"{motion}/{name}.npy", captions, split, original or name, facts,
-            mirror_of=original, problem=problem,
+            mirror_of=original,
         )  # fmt: skip
 
     def _texts(self, file: str, draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:

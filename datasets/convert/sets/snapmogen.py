@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.splits import join_splits
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.sets.shared.vectors import walked
-from motionloom.datasets.schema import SPLITS, Split, UserError
+from motionloom.datasets.schema import UserError
 
 FPS, JOINTS = 30.0, 24
 WIDTH = 4 + 12 * JOINTS + 4
@@ -56,6 +55,7 @@ class SnapMoGen(Release[SnapMoGenConfig]):
     example = "SnapMoGen shards"
     config_class = SnapMoGenConfig
     terms = "SnapMoGen-noncommercial"
+    lists = ("data_split_info", "data_split_info1", "data_split_info2")
     published = Published("paper, NeurIPS 2025", {"clips": 20450, "hours": 43.7})
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
@@ -63,8 +63,7 @@ class SnapMoGen(Release[SnapMoGenConfig]):
         if not (source / FEATURES).is_dir():
             raise UserError(f"{source}: no {FEATURES}/ in it; give the folder of the release")
         records = require_record(read_json(source / CAPTIONS, CAPTIONS), CAPTIONS)
-        listed = self._splits(draft)
-        for key in dict.fromkeys([*records, *listed]):
+        for key in dict.fromkeys([*records, *(self.listed or {})]):
             where = f"{CAPTIONS}: '{key}'"
             record = require_record(records.get(key, {}), where)
             recording, *bounds = key.split("#")
@@ -72,18 +71,9 @@ class SnapMoGen(Release[SnapMoGenConfig]):
                 raise UserError(f"{where}: a clip is named NAME#FIRST#LAST, with frames for FIRST and LAST")
             texts = [text for kind in ("manual", "gpt") for text in captions_of(record.get(kind), kind)]
             yield Entry(
-                key, f"{FEATURES}/{recording}.npy", tuple(texts), listed.get(key), recording,
+                key, f"{FEATURES}/{recording}.npy", tuple(texts), None, recording,
                 {"recording": recording}, first=int(bounds[0]), last=int(bounds[1]),
-                problem="in no list of clips" if listed and key not in listed else "",
             )  # fmt: skip
-
-    def _splits(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split]:
-        """Split of every clip that the lists name; none without lists."""
-        folder = next(iter(sorted(self.config.source.glob("data_split_info*"))), None)
-        files = [(split, folder / f"{split}_ids.txt") for split in SPLITS] if folder else []
-        found, notes = join_splits((split, path) for split, path in files if path.is_file())
-        draft.notes += notes if found else ["no data_split_info/: split 80/5/15 by hash of the recording"]
-        return found
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return check_array_header(path, width=WIDTH, name=label), FPS

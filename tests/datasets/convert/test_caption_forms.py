@@ -18,7 +18,7 @@ from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.captions.names import label_words, subject_of, subject_splits
 from motionloom.datasets.convert.captions.options import list_clips
 from motionloom.datasets.convert.captions.read import read_captions
-from motionloom.datasets.convert.common.splits import SplitNames, hash_split, read_split_files
+from motionloom.datasets.convert.common.splits import hash_split, read_split_files
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.reader import ShardDataset
@@ -338,30 +338,16 @@ def test_clips_without_captions_stop_the_conversion_until_it_is_decided(source: 
 
 def test_names_of_splits(source: Path, tmp_path: Path) -> None:
     path = tmp_path / "c.csv"
-    path.write_text("name,caption,split\nwalk_a,walks,Validation\njump,jumps,fold 1\nsub/turn,turns,fold 2\n")
-    message = r":3: split 'fold 1' is none of train.*'fold 1' \(1\), 'fold 2' \(1\); say .*splits_map"
-    with pytest.raises(UserError, match=message):
+    path.write_text("name,caption,split\nwalk_a,walks,Validation\njump,jumps,fold 1\n")
+    with pytest.raises(UserError, match=r"c\.csv:3: split 'fold 1' is none of train"):
         plan(source, path)
-    mapped = plan(source, path, splits_map="fold 1=train, fold 2=drop")
-    assert {clip.id: split for split, clip in mapped.items} == {"walk_a": "val", "jump": "train"}
-    assert ["splits_map" in drop.reason for drop in mapped.dropped] == [True]
-    ignored = plan(source, path, splits_map="ignore")
-    assert {clip.id: split for split, clip in ignored.items} == {
-        "walk_a": "val",
-        **{name: hash_split(name) for name in ("jump", "sub/turn")},
-    }
-    for mapping in ("fold=dev", "=train", "fold"):
-        with pytest.raises(UserError, match=r"splits_map.*is not NAME=SPLIT"):
-            plan(source, path, splits_map=mapping)
 
 
 def test_split_files_by_other_names(tmp_path: Path) -> None:
-    for name in ("Train", "valid", "testing", "fold1", "all"):
+    for name in ("Train", "valid", "crossmodal_testing", "fold1", "all"):
         (tmp_path / f"{name}.txt").write_text(f"in {name}\n")
     splits, _ = read_split_files(tmp_path)
-    assert splits == {"in Train": "train", "in valid": "val", "in testing": "test"}
-    splits, _ = read_split_files(tmp_path, SplitNames("fold1=train,testing=ignore"))
-    assert splits == {"in Train": "train", "in fold1": "train", "in valid": "val"}
+    assert splits == {"in Train": "train", "in valid": "val", "in crossmodal_testing": "test"}
     counts = Counter(hash_split(f"clip {number}") for number in range(20_000))
     assert counts["train"] / 20_000 == pytest.approx(0.80, abs=0.01)
     assert counts["val"] / 20_000 == pytest.approx(0.05, abs=0.005)

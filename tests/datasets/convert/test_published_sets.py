@@ -202,7 +202,7 @@ def test_motionmillion_and_streams_have_other_trees(tmp_path: Path) -> None:
     assert [text.text for text in clip.entry.texts] == ["a person walks", "someone walks"]
     assert [row.stated for row in plan.audit_rows()] == [2_000_000, 2000]
     assert {drop.source: drop.reason for drop in plan.dropped} == {
-        "motion_data/vector_272/gv/b.npy": "in no split list"
+        "motion_data/vector_272/gv/b.npy": "in no split file"
     }
     trees.put(stream / "train_stream_text/seq1.txt", "stands*walks off#45")
     ((split, clip),) = planned("motion272", stream).plan.items

@@ -113,8 +113,6 @@ class BodyRelease(Release[Cfg]):
         """Seconds of every sound file that can be read."""
         self.sound_folder = config.source
         """Folder that `entry.sound` is relative to."""
-        self.sound_start = 0.0
-        """Second of a sound at which its motion begins."""
         self._cut = 0
         """Clips that end with their sound."""
 
@@ -168,7 +166,7 @@ class BodyRelease(Release[Cfg]):
     def cut_to_sound(self, entry: Entry, last: int, fps: float) -> tuple[int, str]:
         if entry.sound is None:
             return last, ""
-        seconds = max(self._sounds[entry.sound] - self.sound_start, 0.0)
+        seconds = self._sounds[entry.sound]
         end = min(last, int(seconds * fps + 1e-6))
         if last - end <= self.config.max_music_gap * fps:
             self._cut += end < last
@@ -220,7 +218,7 @@ class BodyRelease(Release[Cfg]):
         rows, wav = None, None
         if clip.entry.sound is not None:
             seconds = len(motion) / layout.fps
-            start = self.sound_start + clip.first / clip.fps
+            start = clip.first / clip.fps
             rows, wav = cut_of(self.config, self.sound_folder, clip.entry.sound, start, seconds)
         meta = meta.model_copy(update={"song": self.song(clip)})
         return Sample(meta, motion, texts=list(clip.entry.texts), audio=rows, wav=wav)

@@ -50,12 +50,12 @@ class BvhSetConfig(BvhConfig):
     def unfit(self, path: str) -> str:
         return "" if stem(path) in self.rows() else "not in the tables of the set"
 
-    def listing(self, paths: Sequence[str]) -> Listing:
+    def listing(self, paths: Sequence[str], readable: Sequence[str] | None = None) -> Listing:
         if self.captions is not None:
-            return super().listing(paths)
+            return super().listing(paths, readable)
         known, here = self.rows(), {stem(path): path for path in paths}
         rows = [
-            CaptionRow(name, row.texts, here[name], hash_split(row.group), False, None, name)
+            CaptionRow(name, row.texts, here[name], hash_split(row.group), None, name)
             for name, row in known.items()
             if name in here
         ]

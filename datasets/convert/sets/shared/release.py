@@ -23,7 +23,12 @@ from motionloom.datasets.convert.common.features import features_of, frames_afte
 from motionloom.datasets.convert.common.files import inside, read_in_threads
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan, drop
-from motionloom.datasets.convert.common.splits import hash_split, read_split_files
+from motionloom.datasets.convert.common.splits import (
+    hash_split,
+    keep_mirrors_together,
+    read_split_files,
+    split_files,
+)
 from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 
@@ -134,6 +139,10 @@ class Release(Converter[Cfg, ReleaseClip]):
 
     terms: ClassVar[str]
     """The licence of clips that state none of their own."""
+    lists: ClassVar[tuple[str, ...]] = ()
+    """Folders of the source that may hold its split files; the first that does counts."""
+    listed: dict[str, Split] | None = None
+    """Split of every clip of the split files; None without any."""
     settings = PlanSettings()
     """Workers and files that a plan uses; no effect on its result."""
 
@@ -156,7 +165,10 @@ class Release(Converter[Cfg, ReleaseClip]):
         if not config.source.is_dir():
             raise UserError(f"{config.source}: no such folder")
         draft = ConversionPlan[ReleaseClip](config, audit=Audit(self.stated()))
+        self.listed = self.split_lists(draft)
         entries = list(self.entries(draft))
+        if self.lists and self.listed is None and any(entry.split is None for entry in entries):
+            draft.notes.append("no split files: split 80/5/15 by hash")
         repeated = len(draft.dropped)
         if not entries:
             raise UserError(f"{config.source}: the lists of {self.title} name no clip in it")
@@ -167,13 +179,16 @@ class Release(Converter[Cfg, ReleaseClip]):
         for file, state in scanned.items():
             if isinstance(state, UserError):
                 draft.fail(file, state)
-        listed = self.split_lists()
+        named = {entry.id for entry in entries}
+        for clip_id, split in (self.listed or {}).items():
+            if clip_id not in named:
+                draft.miss(clip_id, f"listed in {split}.txt, but not in the source")
         for entry, reason in self.with_sound(entries, draft):
             state = scanned[entry.file]
             if state is None:
                 draft.miss(entry.file, f"clip '{entry.id}' is listed, but its file is not in the source")
             elif not isinstance(state, UserError):
-                clip, problem = self._clip(entry, state, listed, draft)
+                clip, problem = self._clip(entry, state, draft)
                 draft.settle(clip, entry.problem or reason or problem)
         draft.limit(lambda clip: clip.id)
         return draft.finish(
@@ -190,9 +205,17 @@ class Release(Converter[Cfg, ReleaseClip]):
         """Frames of a clip's features."""
         return frames_after(clip.last - clip.first, clip.fps, self.layout)
 
-    def split_lists(self) -> dict[str, Split] | None:
-        """Splits of clips by the user's own lists, which overrule the set's; None without any."""
-        return read_split_files(self.config.splits)[0] if self.config.splits else None
+    def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
+        """Split of every clip that the user's lists or else the set's own name; None without lists."""
+        source = self.config.source
+        here = [source / name for name in self.lists if split_files(source / name)]
+        folder = self.config.splits or next(iter(here), None)
+        if folder is None:
+            return None
+        splits, notes = read_split_files(folder)
+        keep_mirrors_together(splits, folder)
+        draft.notes += notes
+        return splits
 
     def with_sound(
         self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
@@ -215,11 +238,7 @@ class Release(Converter[Cfg, ReleaseClip]):
             return error
 
     def _clip(
-        self,
-        entry: Entry,
-        state: tuple[int, float, int],
-        listed: dict[str, Split] | None,
-        draft: ConversionPlan[ReleaseClip],
+        self, entry: Entry, state: tuple[int, float, int], draft: ConversionPlan[ReleaseClip]
     ) -> tuple[ReleaseClip, str]:
         """The clip of an entry whose file is there, and why it is left out."""
         config, (frames, fps, size) = self.config, state
@@ -234,16 +253,15 @@ class Release(Converter[Cfg, ReleaseClip]):
             else:
                 draft.notes.append(f"{entry.id}: a caption at {text.start:g} s is beyond its {seconds:.1f} s")
         entry = replace(entry, texts=tuple(texts))
-        split = entry.split or hash_split(entry.group or entry.id)
-        if listed is not None:
-            split = listed.get(entry.id, split)
+        listed = self.listed if self.listed is not None else {entry.id: entry.split}
+        split = listed.get(entry.id) or entry.split or hash_split(entry.group or entry.id)
         licence = config.licence or entry.licence or self.terms
         clip = ReleaseClip(entry, split, min(entry.first, last), last, fps, licence, size)
         if not texts:
             draft.uncaptioned.append(clip.label())
         reason = (
             mute
-            or ("" if listed is None or entry.id in listed else "in no split file")
+            or ("" if entry.id in listed else "in no split file")
             or ("" if texts or config.uncaptioned == "keep" else "no usable caption")
             or config.licence_problem(licence)
             or config.length_problem(clip.seconds)
