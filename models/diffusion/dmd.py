@@ -26,11 +26,10 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from motionloom.models.diffusion.network import step_waves
-from motionloom.models.diffusion.schedule import ScheduleConfig, Scheduler
+from motionloom.models.diffusion.schedule import ScheduleConfig
 from motionloom.models.gpt.tokens import stream_names
 from motionloom.models.layers.transformer import StackConfig, Transformer, length_mask, sinusoid
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
-from motionloom.models.training.distributed import masked_mean
 
 
 class DmdConfig(StackConfig):
@@ -148,39 +147,3 @@ class Dmd(nn.Module):
     def _stack(self, layers: int) -> Transformer:
         config = self.config
         return Transformer(config, layers, attention_dropout=config.attention_dropout)
-
-
-def dmd_loss(
-    net: Dmd,
-    noiser: Scheduler,
-    motion: Tensor,
-    codes: Mapping[str, Tensor],
-    length: Tensor,
-    step: Tensor,
-    noise: Tensor,
-    *,
-    hidden: Tensor | None = None,
-    present: Tensor | None = None,
-) -> Tensor:
-    """Squared error of the predicted noise, mean over the real frames of all ranks (equation 10), and of what
-    is predicted between frames, by `velocity_weight`.
-
-    Args:
-        noiser: `config.schedule.noiser()`.
-        motion: [B, T, D], normalised.
-        codes: Its tokens, per stream int64 [B, G * per_group], 4 G >= T.
-        length: int64 [B], frames.
-        step: int64 [B], time steps.
-        noise: [B, T, D], standard normal.
-        present: bool [B, D], columns that count (None = all).
-    """
-    found = net(noiser.add_noise(motion, noise, step), step, codes, length, hidden)
-    target = motion if net.config.schedule.predicts == "sample" else noise
-    error = found - target.to(found.dtype)
-    loss = masked_mean(error.square(), length_mask(length, motion.shape[1]), present)
-    # A difference of frames counts where both of them are real.
-    weight = net.config.velocity_weight
-    if weight:
-        between = length_mask(length - 1, motion.shape[1] - 1)
-        loss = loss + weight * masked_mean(error.diff(dim=1).square(), between, present)
-    return loss

@@ -3,7 +3,7 @@
 At every denoising step the predicted clean motion is replaced by the known one where there is one (MDM's
 editing). The prediction is corrected near the boundary of known frames and smoothed [ours], and a gradient
 step reduces its distance to the root's known places and headings and to pinned joints, recovered in metres
-(`recovery.py`) [ours]. The in-betweener also observes all that is known but the pins.
+(`observed.py`) [ours]. The in-betweener also observes all that is known but the pins.
 
 Motions longer than the training's are made in overlapping windows that agree at every step, and spans of
 other captions are windows of their own: a frame is the mean of the predictions for it, weighed by how much it
@@ -24,10 +24,8 @@ import torch
 from torch import Tensor
 from torch.func import jvp
 
-from motionloom.models.diffusion.inbetweener import InBetweener
-from motionloom.models.diffusion.network import TextDenoiser
-from motionloom.models.diffusion.observed import Places, observed_columns
-from motionloom.models.diffusion.recovery import Recovery, turned_back
+from motionloom.models.diffusion.network import InBetweener, TextDenoiser
+from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, turned_back
 from motionloom.models.diffusion.sampling import blend_weights, window_starts
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.frozen import evaluating

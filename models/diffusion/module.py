@@ -12,9 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from motionloom.models.diffusion.dmd import Dmd, dmd_loss
-from motionloom.models.diffusion.inbetweener import InBetweener
-from motionloom.models.diffusion.network import TextDenoiser
+from motionloom.models.diffusion.dmd import Dmd
+from motionloom.models.diffusion.network import InBetweener, TextDenoiser
 from motionloom.models.diffusion.observed import Observations
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
@@ -36,6 +35,7 @@ class DenoiserModule(StageModule):
         """Return the loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present"
         bool [B, D] (optional: all). Time steps and noise are drawn in each call.
         """
+        batch = self.prepared(batch)
         motion, schedule = batch["motion"], self.net.config.schedule
         mask = length_mask(batch["length"], motion.shape[1])
         step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
@@ -43,6 +43,10 @@ class DenoiserModule(StageModule):
         predicted = self.predict(self.noiser.add_noise(motion, noise, step), step, batch, mask)
         target = motion if schedule.predicts == "sample" else noise
         return {"loss": self.mean(predicted - target.to(predicted.dtype), mask, batch.get("present"))}
+
+    def prepared(self, batch: Batch) -> Batch:
+        """Return the batch with what is noised as "motion" and its "length"."""
+        return batch
 
     def predict(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
         """Return the network's prediction [B, T, D] for noisy motions at step [B]; mask bool [B, T]."""
@@ -98,7 +102,7 @@ class InBetweenModule(TextDenoiserModule):
         return loss + self.net.config.velocity_weight * speed_error
 
 
-class DmdModule(StageModule):
+class DmdModule(DenoiserModule):
     """Trains a `Dmd` on windows of motion; the tokenizer that makes their tokens is frozen."""
 
     net: Dmd
@@ -107,26 +111,31 @@ class DmdModule(StageModule):
         self, net: Dmd, optim: OptimConfig, *, seed: int, max_steps: int, tokenizer: Tokenizer
     ) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.noiser = net.config.schedule.noiser()
         self.tokenizer = Frozen(tokenizer)
 
-    def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Loss of one batch: "motion" [B, T, D] (the tokenizer's columns), "length" [B], "present" bool
-        [B, D] (optional: all). Time steps and noise are drawn in each call.
+    @torch.no_grad()
+    def prepared(self, batch: Batch) -> Batch:
+        """Return the batch with its motion in the tokenizer's coordinates, and their tokens as "codes"."""
+        tokenizer, motion, present = self.tokenizer.module, batch["motion"], batch.get("present")
+        length = (batch["length"] // GROUP_FRAMES).clamp(min=1) * GROUP_FRAMES
+        codes = tokenizer.encode(motion, length, present)
+        return {**batch, "motion": tokenizer.coordinates(motion, present), "length": length, "codes": codes}
+
+    def predict(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
+        length, size = batch["length"], -(-noisy.shape[1] // GROUP_FRAMES)
+        hidden = hidden_stretch(length // GROUP_FRAMES, size, self.net.config.hide)
+        predicted: Tensor = self.net(noisy, step, batch["codes"], length, hidden)
+        return predicted
+
+    def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
+        """Return the mean over the real frames of all ranks (equation 10), and by `velocity_weight` that of
+        the error between frames.
         """
-        motion, present = batch["motion"], batch.get("present")
-        groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
-        length = groups * GROUP_FRAMES
-        with torch.no_grad():
-            codes = self.tokenizer.module.encode(motion, length, present)
-            seen = self.tokenizer.module.coordinates(motion, present)
-        step = torch.randint(0, self.net.config.schedule.steps, (len(motion),), device=motion.device)
-        noise = torch.randn_like(seen)
-        hidden = hidden_stretch(groups, -(-motion.shape[1] // GROUP_FRAMES), self.net.config.hide)
-        loss = dmd_loss(
-            self.net, self.noiser, seen, codes, length, step, noise, hidden=hidden, present=present
-        )
-        return {"loss": loss}
+        loss, weight = super().mean(error, mask, present), self.net.config.velocity_weight
+        # A difference of frames counts where both of them are real.
+        if weight:
+            loss = loss + weight * masked_mean(error.diff(dim=1).square(), mask[:, 1:], present)
+        return loss
 
 
 def hidden_stretch(groups: Tensor, size: int, share: float) -> Tensor | None:

@@ -12,10 +12,11 @@ Legend: n motions, T frames, D features, K windows, W frames of a window.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd
@@ -27,7 +28,6 @@ from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 
 
-@torch.no_grad()
 def sample_motions(
     net: TextDenoiser,
     text: Tensor,
@@ -38,12 +38,42 @@ def sample_motions(
     steps: int = 50,
     guidance: float = 1.0,
 ) -> list[Tensor]:
-    """Normalised motions [T, D] for text vectors [n, E], one length and one seed each (`by_length`).
+    """Normalised motions [T, D] for text vectors [n, E], one length and one seed each (`sample_guided`)."""
 
-    `guidance` 1 is off; above it both passes go through one forward. `UserError` for guidance of a model that
-    never trained without text, and for more `steps` than the training's.
+    def predict(noisy: Tensor, step: Tensor, text: Tensor, conditioned: Tensor) -> Tensor:
+        mask = torch.ones(noisy.shape[:2], dtype=torch.bool, device=noisy.device)
+        found: Tensor = net(noisy, step, text, mask, conditioned)
+        return found
+
+    how = {"seeds": seeds, "sampler": sampler, "steps": steps, "guidance": guidance}
+    return sample_guided(net, predict, text, frames, net.motion_dim, **how)  # type: ignore[arg-type]
+
+
+@torch.no_grad()
+def sample_guided(
+    net: nn.Module,
+    predict: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor],
+    text: Tensor,
+    frames: Sequence[int],
+    dim: int,
+    *,
+    seeds: Sequence[int],
+    sampler: Sampler,
+    steps: int,
+    guidance: float,
+) -> list[Tensor]:
+    """Sequences [T, dim] for text vectors [n, E], one length and one seed each (`by_length`).
+
+    Args:
+        net: A denoiser, whose config has `condition_dropout` and `schedule`; is left in evaluation mode.
+        predict: Its output [B, T, dim] for noisy sequences, time steps [B], text [B, E] and conditioned [B].
+        guidance: 1 is off; else both passes go through one forward.
+
+    `UserError` for guidance of a model that never trained without text, and for more `steps` than the
+    training's.
     """
-    if guidance != 1 and net.config.condition_dropout == 0:
+    config: Any = net.config
+    if guidance != 1 and config.condition_dropout == 0:
         raise UserError(
             "guidance needs a diffusion model trained with condition_dropout > 0; set cfg_scale, of a face "
             "face_cfg_scale, to 1"
@@ -56,16 +86,16 @@ def sample_motions(
         # Rows with their text first, then the same rows without, in one forward pass.
         both = text[rows].repeat(1 + guided, 1)
         conditioned = torch.arange(len(both), device=text.device) < count
-        mask = torch.ones(len(both), x.shape[1], dtype=torch.bool, device=text.device)
 
-        def predict(given: Tensor, step: Tensor) -> Tensor:
-            given, steps = given.repeat(1 + guided, 1, 1), step.to(text.device).expand(len(both))
-            found: Tensor = net(given, steps, both, mask, conditioned)
+        def step(given: Tensor, at: Tensor) -> Tensor:
+            steps = at.to(text.device).expand(len(both))
+            found = predict(given.repeat(1 + guided, 1, 1), steps, both, conditioned)
             return found[count:] + guidance * (found[:count] - found[count:]) if guided else found
 
-        return net.config.schedule.denoise(predict, x, noise, sampler, steps)
+        denoised: Tensor = config.schedule.denoise(step, x, noise, sampler, steps)
+        return denoised
 
-    return by_length(frames, seeds, net.motion_dim, text.device, denoised)
+    return by_length(frames, seeds, dim, text.device, denoised)
 
 
 @torch.no_grad()

@@ -7,6 +7,10 @@ a patch, after PatchGAN.
 Frames after a clip's length are zeroed before anything reads them, so padding does not reveal which
 motions were generated, and a clip in a padded batch gives what it gives alone.
 
+The generator minimises -E D(G(p), q), equation 6. The paper leaves the discriminator's own loss open; it is
+the hinge loss [ours]: equation 6 is the generator's half of exactly that pair, the generator's gradient does
+not fade when the discriminator is sure, and a discriminator that is right by a margin is not pushed further.
+
 Legend: B batch, T frames, D motion features, E condition width, P = ceil(T / 4) patches, C width.
 """
 
@@ -20,8 +24,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm
 
+from motionloom.datasets.schema import Config
 from motionloom.models.layers.strided import StridedEncoder
 from motionloom.models.layers.transformer import StackConfig, Transformer, length_mask, sinusoid
+from motionloom.models.training.distributed import masked_mean
+from motionloom.models.training.optim import OptimConfig
 
 PATCH = 4
 """Frames of a patch."""
@@ -78,3 +85,54 @@ class PatchDiscriminator(nn.Module):
         score = self.score(self.stack(x, mask))[..., 0]
         score = score.to(torch.promote_types(score.dtype, torch.float32))
         return Validity(score.masked_fill(~mask, 0.0), mask)
+
+
+class AdversarialConfig(Config):
+    """Weights of the adversarial terms."""
+
+    weight: float = Field(default=1.0, ge=0)
+    """beta_adv of equation 4; 0 leaves the term out. The public demo has 0.1."""
+    gumbel_temperature: float = Field(default=1.0, gt=0)
+    """Temperature of the straight-through draw of tokens [ours]."""
+    sample: bool = True
+    """Draw the tokens that are decoded for the discriminator; false takes the likeliest [ours]."""
+
+
+def discriminator_loss(real: Validity, fake: Validity) -> dict[str, Tensor]:
+    """`loss` = E max(0, 1 - D(real)) + E max(0, 1 + D(fake)), its halves `real` and `fake`, and `accuracy`,
+    the share of patches on the right side of 0.
+
+    Each expectation is the mean over the real patches of all ranks.
+    """
+    terms = {
+        "real": masked_mean(functional.relu(1 - real.score), real.mask),
+        "fake": masked_mean(functional.relu(1 + fake.score), fake.mask),
+    }
+    right = masked_mean((real.score > 0).float(), real.mask) + masked_mean(
+        (fake.score < 0).float(), fake.mask
+    )
+    return {"loss": terms["real"] + terms["fake"], **terms, "accuracy": right / 2}
+
+
+def generator_loss(fake: Validity) -> Tensor:
+    """-E D(G(p), q), mean over the real patches of all ranks (equation 6)."""
+    return masked_mean(-fake.score, fake.mask)
+
+
+class UttLossConfig(Config):
+    """The loss of MATE and UTT."""
+
+    adversarial: AdversarialConfig = AdversarialConfig()
+    adversarial_start: int = Field(0, ge=0)
+    """First step with the adversarial term, and the discriminator's first step."""
+    adversarial_ramp: int = Field(0, ge=0)
+    """Steps over which its weight rises from 0."""
+    discriminator: DiscriminatorConfig = DiscriminatorConfig()
+    discriminator_optim: OptimConfig = OptimConfig(optimizer="adam", betas=(0.5, 0.99))
+
+    def weight(self, step: int) -> float:
+        since = step - self.adversarial_start
+        if since < 0:
+            return 0.0
+        rise = 1.0 if self.adversarial_ramp == 0 else min(1.0, (since + 1) / self.adversarial_ramp)
+        return self.adversarial.weight * rise

@@ -16,8 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from motionloom.datasets.schema import Config
-from motionloom.models.gpt.token_network import TokenNetwork
-from motionloom.models.gpt.tokens import PAD
+from motionloom.models.gpt.tokens import PAD, TokenNetwork
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.distributed import masked_mean
 

@@ -26,8 +26,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.token_network import TokenNetwork
-from motionloom.models.gpt.tokens import closing_length
+from motionloom.models.gpt.tokens import TokenNetwork, closing_length
 from motionloom.models.layers.transformer import KVCache, StackConfig, Transformer
 from motionloom.models.tokenizer.base import Stream
 

@@ -9,7 +9,7 @@ the length of its training clips it knows nothing, and a walk would stand still 
 clip ends with, which is often a figure that slows down, it would go on no better. Clips that a text begins
 alone have their first groups in common: what it leaves open, such as how fast, stays as it was drawn.
 
-Draws are those of `drawing.py`, in the same order as `sampling.generate`: as long as the text stays and no
+Draws are those of `sampling.generate`, in the same order: as long as the text stays and no
 block is over, the tokens are those of a motion of a requested length.
 """
 
@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from motionloom.models.gpt.drawing import Drawing, next_token
 from motionloom.models.gpt.network import InterleavedGPT
+from motionloom.models.gpt.sampling import Drawing, next_token
 from motionloom.models.layers.transformer import KVCache
 
 OPENING = 2

@@ -19,8 +19,12 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from motionloom.models.condition.mate import Encoded, drop_conditions
-from motionloom.models.discriminator.losses import discriminator_loss, generator_loss
-from motionloom.models.discriminator.patch import PatchDiscriminator
+from motionloom.models.discriminator.patch import (
+    PatchDiscriminator,
+    UttLossConfig,
+    discriminator_loss,
+    generator_loss,
+)
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.tokens import TokenSequence, interleave
@@ -28,7 +32,6 @@ from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import Batch, Execution
-from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.network import ConditionedUtt
 
 

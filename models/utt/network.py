@@ -30,8 +30,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded, Mate, MateConfig
-from motionloom.models.gpt.token_network import TokenNetwork
-from motionloom.models.gpt.tokens import closing_length
+from motionloom.models.gpt.tokens import TokenNetwork, closing_length
 from motionloom.models.layers.transformer import StackConfig, Transformer
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
 from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State

@@ -1,7 +1,7 @@
 """Sampling motion tokens from a `Utt`: cached, guided, of any length, and continuing other tokens.
 
 Notable choices:
-- Noise and draws come from counter-based streams keyed by each sample's own seed, as in `gpt/drawing.py`: a
+- Noise and draws come from counter-based streams keyed by each sample's own seed, as in `gpt/sampling.py`: a
   sample depends on its conditions, its seed and the settings, and on nothing else in the batch.
 - `start` gives tokens that come before the first new one, e.g. those of a segment with other conditions, so
   that a motion goes on across a change from text to music (UDE section 4.4) [ours].
@@ -22,12 +22,56 @@ from torch.nn.functional import pad
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.drawing import Drawing, decode, requested_groups, seeds_of, uniform_numbers
 from motionloom.models.gpt.frozen import evaluating
+from motionloom.models.gpt.sampling import Drawing, decode, requested_groups, seeds_of, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, as_codes
 from motionloom.models.utt.backbone import State
-from motionloom.models.utt.continuing import last_groups, window_start
 from motionloom.models.utt.network import Utt
+
+
+def window_start(count: int, block: int, size: int) -> int:
+    """First token that is seen when token number `count` is drawn: 0 while the start vector and all tokens
+    before fit into `block` inputs, then by whole halves of the block's groups further.
+    """
+    if count < block:
+        return 0
+    hop = max(1, block // size // 2) * size
+    return -(-(count + 1 - block) // hop) * hop
+
+
+def join(first: Codes, second: Codes, pattern: Sequence[str]) -> Codes:
+    """The groups of `first`, then those of `second`, row by row; codes after `groups` are 0."""
+    groups = first.groups + second.groups
+    longest = int(groups.max()) if len(groups) else 0
+    codes = {}
+    for name, a in first.codes.items():
+        per = list(pattern).count(name)
+        pool = torch.cat([a, second.codes[name], a.new_zeros(len(a), 1)], dim=1)
+        at = torch.arange(longest * per, device=a.device)[None]
+        end = first.groups[:, None] * per
+        index = torch.where(at < end, at, at - end + a.shape[1])
+        index = torch.where(at < groups[:, None] * per, index, pool.shape[1] - 1)
+        codes[name] = pool.gather(1, index)
+    return Codes(codes, groups)
+
+
+def last_groups(codes: Codes, pattern: Sequence[str], count: int | None = None) -> tuple[Tensor, Tensor]:
+    """The last `count` groups of each row (None: all) as interleaved tokens int64 [B, G * P], 0 after a
+    row's own, and their numbers int64 [B].
+    """
+    groups = codes.groups
+    kept = groups if count is None else groups.clamp(max=count)
+    most = int(kept.max()) if len(kept) else 0
+    at = (groups - kept)[:, None] + torch.arange(most, device=groups.device)
+    slots = []
+    for slot, name in enumerate(pattern):
+        per = list(pattern).count(name)
+        groups_of = codes.codes[name].reshape(len(groups), codes.codes[name].shape[1] // per, per)
+        here = groups_of[:, :, list(pattern[:slot]).count(name)]
+        slots.append(here.gather(1, at.clamp(max=max(0, here.shape[1] - 1))))
+    rows = torch.stack(slots, dim=2)
+    valid = torch.arange(most, device=groups.device)[None] < kept[:, None]
+    return torch.where(valid[..., None], rows, 0).flatten(1), kept
 
 
 def draw_z(seeds: Sequence[int], dim: int) -> Tensor:

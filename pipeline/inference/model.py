@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import sample_seeds
+from motionloom.models.gpt.sampling import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig

@@ -12,11 +12,9 @@ from torch import Tensor
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.figure_parts import PIECES
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
 from motionloom.models.diffusion.module import DenoiserModule, InBetweenModule, TextDenoiserModule
-from motionloom.models.diffusion.network import TextDenoiserConfig
-from motionloom.models.diffusion.observed import Observations
-from motionloom.models.diffusion.recovery import Recovery
+from motionloom.models.diffusion.network import InBetweenConfig, InBetweener, TextDenoiserConfig
+from motionloom.models.diffusion.observed import Observations, Recovery
 from motionloom.models.evaluator.module import EvaluatorModule
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.models.gpt.losses import GptLossConfig
@@ -33,13 +31,13 @@ from motionloom.models.tokenizer.single import FsqConfig, MqConfig, RvqConfig
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 from motionloom.pipeline.baselines.mdm.network import Mdm
-from motionloom.pipeline.baselines.mld.losses import MotionVaeLossConfig
 from motionloom.pipeline.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
 from motionloom.pipeline.baselines.mld.network import (
     LatentDenoiser,
     LatentDiffusionConfig,
     MotionVae,
     MotionVaeConfig,
+    MotionVaeLossConfig,
 )
 from motionloom.pipeline.baselines.motionclip.module import MotionClipModule
 from motionloom.pipeline.baselines.motionclip.network import (
@@ -52,9 +50,13 @@ from motionloom.pipeline.baselines.motiondiffuse.network import (
     MotionDiffuse,
     MotionDiffuseConfig,
 )
-from motionloom.pipeline.baselines.tm2t.losses import CaptionLossConfig, Seq2SeqLossConfig
 from motionloom.pipeline.baselines.tm2t.module import CaptionerModule, Seq2SeqModule
-from motionloom.pipeline.baselines.tm2t.network import Captioner, CaptionerConfig
+from motionloom.pipeline.baselines.tm2t.network import (
+    Captioner,
+    CaptionerConfig,
+    CaptionLossConfig,
+    Seq2SeqLossConfig,
+)
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig
 from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig
 

@@ -24,13 +24,13 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import DmdModule
+from motionloom.models.discriminator.patch import UttLossConfig
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.tokenizer.single import MqConfig
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
-from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import ConditionedUtt, UttConfig
 from motionloom.pipeline.baselines.bailando.codes import DanceVq, DanceVqConfig
@@ -38,8 +38,8 @@ from motionloom.pipeline.baselines.bailando.module import ActorCriticModule, Cro
 from motionloom.pipeline.baselines.bailando.network import ActorCritic, CrossGpt, CrossGptConfig, RewardConfig
 from motionloom.pipeline.baselines.fact.module import FactModule
 from motionloom.pipeline.baselines.fact.network import Fact, FactConfig
-from motionloom.pipeline.baselines.tm2t.losses import CriticConfig
 from motionloom.pipeline.baselines.tm2t.module import AdversarialTokenizerModule
+from motionloom.pipeline.baselines.tm2t.network import CriticConfig
 from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig, Tm2tQuantizer
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trainer import fit

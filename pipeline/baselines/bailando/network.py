@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config
-from motionloom.models.gpt.drawing import draw
+from motionloom.models.gpt.sampling import draw
 from motionloom.models.layers.transformer import StackConfig, Transformer
 
 

@@ -2,30 +2,80 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field
 
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.motion.layout import Part
+from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.baselines.fact.generator import FactGenerator
 from motionloom.pipeline.baselines.fact.network import Fact, FactConfig
-from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
 from motionloom.pipeline.stages.networks.captions import part_columns, part_of
-from motionloom.pipeline.stages.networks.clips import MUSIC, clip_batches, motion_example, spread_dances
+from motionloom.pipeline.stages.networks.clips import (
+    MUSIC,
+    clip_batches,
+    motion_example,
+    music_of,
+    spread_dances,
+)
 from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
     from motionloom.pipeline.baselines.fact.module import FactModule
+
+
+@dataclass(frozen=True)
+class FactGenerator:
+    """One dance for each music; it draws nothing, so the motion that it begins with makes the difference."""
+
+    net: Fact
+    layout: MotionLayout
+    part: Part
+    given: Mapping[str, Any]
+    """The stage's loaded inputs; "stats" and "audio" are read."""
+    method = "fact"
+    modalities = frozenset({"audio"})
+    settings = frozenset[str]()
+    unit_frames = 1
+    max_frames = None
+    decides_length = False
+
+    @property
+    def prepared(self) -> Mapping[str, object]:
+        return {"audio": self.given.get("audio")}
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(seed_frames=self.net.config.motion_frames)
+
+    def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
+        """Features in their own units; without seed motions each goes on from a kept one, by its seed."""
+        lengths = request.lengths("FACT")
+        columns, stats = self.layout.part(self.part), self.given["stats"]
+        mean, std = stats.mean[columns], stats.std[columns]
+        if request.seed_motions is None:
+            begun = self.net.kept[[seed % len(self.net.kept) for seed in request.seeds]]
+        else:
+            begun = torch.from_numpy((np.stack(list(request.seed_motions)) - mean) / std)
+        made = self.net.go_on(
+            begun.to(device_of(self.net), torch.float32), music_of(request, self.given), max(lengths)
+        )
+        own = np.asarray(made.cpu().numpy() * std + mean, np.float32)
+        return [motion[:count] for motion, count in zip(own, lengths, strict=True)]
 
 
 class FactStageConfig(TrainedStageConfig):

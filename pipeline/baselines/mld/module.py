@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
+from motionloom.models.diffusion.module import DenoiserModule
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tma.losses import kl_divergence, reconstruction_loss
 from motionloom.models.training.joints_module import JointsModule
-from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
-from motionloom.pipeline.baselines.mld.losses import MotionVaeLossConfig, smooth_l1_of_joints
-from motionloom.pipeline.baselines.mld.network import LatentDenoiser, MotionVae, mask_missing
+from motionloom.models.training.stage_module import Batch, OptimConfig
+from motionloom.pipeline.baselines.mld.network import (
+    LatentDenoiser,
+    MotionVae,
+    MotionVaeLossConfig,
+    mask_missing,
+    smooth_l1_of_joints,
+)
 
 
 class MotionVaeModule(JointsModule):
@@ -42,7 +47,7 @@ class MotionVaeModule(JointsModule):
         return {"loss": loss, **losses}
 
 
-class LatentDiffusionModule(StageModule):
+class LatentDiffusionModule(DenoiserModule):
     """Trains a `LatentDenoiser` on captioned `ConditionBatches`; the auto-encoder is frozen, dropout off."""
 
     net: LatentDenoiser
@@ -51,27 +56,25 @@ class LatentDiffusionModule(StageModule):
         self, net: LatentDenoiser, optim: OptimConfig, *, seed: int, max_steps: int, vae: MotionVae
     ) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.noiser = net.config.schedule.noiser()
         self.vae = Frozen(vae)
 
-    def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Loss of one batch: as of the auto-encoder, and "conditions" with "text".
+    @torch.no_grad()
+    def prepared(self, batch: Batch) -> Batch:
+        """Return the latents of motions as "motion" [B, K, C]: drawn in training, else their means."""
+        motion = batch["motion"]
+        mask = length_mask(batch["length"], motion.shape[1])
+        mu, logvar = self.vae.module.encode(mask_missing(motion, batch.get("present")), mask)
+        z = drawn(mu, logvar) if self.training else mu
+        return {**batch, "motion": z, "length": torch.full((len(z),), z.shape[1], device=z.device)}
 
-        Time steps, noise and, in training, latents are drawn in each call; in evaluation no text is hidden.
-        """
-        motion, text = batch["motion"], batch["conditions"]["text"].pooled
-        config = self.net.config
-        with torch.no_grad():
-            mask = length_mask(batch["length"], motion.shape[1])
-            mu, logvar = self.vae.module.encode(mask_missing(motion, batch.get("present")), mask)
-            z = drawn(mu, logvar) if self.training else mu
-        step = torch.randint(0, config.schedule.steps, (len(z),), device=z.device)
-        noise = torch.randn_like(z)
-        hidden = config.condition_dropout if self.training else 0.0
-        conditioned = torch.rand(len(z), device=z.device) >= hidden
-        found = self.net(self.noiser.add_noise(z, noise, step), step, text, conditioned)
-        target = z if config.schedule.predicts == "sample" else noise
-        return {"loss": F.mse_loss(found, target.float())}
+    def predict(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
+        hidden = self.net.config.condition_dropout if self.training else 0.0
+        conditioned = torch.rand(len(noisy), device=noisy.device) >= hidden
+        predicted: Tensor = self.net(noisy, step, batch["conditions"]["text"].pooled, conditioned)
+        return predicted
+
+    def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
+        return error.square().mean()
 
 
 def drawn(mu: Tensor, logvar: Tensor) -> Tensor:

@@ -5,7 +5,8 @@ latent in front of the frames, whose outputs are its mean and the logarithm of i
 queries are positions alone and attend to the latents.
 
 Published sizes: 18.03 M and 8.35 M parameters. Of the latter 128,000 are a table of positions that the
-published network never reads, and this one does not have.
+published network never reads, and this one does not have. The published means of losses run over padding
+too, where both sides are zero; these run over real frames alone [ours].
 
 Legend: B batch, T frames, D motion features, K latents, C width, E text width.
 """
@@ -15,14 +16,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from motionloom.datasets.motion.features.torch_joints import present_joints, torch_joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import Config, UserError
 from motionloom.models.diffusion.network import step_waves
 from motionloom.models.diffusion.schedule import ScheduleConfig
 from motionloom.models.layers.transformer import SkipTransformer, StackConfig, length_mask
+from motionloom.models.training.distributed import masked_mean
 
 
 class UConfig(StackConfig):
@@ -164,3 +168,25 @@ def mask_missing(x: Tensor, present: Tensor | None) -> Tensor:
 
 def _stack(config: UConfig, *, memory: bool = False) -> SkipTransformer:
     return SkipTransformer(config, config.layers, attention_dropout=config.attention_dropout, memory=memory)
+
+
+class MotionVaeLossConfig(Config):
+    """Weights; the defaults are the published ones."""
+
+    features: float = Field(default=1.0, ge=0)
+    joints: float = Field(default=1.0, ge=0)
+    kl: float = Field(default=1e-4, ge=0)
+
+
+def smooth_l1_of_joints(
+    pred: Tensor, target: Tensor, layout: MotionLayout, mask: Tensor, present: Tensor | None = None
+) -> Tensor:
+    """SmoothL1 of the joints in metres, mean over real frames and the joints that each clip holds.
+
+    pred, target [B, T, D] in their own units; mask bool [B, T]; present bool [B, D] (None = all).
+    """
+    with torch.autocast(pred.device.type, enabled=False):
+        found, wanted = (torch_joints_of(motion, layout) for motion in (pred.float(), target.float()))
+        error = F.smooth_l1_loss(found, wanted, reduction="none").flatten(2)
+        held = None if present is None else present_joints(present, layout).repeat_interleave(3, dim=1)
+        return masked_mean(error, mask, held)

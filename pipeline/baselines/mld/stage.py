@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import torch
 from pydantic import model_validator
+from torch import Tensor
 
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
-from motionloom.models.layers.transformer import name_in_torch
+from motionloom.models.diffusion.sampling import sample_guided
+from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.layers.transformer import length_mask, name_in_torch
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.baselines.mld.generator import LatentMotion
-from motionloom.pipeline.baselines.mld.losses import MotionVaeLossConfig
 from motionloom.pipeline.baselines.mld.network import (
     LatentDenoiser,
     LatentDiffusionConfig,
     LoadedMotionVae,
     MotionVae,
     MotionVaeConfig,
+    MotionVaeLossConfig,
 )
-from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest, MotionGenerator
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, Stage, register
+from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     CaptionStage,
@@ -34,6 +39,7 @@ from motionloom.pipeline.stages.networks.captions import (
 )
 from motionloom.pipeline.stages.networks.clips import clip_batches, motion_example
 from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.weights import ModelFacts, Release
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
@@ -41,8 +47,58 @@ from motionloom.pipeline.training.trained_stage import Batches, Example, Log, Tr
 if TYPE_CHECKING:
     from motionloom.pipeline.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
 
+
 _OPTIM = OptimConfig(weight_decay=0.01, betas=(0.9, 0.999))
 """AdamW as published, at 1e-4."""
+
+
+def sample_latents(
+    net: LatentDenoiser,
+    text: Tensor,
+    *,
+    seeds: Sequence[int],
+    sampler: Sampler = "ddim",
+    steps: int = 50,
+    guidance: float = 7.5,
+) -> Tensor:
+    """Latents [n, K, C] for text vectors [n, E], one seed each (`sample_guided`)."""
+    sizes, how = [net.latent_tokens] * len(text), {"sampler": sampler, "steps": steps, "guidance": guidance}
+    return torch.stack(sample_guided(net, net, text, sizes, net.config.dim, seeds=seeds, **how))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class LatentMotion(WholeMotion):
+    """A latent is denoised under a sentence embedding and decoded to all frames at once."""
+
+    net: LatentDenoiser
+    vae: LoadedMotionVae
+    who = "this latent diffusion model"
+    method = "mld"
+    settings = frozenset({"cfg_scale", "sampler", "denoising_steps"})
+
+    @property
+    def max_frames(self) -> int | None:
+        """Return the longest motion of the decoder's training."""
+        return self.vae.max_frames
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return Capabilities(denoising=self.denoising)
+
+    def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
+        """As asked for, or else DDIM in 50 steps, as published, or the training's where those are fewer."""
+        steps = sampling.denoising_steps or min(50, self.net.config.schedule.steps)
+        return sampling.sampler or "ddim", steps
+
+    def normalised(self, request: GenerationRequest, frames: Sequence[int]) -> list[Tensor]:
+        sampler, steps = self.denoising(request.sampling)
+        text = request.pooled_text(self.who).to(device_of(self.net))
+        latents = sample_latents(
+            self.net, text, seeds=request.seeds, sampler=sampler, steps=steps,
+            guidance=request.sampling.cfg_scale,
+        )  # fmt: skip
+        mask = length_mask(torch.as_tensor(frames, device=latents.device), max(frames))
+        return [made[:count] for made, count in zip(self.vae.net.decode(latents, mask), frames, strict=True)]
 
 
 class MotionVaeStageConfig(CaptionStageConfig):

@@ -36,7 +36,9 @@ from motionloom.models.training.alternating import AlternatingModule, OptimizerG
 from motionloom.models.training.distributed import masked_mean, sum_over_ranks, sum_over_ranks_with_grad
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import Batch, Execution, StageModule
-from motionloom.pipeline.baselines.tm2t.losses import (
+from motionloom.pipeline.baselines.tm2t.network import (
+    PAD,
+    Captioner,
     CaptionLossConfig,
     CriticConfig,
     Seq2SeqLossConfig,
@@ -44,7 +46,6 @@ from motionloom.pipeline.baselines.tm2t.losses import (
     summed_or_mean,
     word_errors,
 )
-from motionloom.pipeline.baselines.tm2t.network import PAD, Captioner
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq
 
 

@@ -16,10 +16,19 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.cache import TextCache
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.baselines.tm2t.generator import Seq2SeqGenerator, TokenCaptioner
-from motionloom.pipeline.baselines.tm2t.losses import CaptionLossConfig, Seq2SeqLossConfig
-from motionloom.pipeline.baselines.tm2t.network import Captioner, CaptionerConfig, Vocabulary
-from motionloom.pipeline.baselines.tm2t.release import captioner_names, published_words
+from motionloom.pipeline.baselines.tm2t.generator import (
+    Seq2SeqGenerator,
+    TokenCaptioner,
+    captioner_names,
+    published_words,
+)
+from motionloom.pipeline.baselines.tm2t.network import (
+    Captioner,
+    CaptionerConfig,
+    CaptionLossConfig,
+    Seq2SeqLossConfig,
+    Vocabulary,
+)
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig
 from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tStage, Tm2tStageConfig
 from motionloom.pipeline.contract.captioning import MotionCaptioner

@@ -23,7 +23,7 @@ from motionloom.models.quantize.gradient import GradientQuantizer
 from motionloom.models.tokenizer.base import Recon, Stream, Tokenizer
 from motionloom.models.tokenizer.single import MqConfig, OneCodebook
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.baselines.tm2t.losses import CriticConfig
+from motionloom.pipeline.baselines.tm2t.network import CriticConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.stages.networks.tokenizer import (
     TokenizerInputs,

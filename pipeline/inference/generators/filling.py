@@ -14,8 +14,7 @@ from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import CaptionSpan, Filling, KnownMotion, Pins
 from motionloom.models.diffusion.network import TextDenoiser
-from motionloom.models.diffusion.observed import Places, known_columns
-from motionloom.models.diffusion.recovery import Recovery
+from motionloom.models.diffusion.observed import Places, Recovery, known_columns
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.pipeline.inference.edits.frames import EditFrames
 from motionloom.pipeline.store.networks import device_of

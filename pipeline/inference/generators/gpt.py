@@ -14,8 +14,7 @@ from torch.nn import functional as F
 
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import Drawing, sample_seeds
-from motionloom.models.gpt.sampling import generate
+from motionloom.models.gpt.sampling import Drawing, generate, sample_seeds
 from motionloom.models.gpt.streaming import TokenStream
 from motionloom.models.gpt.tokens import as_codes
 from motionloom.pipeline.contract.generation import (

@@ -21,9 +21,8 @@ from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
-from motionloom.models.utt.continuing import join
 from motionloom.models.utt.network import ConditionedUtt
-from motionloom.models.utt.sampling import draw_z, generate
+from motionloom.models.utt.sampling import draw_z, generate, join
 from motionloom.pipeline.contract.generation import Stretch
 from motionloom.pipeline.contract.sampling import SamplingConfig
 

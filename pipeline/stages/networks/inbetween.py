@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import Part
-from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
+from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
 from motionloom.models.diffusion.observed import Observations
 from motionloom.pipeline.contract.stage import register
 from motionloom.pipeline.stages.networks.captions import (

@@ -13,9 +13,9 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import MateConfig
+from motionloom.models.discriminator.patch import UttLossConfig
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.network import ConditionedUtt, UttConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Every, Inputs, Role, Stage, register

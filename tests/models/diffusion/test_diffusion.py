@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from motionloom.datasets.conditions import Condition
-from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
 from motionloom.models.diffusion.module import TextDenoiserModule
-from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig
+from motionloom.models.diffusion.network import InBetweenConfig, InBetweener, TextDenoiser, TextDenoiserConfig
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.models.training.stage_module import OptimConfig

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.dmd import Dmd, DmdConfig, dmd_loss
+from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import hidden_stretch
 from motionloom.models.diffusion.sampling import blend_weights, decode_motions, window_starts
-from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
+from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import Stream
 
@@ -101,29 +101,6 @@ def test_stretches_hidden_in_training() -> None:
     assert hidden[groups == 16].any(0).all()
 
 
-@pytest.mark.parametrize("velocity", [0.0, 3.0])
-def test_loss_counts_real_frames_and_columns(velocity: float) -> None:
-    """And velocities between real frames, where the network predicts the motion itself."""
-    torch.manual_seed(0)
-    schedule = ScheduleConfig(predicts="sample" if velocity else "epsilon")
-    config = SMALL.model_copy(update={"velocity_weight": velocity, "schedule": schedule})
-    net = Dmd(config, STREAMS, PATTERN, 6).eval()
-    codes, length = random_codes([4, 2]), torch.tensor([16, 7])
-    motion, noise, step = torch.randn(2, 16, 6), torch.randn(2, 16, 6), torch.tensor([10, 900])
-    noiser = schedule.noiser()
-    present = torch.ones(2, 6, dtype=torch.bool)
-    present[1, 4:] = False
-    loss = dmd_loss(net, noiser, motion, codes.codes, length, step, noise, present=present)
-    found = net(noiser.add_noise(motion, noise, step), step, codes.codes, length)
-    error = found - (motion if velocity else noise)
-    total = (error[0].square().sum() + error[1, :7, :4].square().sum()) / (16 * 6 + 7 * 4)
-    moved = error[0].diff(dim=0).square().sum() + error[1, :7, :4].diff(dim=0).square().sum()
-    total = total + velocity * moved / (15 * 6 + 6 * 4)
-    assert loss.item() == pytest.approx(total.item(), rel=1e-5)
-    with pytest.raises(ValueError, match="noise has no velocity"):
-        DmdConfig(velocity_weight=1.0)
-
-
 def test_sizes_of_the_paper() -> None:
     net = Dmd(DmdConfig(), (Stream("code", 2048, 1),), ("code",), 75)
     block = 4 * 512 * 512 + 4 * 512 + 2 * 512 * 1024 + 1024 + 512 + 4 * 512
@@ -206,7 +183,8 @@ def test_learns_and_leaves_no_seams() -> None:
         step = torch.randint(1000, (64,), generator=generator)
         noise = torch.randn(64, 16, 2, generator=generator)
         optimizer.zero_grad()
-        dmd_loss(net, noiser, toy(codes, generator), {"code": codes}, length, step, noise).backward()
+        noisy = noiser.add_noise(toy(codes, generator), noise, step)
+        (net(noisy, step, {"code": codes}, length) - noise).square().mean().backward()
         optimizer.step()
         decay.step()
     tokens = Codes({"code": torch.randint(3, (12, 23), generator=generator)}, torch.full((12,), 23))
@@ -237,5 +215,7 @@ def test_mistakes_are_named(net: Dmd) -> None:
         decode_motions(net, codes, seeds=[1, 2], steps=2000)
     with pytest.raises(UserError, match="hidden"):
         decode_motions(net, codes, seeds=[1, 2], hidden=torch.zeros(2, 4, dtype=torch.bool))
+    with pytest.raises(ValueError, match="noise has no velocity"):
+        DmdConfig(velocity_weight=1.0)
     with pytest.raises(ValueError, match=r"12 frames.* 16"):
         net(torch.zeros(1, 16, 6), torch.tensor([1]), random_codes([3]).codes, torch.tensor([12]))

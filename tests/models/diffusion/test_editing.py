@@ -12,11 +12,15 @@ from motionloom.datasets.motion.figure_parts import LOWER, PIECES
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import CaptionSpan, Filling, KnownMotion, Pins
-from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
 from motionloom.models.diffusion.module import InBetweenModule
-from motionloom.models.diffusion.network import TextDenoiser
-from motionloom.models.diffusion.observed import Observations, Places, known_columns, observed_columns
-from motionloom.models.diffusion.recovery import Recovery
+from motionloom.models.diffusion.network import InBetweenConfig, InBetweener, TextDenoiser
+from motionloom.models.diffusion.observed import (
+    Observations,
+    Places,
+    Recovery,
+    known_columns,
+    observed_columns,
+)
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.baselines.mdm.network import Mdm
 

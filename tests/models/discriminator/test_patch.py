@@ -6,8 +6,13 @@ import pytest
 import torch
 from torch import nn
 
-from motionloom.models.discriminator.losses import discriminator_loss, generator_loss
-from motionloom.models.discriminator.patch import DiscriminatorConfig, PatchDiscriminator, Validity
+from motionloom.models.discriminator.patch import (
+    DiscriminatorConfig,
+    PatchDiscriminator,
+    Validity,
+    discriminator_loss,
+    generator_loss,
+)
 
 SMALL = DiscriminatorConfig(dim=16, heads=4, ff=32, dropout=0.0)
 

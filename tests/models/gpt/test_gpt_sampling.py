@@ -7,11 +7,10 @@ import torch
 from toy_gpt import ENDS, PATTERN, STREAMS, toy_gpt
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import draw, filter_logits, sample_seeds
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import InterleavedGPT
-from motionloom.models.gpt.sampling import generate
+from motionloom.models.gpt.sampling import draw, filter_logits, generate, sample_seeds
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.training.stage_module import OptimConfig
 

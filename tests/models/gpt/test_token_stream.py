@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.drawing import Drawing
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.gpt.sampling import generate
+from motionloom.models.gpt.sampling import Drawing, generate
 from motionloom.models.gpt.streaming import OPENING, TokenStream
 from motionloom.models.tokenizer.base import Stream
 

@@ -11,14 +11,17 @@ from torch import Tensor, nn
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.condition.mate import MateConfig
-from motionloom.models.discriminator.losses import AdversarialConfig, generator_loss
-from motionloom.models.discriminator.patch import DiscriminatorConfig
+from motionloom.models.discriminator.patch import (
+    AdversarialConfig,
+    DiscriminatorConfig,
+    UttLossConfig,
+    generator_loss,
+)
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.single import MqConfig
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.utt.losses import UttLossConfig
 from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import ConditionedUtt, UttConfig
 

@@ -9,12 +9,11 @@ import torch
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.drawing import draw, sample_seeds
+from motionloom.models.gpt.sampling import draw, sample_seeds
 from motionloom.models.gpt.tokens import Codes, interleave
 from motionloom.models.tokenizer.base import Stream
-from motionloom.models.utt.continuing import join, last_groups, window_start
 from motionloom.models.utt.network import Utt, UttConfig
-from motionloom.models.utt.sampling import draw_z, generate
+from motionloom.models.utt.sampling import draw_z, generate, join, last_groups, window_start
 
 PATTERN = ("body", "body", "hand")
 STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))

@@ -21,7 +21,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import EncodedText
-from motionloom.models.diffusion.inbetweener import InBetweenConfig, InBetweener
+from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Capabilities
 from motionloom.pipeline.contract.sampling import SamplingConfig

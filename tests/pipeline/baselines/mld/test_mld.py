@@ -18,17 +18,21 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.stage_module import OptimConfig
-from motionloom.pipeline.baselines.mld.generator import sample_latents
-from motionloom.pipeline.baselines.mld.losses import MotionVaeLossConfig
 from motionloom.pipeline.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
 from motionloom.pipeline.baselines.mld.network import (
     LatentDenoiser,
     LatentDiffusionConfig,
     MotionVae,
     MotionVaeConfig,
+    MotionVaeLossConfig,
     Positions,
 )
-from motionloom.pipeline.baselines.mld.stage import LatentDiffusionStage, MotionVaeStage, mld_names
+from motionloom.pipeline.baselines.mld.stage import (
+    LatentDiffusionStage,
+    MotionVaeStage,
+    mld_names,
+    sample_latents,
+)
 
 SMALL = {"dim": 16, "ff": 32, "layers": 3, "heads": 2, "dropout": 0.0, "attention_dropout": 0.0}
 LENGTH = torch.tensor([12, 7])

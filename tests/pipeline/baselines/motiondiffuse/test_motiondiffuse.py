@@ -12,7 +12,6 @@ from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.module import DenoiserModule
 from motionloom.models.diffusion.schedule import ScheduleConfig
 from motionloom.models.training.stage_module import OptimConfig
-from motionloom.pipeline.baselines.motiondiffuse.generator import sample_motions
 from motionloom.pipeline.baselines.motiondiffuse.network import (
     Attend,
     Attention,
@@ -22,6 +21,7 @@ from motionloom.pipeline.baselines.motiondiffuse.network import (
     Stylization,
     linear_attention,
 )
+from motionloom.pipeline.baselines.motiondiffuse.stage import sample_motions
 
 SMALL = MotionDiffuseConfig(
     dim=16, layers=1, heads=2, ff=16, caption=CaptionConfig(dim=8, layers=1, heads=2, ff=8)

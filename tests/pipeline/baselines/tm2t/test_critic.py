@@ -8,8 +8,8 @@ from torch.nn import functional
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.baselines.tm2t.losses import CriticConfig
 from motionloom.pipeline.baselines.tm2t.module import AdversarialTokenizerModule, Critic, RankNorm
+from motionloom.pipeline.baselines.tm2t.network import CriticConfig
 from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig, Tm2tQuantizer
 
 LAYOUT = MotionLayout.named("h3d263")

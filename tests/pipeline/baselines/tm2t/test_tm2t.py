@@ -8,12 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from motionloom.models.gpt.drawing import Drawing
+from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tokenizer.base import Stream
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.baselines.tm2t.generator import likeliest
-from motionloom.pipeline.baselines.tm2t.losses import CaptionLossConfig, Seq2SeqLossConfig, hidden_ends
 from motionloom.pipeline.baselines.tm2t.module import CaptionerModule, Seq2SeqModule
 from motionloom.pipeline.baselines.tm2t.network import (
     END,
@@ -23,7 +22,10 @@ from motionloom.pipeline.baselines.tm2t.network import (
     UNKNOWN,
     Captioner,
     CaptionerConfig,
+    CaptionLossConfig,
+    Seq2SeqLossConfig,
     Vocabulary,
+    hidden_ends,
 )
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig, draw_tokens
 
