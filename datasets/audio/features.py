@@ -18,6 +18,10 @@ Notable choices:
 - Frames of chroma 140 dB below the loudest one have no notes: what is there is rounding, which librosa scales
   up to 1.
 - A frame's number is time x frames a second; a sound of n samples has 1 + n // 512 frames.
+
+Models are conditioned on them aligned with a motion (`features_of`): frame k of a motion and row k are at
+k / fps seconds of the music that goes with it. Music that goes on is cut; where it ends first, its last row
+is repeated.
 """
 
 from __future__ import annotations
@@ -30,9 +34,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
-from motionloom.datasets.audio.compiled import load_librosa
-from motionloom.datasets.audio.sound import resample_sound
-from motionloom.datasets.audio.spectra import HOP, separate, tuning
+from motionloom.datasets.audio.sound import Sound, resample_sound
+from motionloom.datasets.audio.spectra import HOP, load_librosa, separate, tuning
 from motionloom.datasets.schema import Config, UserError
 
 DIM = 438
@@ -114,21 +117,78 @@ def audio_features(
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 
 
-def beats(
-    samples: NDArray[np.float32], rate: int, settings: AudioSettings | None = None
-) -> NDArray[np.float64]:
+def beats(samples: NDArray[np.float32], rate: int) -> NDArray[np.float64]:
     """Return the times of the beats in seconds, ascending: those that column 53 of `audio_features` marks."""
-    settings = settings or AudioSettings()
+    settings = AudioSettings()
     samples = _prepared(samples, rate, settings)
     with _no_remarks():
         onsets = onset_strength(separate(samples, settings.rate).percussive_mel)
         return np.asarray(_beat_frames(onsets, settings) / settings.fps)
 
 
-def fitting_octaves(rate: int, most: int = 7) -> int:
-    """Return how many octaves above C1 fit below half the rate, at most `most`; 0 where not even one does."""
+def features_of(sound: Sound, fps: float, width: int = DIM, rate: float | None = None) -> NDArray[np.float32]:
+    """Return features [T, width] of a sound, a row for each motion frame, by all of the piece it is cut from.
+
+    The width says which: the 438 published ones, at `rate` rows a second where that is given, or those of
+    `rhythm_features`.
+
+    Tempo and beats are read from many seconds around a frame, in training too: a slice analysed alone would
+    look different. A piece is analysed once; the sound keeps the result.
+    """
+    piece = sound.piece or sound
+    # The piece is analysed from less than a frame after its start, so that rows fall on the motion's frames.
+    first = int(sound.begin * fps + 1e-6)
+    lead = max(0.0, sound.begin - first / fps)
+    rows = piece.analysed.get((lead, fps, width, rate))
+    if rows is None:
+        whole = piece.slice(lead) if round(lead * piece.rate) else piece
+        rows = piece.analysed[lead, fps, width, rate] = _analyse(whole, fps, width, rate)
+    frames = max(1, round(sound.seconds * fps))
+    return rows[np.minimum(np.arange(first, first + frames), len(rows) - 1)]
+
+
+def _analyse(whole: Sound, fps: float, width: int, rate: float | None) -> NDArray[np.float32]:
+    frames = max(1, round(whole.seconds * fps))
+    if width == DIM:
+        settings = settings_at(fps) if rate is None else AudioSettings.parse({"fps": rate}, "audio features")
+        return rows_at(audio_features(whole.samples, whole.rate, settings), settings.fps, fps, frames)
+    from motionloom.datasets.audio.rhythm_features import RHYTHM_DIM, rhythm_features
+
+    if width != RHYTHM_DIM:
+        raise UserError(
+            f"this model was trained on {width} features of music; known are {DIM} (published) and "
+            f"{RHYTHM_DIM} (rhythm)"
+        )
+    return rhythm_features(whole, fps, frames)
+
+
+def settings_at(fps: float) -> AudioSettings:
+    """Return settings with a row for each frame at `fps`, or with the published 60 where that is no rate."""
+    if 5 <= fps <= 240 and fps * HOP == int(fps * HOP):
+        return AudioSettings(fps=fps)
+    return AudioSettings()
+
+
+def rows_at(
+    features: NDArray[np.float32], features_fps: float, fps: float, frames: int
+) -> NDArray[np.float32]:
+    """Return of features [T, 438] at `features_fps` the rows nearest to frames at `fps`, [frames, 438].
+
+    Each beat is marked at the one frame nearest to it, so none is skipped or doubled.
+    """
+    nearest = np.floor(np.arange(frames) * (features_fps / fps) + 0.5).astype(np.int64)
+    out: NDArray[np.float32] = features[np.minimum(nearest, len(features) - 1)]
+    # A beat is one row in either rate: taking the nearest row would lose some and double others.
+    beats = np.floor(np.flatnonzero(features[:, BEAT]) * (fps / features_fps) + 0.5).astype(np.int64)
+    out[:, BEAT] = 0
+    out[beats[beats < frames], BEAT] = 1
+    return out
+
+
+def fitting_octaves(rate: int) -> int:
+    """Return how many octaves above C1 fit below half the rate, at most 7; 0 where not even one does."""
     librosa = load_librosa()
-    for octaves in range(most, 0, -1):
+    for octaves in range(7, 0, -1):
         # Tuning moves the filters by less than half a bin.
         frequencies = librosa.cqt_frequencies(
             octaves * _BINS, fmin=librosa.note_to_hz("C1"), bins_per_octave=_BINS, tuning=0.5

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from motionloom.datasets.audio.beat_net import ROWS, band_from, band_power
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.audio.tracker import Beats, track
-from motionloom.datasets.schema import UserError
 
 COLUMNS = (
     "beat_cos", "beat_sin", "two_beat_cos", "two_beat_sin", "bar_cos", "bar_sin",
@@ -41,8 +40,6 @@ _SMALLEST_RANGE = 6.0
 
 def rhythm_features(sound: Sound, fps: float, frames: int) -> NDArray[np.float32]:
     """Return features of a whole piece, float32 [frames, 19]; row k is at k / fps s, the last one repeats."""
-    if frames < 1 or fps <= 0:
-        raise UserError(f"features cannot be aligned with {frames} frames at {fps:g} a second")
     power = band_power(sound)
     beats = track(sound, power)
     at = np.minimum(np.arange(frames) / fps, max(0.0, sound.seconds))

@@ -43,6 +43,9 @@ _BLOCK = 2**18
 _UNKNOWN = 2**63 - 1
 """libsndfile's length of a pipe."""
 
+_UNSTATED = 0xFFFFFFFF
+"""Length of the samples of a WAV that does not say it."""
+
 _OTHER = "wav, flac, ogg and mp3 are read; convert others, as by: ffmpeg -i song.m4a song.wav"
 
 _WAV_SUFFIXES = (".wav", ".wave")
@@ -116,7 +119,7 @@ class Sound:
     analysed: dict[tuple[float, float, int, float | None], NDArray[np.float32]] = field(
         default_factory=dict, repr=False
     )
-    """Features of the piece from a second on, at frames a second, by width (`align_features.features_of`)."""
+    """Features of the piece from a second on, at frames a second, by width (`features.features_of`)."""
 
     def __post_init__(self) -> None:
         samples = np.asarray(self.samples, dtype=np.float32)
@@ -262,8 +265,6 @@ def _length(path: Path, name: str) -> tuple[int, int]:
         samples, rate = int(file.frames), int(file.samplerate)
         if samples == _UNKNOWN:
             samples = sum(len(block) for block in _mono(file, name, MAX_SECONDS * rate + 1))
-    if rate <= 0:
-        raise UserError(f"{name}: sample rate {rate}")
     if samples <= 0:
         raise UserError(f"{name}: no sound in it, or cut short (0 samples)")
     if samples > MAX_SECONDS * rate:
@@ -332,34 +333,13 @@ def _check_header(path: Path, name: str) -> None:
 
 
 def _check_wave_chunks(file: BinaryIO, name: str, size: int) -> None:
-    """Walk the chunks up to the samples: a format with a rate, and as many bytes as the file promises."""
-    long_data: int | None = None
-    formatted = False
-    # Chunks are walked as they state their lengths; what no reader knows (LIST, bext) is passed over.
+    """Walk the chunks up to the samples, of which there must be as many bytes as the file states."""
     while len(head := file.read(8)) == 8:
         kind, length = struct.unpack("<4sI", head)
         start = file.tell()
-        if kind == b"ds64":  # 64-bit lengths of RF64
-            body = file.read(min(length, 16))
-            long_data = struct.unpack("<Q", body[8:16])[0] if len(body) == 16 else None
-        elif kind == b"fmt ":
-            body = file.read(min(length, 16))
-            if len(body) < 16:
-                raise UserError(f"{name}: the format chunk is cut short")
-            channels, rate = struct.unpack("<HI", body[2:8])
-            if not rate:
-                raise UserError(f"{name}: sample rate 0")
-            if not channels:
-                raise UserError(f"{name}: 0 channels")
-            formatted = True
-        elif kind == b"data":
-            if long_data is not None and length == 0xFFFFFFFF:
-                length = long_data
-            if not formatted:
-                raise UserError(f"{name}: samples before the format chunk")
-            if not length:
-                raise UserError(f"{name}: no sound in it (0 samples)")
-            if length > size - start:
+        if kind == b"data":
+            # RF64 files, and those that were written into a pipe, state no length here.
+            if length != _UNSTATED and length > size - start:
                 raise UserError(f"{name}: cut short: {size - start} bytes of sound, {length} expected")
             return
         file.seek(start + length + length % 2)  # chunks lie at even places
@@ -393,4 +373,6 @@ def _reason(error: Exception) -> str:
         return f"of no known format; {_OTHER}"
     if words.startswith("Supported file format"):
         return f"damaged, or of an unknown kind; {_OTHER}"
+    if words.startswith("Internal error"):
+        return "its header states no sample rate or no channels"
     return "damaged or cut short" if words.startswith("Unspecified internal error") else words

@@ -1,6 +1,11 @@
 """Spectra of a sound: mel power, harmonic and percussive shares, tuning.
 
-Everything is librosa's; two things are arranged here:
+Everything is librosa's; three things are arranged here:
+
+- librosa compiles parts of itself with numba: half a minute when it is first used in an environment, then
+  seconds in each process. Processes that fill one cache of numba's at once can mix their files and crash
+  (numba issue 10128), which the workers of a first conversion would do. So the first process compiles all
+  that audio features use behind a lock and leaves a mark; whoever finds the mark just imports.
 
 - The medians of harmonic-percussive separation run along rows of one long line. scipy does that ten times as
   fast as the two-dimensional filters that `librosa.effects.hpss` calls, with the same numbers. One transform
@@ -11,13 +16,19 @@ Everything is librosa's; two things are arranged here:
 
 from __future__ import annotations
 
+import fcntl
+import os
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import distribution, version
+from pathlib import Path
+from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
-
-from motionloom.datasets.audio.compiled import load_librosa
 
 FFT = 2048
 HOP = 512
@@ -29,6 +40,42 @@ _MARGIN = 32
 
 _PIECE = 2048
 """Frames of a piece without its margins; some 100 MB are used at once."""
+
+
+@lru_cache(maxsize=1)
+def load_librosa() -> Any:
+    """The module, with what audio features use of it compiled."""
+    mark = _mark()
+    if mark.exists():
+        return _imported()
+    with mark.with_suffix(".lock").open("ab") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        module = _imported()
+        mark.touch()
+    return module
+
+
+def _mark() -> Path:
+    """The file whose existence means that numba's cache of this installation and processor is filled."""
+    package = distribution("librosa")
+    from llvmlite.binding import get_host_cpu_name  # numba's own name of it
+
+    source = Path(str(package.locate_file("librosa/__init__.py")))
+    about = f"{source} {source.stat().st_mtime_ns} {version('numba')} {get_host_cpu_name()}"
+    own = Path(tempfile.gettempdir()) / f"motionloom-{os.getuid()}"
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR", own))
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder / f"motionloom-librosa-{crc32(about.encode()):08x}.compiled"
+
+
+def _imported() -> Any:
+    import librosa
+    import librosa.beat  # compiles on import, like most of librosa; the calls below do the rest
+
+    noise = np.random.default_rng(0).standard_normal(4096).astype(np.float32)
+    librosa.istft(librosa.stft(noise))
+    librosa.cqt(noise, sr=4096, n_bins=12, fmin=440.0)
+    return librosa
 
 
 @dataclass(frozen=True)

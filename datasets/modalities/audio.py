@@ -25,7 +25,7 @@ class AudioModality(FrameModality):
 
         The columns are those that the model was trained on: as many as the statistics `prepared` have.
         """
-        from motionloom.datasets.audio.align_features import features_of
+        from motionloom.datasets.audio.features import features_of
         from motionloom.datasets.audio.sound import Sound
 
         if not isinstance(value, Sound):

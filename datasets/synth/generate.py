@@ -18,8 +18,8 @@ from pydantic import Field, field_validator, model_validator
 
 from motionloom.datasets.actions.dances import Record
 from motionloom.datasets.actions.hands import HANDS
-from motionloom.datasets.audio.align_features import settings_at
 from motionloom.datasets.audio.features import VERSION as AUDIO_VERSION
+from motionloom.datasets.audio.features import settings_at
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.smpl75 import smpl75_of

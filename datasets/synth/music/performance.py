@@ -7,8 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.align_features import features_of
-from motionloom.datasets.audio.features import DIM
+from motionloom.datasets.audio.features import DIM, features_of
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.synth.music.band import play_band
 from motionloom.datasets.synth.music.recording import record

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from pathlib import Path
 
@@ -10,7 +11,16 @@ import pytest
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio import features, spectra
-from motionloom.datasets.audio.features import AudioSettings, audio_features, beats, fitting_octaves
+from motionloom.datasets.audio.features import (
+    AudioSettings,
+    audio_features,
+    beats,
+    features_of,
+    fitting_octaves,
+    rows_at,
+    settings_at,
+)
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 
 
@@ -97,14 +107,6 @@ def test_pieces_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_allclose(audio_features(samples, 30720), want, rtol=0, atol=5e-4)
 
 
-@pytest.mark.parametrize("columns", [1, 3, 15, 16, 17, 31, 100])
-def test_row_medians_are_exact(columns: int) -> None:
-    values = np.random.default_rng(columns).integers(0, 50, (37, columns)).astype(np.float32)
-    padded = np.pad(values, ((0, 0), (15, 15)), mode="symmetric")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 31, axis=1)
-    np.testing.assert_array_equal(spectra._row_medians(values), np.median(windows, axis=-1))
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_beats_equal_librosas(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """The tempo comes from a mean that is taken in blocks; librosa's own holds every tempogram at once."""
@@ -141,3 +143,53 @@ def test_mistakes_are_named() -> None:
         audio_features(np.full(30720, np.nan, dtype=np.float32), 30720)
     with pytest.raises(UserError, match="fps"):
         AudioSettings.parse({"fps": 29.97}, "settings")
+
+
+def test_rows_belong_to_frames_and_every_beat_is_marked_once() -> None:
+    clicks = (0.01 * np.random.default_rng(0).standard_normal(3 * 15360)).astype(np.float32)
+    clicks.reshape(6, -1)[:, :200] += 0.5
+    whole = audio_features(clicks, 15360, AudioSettings(fps=20))
+    np.testing.assert_array_equal(features_of(Sound(clicks, 15360), 20), whole[:60])
+    longer, quiet = rows_at(whole, 20, 20, 70), np.arange(438) != 53
+    np.testing.assert_array_equal(longer[:61], whole)
+    np.testing.assert_array_equal(longer[61:, quiet], np.repeat(whole[-1:, quiet], 9, axis=0))
+    assert not longer[61:, 53].any()
+    fast = audio_features(clicks, 15360)
+    found = features_of(Sound(clicks, 15360), 20, rate=60)
+    np.testing.assert_array_equal(found[:, quiet], fast[:-1:3, quiet])
+    assert found[:, 53].sum() == fast[:, 53].sum() > 3
+    seconds = np.flatnonzero(fast[:, 53]) / 60
+    assert np.abs(np.flatnonzero(found[:, 53]) / 20 - seconds).max() <= 0.025 + 1e-9
+    slow = rows_at(whole, 20, 60, 181)
+    np.testing.assert_array_equal(slow[1::3, 0], whole[:60, 0])
+    assert slow[:, 53].sum() == whole[:, 53].sum()
+    assert settings_at(30).fps == 30
+    assert settings_at(29.97).fps == settings_at(2).fps == settings_at(300).fps == 60
+
+
+def test_librosa_is_compiled_by_one_process_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first of two that start together compiles, the second waits for it; a third just imports."""
+    inside: list[int] = []
+    seen: list[int] = []
+
+    def imported() -> str:
+        inside.append(1)
+        seen.append(len(inside))
+        threading.Event().wait(0.2)
+        inside.pop()
+        return "librosa"
+
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(spectra, "_imported", imported)
+    load = spectra.load_librosa.__wrapped__
+    threads = [threading.Thread(target=load) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert seen == [1, 1] and len(list(tmp_path.glob("*.compiled"))) == 1
+    for lock in tmp_path.glob("*.lock"):
+        lock.unlink()
+    assert load() == "librosa" and not list(tmp_path.glob("*.lock")), "the mark was enough"

@@ -9,8 +9,7 @@ import pytest
 
 from motionloom.datasets.actions.dances import beats_of, kinetic_beats, measure_dance
 from motionloom.datasets.actions.measure import agrees
-from motionloom.datasets.audio.align_features import settings_at
-from motionloom.datasets.audio.features import audio_features, beats
+from motionloom.datasets.audio.features import audio_features, beats, settings_at
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, facing
 from motionloom.datasets.synth.dances import DanceConditions, DanceConfig

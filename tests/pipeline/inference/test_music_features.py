@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from motionloom.datasets.audio import align_features
+from motionloom.datasets.audio import features
+from motionloom.datasets.audio.features import features_of
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.dances import DanceConfig
@@ -33,13 +34,13 @@ def heard(sounds: list[Sound]) -> list[np.ndarray]:
 
 
 def test_a_slice_is_heard_as_its_piece_is(song: Sound) -> None:
-    whole = align_features.motion_frame_features(song, FPS, round(song.seconds * FPS))
+    whole = features_of(song, FPS)
     part = song.slice(4.0, 8.5)
     assert part.piece is song
     (found,) = heard([part])
     assert np.array_equal(found, whole[80:170])
     # Heard alone it would be another music: the tempogram alone spans many seconds.
-    alone = align_features.motion_frame_features(Sound(part.samples, RATE), FPS, 90)
+    alone = features_of(Sound(part.samples, RATE), FPS)
     assert np.abs(alone - whole[80:170])[:, 54:].mean() > 0.01
 
 
@@ -50,23 +51,23 @@ def test_a_slice_of_a_slice_and_one_between_two_frames(song: Sound) -> None:
     assert np.array_equal(heard([inner.resampled(8_000)])[0], heard([inner])[0])
     between = song.slice(4.02, 8.52)
     moved = song.slice(0.02)
-    rows = align_features.motion_frame_features(Sound(moved.samples, RATE), FPS, round(moved.seconds * FPS))
+    rows = features_of(Sound(moved.samples, RATE), FPS)
     assert np.array_equal(heard([between])[0], rows[80:170])
 
 
 def test_pieces_are_heard_once(song: Sound, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[float] = []
-    real = align_features.motion_frame_features
+    calls: list[int] = []
+    real = features.audio_features
 
-    def counted(sound: Sound, *rest: object) -> np.ndarray:
-        calls.append(sound.seconds)
-        return real(sound, *rest)  # type: ignore[arg-type]
+    def counted(samples: np.ndarray, *rest: object) -> np.ndarray:
+        calls.append(len(samples))
+        return real(samples, *rest)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(align_features, "motion_frame_features", counted)
+    monkeypatch.setattr(features, "audio_features", counted)
     song = Sound(song.samples, song.rate)
     heard([song, song, song.slice(1.0, 3.0)])
     heard([song.slice(3.0, 5.0)])
-    assert calls == [song.seconds]
+    assert calls == [len(song.samples)]
 
 
 def test_known_features_are_taken_as_they_are(song: Sound) -> None:

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from motionloom.datasets.audio.align_features import rows_at
-from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features
+from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features, rows_at
 from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
