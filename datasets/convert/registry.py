@@ -1,4 +1,6 @@
-"""The converters by name: every folder here whose `convert.py` holds a `Converter`, every file in `sets/`."""
+"""The converters by name: every folder here whose `convert.py` holds a `Converter`, every file in `sets/`,
+and those that other packages have registered.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +13,20 @@ from motionloom.datasets import convert as _folder
 from motionloom.datasets.convert import sets as _sets
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion
-from motionloom.datasets.convert.common.converter import AnyConverter, Converter, PlanSettings
+from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter, Converter, PlanSettings
 from motionloom.datasets.schema import UserError
 
 _HELPERS = ("captions", "common", "sets")
 
 
 def names() -> list[str]:
-    """Names of the converters, which are those of their folders or files."""
+    """Names of the converters; ours are those of their folders or files."""
+    return sorted({*_own(), *CONVERTERS})
+
+
+def _own() -> set[str]:
     folders = [entry.name for entry in pkgutil.iter_modules(_folder.__path__) if entry.ispkg]
-    return sorted({*folders, *_set_files()} - set(_HELPERS))
+    return {*folders, *_set_files()} - set(_HELPERS)
 
 
 def _set_files() -> list[str]:
@@ -28,8 +34,10 @@ def _set_files() -> list[str]:
 
 
 def converter_named(name: str) -> type[AnyConverter]:
-    """The converter of a folder or file, imported when it is asked for, so that `--help` stays quick."""
-    if name not in names():
+    """The converter of a name; ours are imported when they are asked for, so that `--help` stays quick."""
+    if name in CONVERTERS:
+        return CONVERTERS[name]
+    if name not in _own():
         raise UserError(f"unknown converter '{name}'; known: {', '.join(names())}")
     place = f"{_sets.__name__}.{name}" if name in _set_files() else f"{_folder.__name__}.{name}.convert"
     module = importlib.import_module(place)
@@ -40,6 +48,14 @@ def converter_named(name: str) -> type[AnyConverter]:
     )
 
 
+def _require_new(kind: type[AnyConverter]) -> None:
+    if kind.name in _own() and not kind.__module__.startswith(_folder.__name__):
+        raise UserError(f"two converters are called '{kind.name}'; rename yours")
+
+
+CONVERTERS.follow(_require_new)
+
+
 def converters() -> list[type[AnyConverter]]:
     """All converters, in the order of their names."""
     return [converter_named(name) for name in names()]
@@ -48,6 +64,7 @@ def converters() -> list[type[AnyConverter]]:
 def prepare(
     config: ConvertConfig,
     *,
+    kind: type[AnyConverter] | None = None,
     out: Path | None = None,
     maps: Path | None = None,
     workers: int = 1,
@@ -55,14 +72,13 @@ def prepare(
 ) -> Conversion[Any]:
     """Look at the whole source and decide what becomes of every file; nothing is converted yet.
 
-    `config` is a converter's and decides which one. With `out`, the folder of the shards, a source whose
-    listing must read every file (archives) is read once and not again by the next run or by the other parts
-    of a conversion. Joint maps that are guessed are written into `maps`, by default `out`.
+    `kind` is the converter, by default the one whose config it is. With `out`, the folder of the shards, a
+    source whose listing must read every file (archives) is read once and not again by the next run or by the
+    other parts of a conversion. Joint maps that are guessed are written into `maps`, by default `out`.
     """
-    fits = [kind for kind in converters() if isinstance(config, kind.config_class)]
-    kind = max(
-        fits, key=lambda kind: len(kind.config_class.__mro__)
-    )  # a set's own before the one it is made of
+    kind = kind or next((one for one in converters() if one.config_class is type(config)), None)
+    if kind is None:
+        raise UserError(f"no converter takes a {type(config).__name__}; register its converter, or name it")
     converter = kind(config)
     scan = None if out is None else out / SCAN_FILE
     return Conversion(converter, converter.plan(PlanSettings(workers, progress, scan, maps or out)))

@@ -1,18 +1,19 @@
-"""The table of modalities: a name for each record, which stands as `RECORD` in the file of that name here."""
+"""The table of modalities. Each of ours stands as `RECORD` in the file of its name here."""
 
 from __future__ import annotations
 
 from importlib import import_module
 
+from motionloom.datasets.base.register import Table, register
 from motionloom.datasets.modalities.modality import Modality
 from motionloom.datasets.schema import UserError
 
 NAMES = ("text", "audio")
 """In the order in which networks read them."""
 
-MODALITIES: dict[str, Modality] = {
-    name: import_module(f"motionloom.datasets.modalities.{name}").RECORD for name in NAMES
-}
+MODALITIES: Table[Modality] = Table(Modality, "modality")
+for _name in NAMES:
+    register(import_module(f"motionloom.datasets.modalities.{_name}").RECORD)
 
 
 def modality(name: str) -> Modality:

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.register import discover
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import (
     INDEX_FILE,
@@ -271,6 +272,7 @@ class ShardDataset:
         return self._store.place, self.split, self._digest, self.reading, self.every
 
     def __setstate__(self, state: tuple[str, Split, str, Reading, bool]) -> None:
+        discover()  # a worker may not have met the members of other packages' modalities
         place, split, digest, reading, every = state
         store = open_store(place, reading.cache)
         manifest, _ = read_manifest(store, digest)

@@ -25,8 +25,9 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, ClipMeta, MotionType, Split, UserError
 
 _OURS = ("audio.flac", "audio.npy", "face_texts.json", "meta.json", "motion.npy", "texts.json")
-MEMBERS = (*_OURS, *(m for record in MODALITIES.values() for m in record.members if m not in _OURS))
+MEMBERS = list(_OURS)
 """Every member name a sample may have: columns of an index, those of further modalities last."""
+MODALITIES.follow(lambda record: MEMBERS.extend(m for m in record.members if m not in MEMBERS))
 
 
 class DropClip(Exception):  # noqa: N818 (a decision, not an error)

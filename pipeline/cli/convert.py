@@ -186,10 +186,11 @@ def convert_command(
     from motionloom.datasets.convert.registry import converter_named, prepare
 
     started = time.perf_counter() if started is None else started
-    config = converter_named(kind).config_class.parse(fields, f"data convert {kind}")
+    converter = converter_named(kind)
+    config = converter.config_class.parse(fields, f"data convert {kind}")
     shown = not console.quiet
     if plan:
-        conversion = prepare(config, maps=out, workers=workers, progress=shown).looked()
+        conversion = prepare(config, kind=converter, maps=out, workers=workers, progress=shown).looked()
         planned = conversion.estimated(workers, started)
         licensed = bool(conversion.converter.licence(planned))
         line = proposed(kind, config, out, planned, licensed=licensed) if planned.items else ""
@@ -200,7 +201,7 @@ def convert_command(
             say(console, f"convert it: {line}" if line else "nothing of it can be converted")
         return
     require_folder(out)
-    conversion = prepare(config, out=out, workers=workers, progress=shown)
+    conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown)
     for note in conversion.plan.notes:
         say(console, f"note: {note}")
     manifest = run_conversion(

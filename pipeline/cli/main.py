@@ -20,6 +20,7 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.base.os_errors import sentence_of
+from motionloom.datasets.base.register import discover
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.caption import caption
 from motionloom.pipeline.cli.data import data_app
@@ -335,6 +336,7 @@ def _exit_code() -> int:
     """Run the command; a user's mistake becomes one sentence on standard error."""
     errors = SafeConsole(stderr=True, highlight=False, soft_wrap=True)
     try:
+        discover()  # formats, sources and metrics of other packages are in the help, too
         code = app(prog_name="motionloom", standalone_mode=False) or 0
         sys.stdout.flush()  # here a full disk can still be answered
     except JointError as error:

@@ -25,7 +25,7 @@ class Role:
     name: str
     optional: bool
     gives: str
-    """The stage that must fill it: a stage of the kind of this name, or one that gives this."""
+    """The stage that must fill it: of the kind of this name or a subclass of it, or one that gives this."""
 
     @staticmethod
     def parse(text: str) -> Role:
@@ -36,7 +36,8 @@ class Role:
 
     def fits(self, kind: _Kind, config: object) -> bool:
         """Whether a stage of this kind and config may fill it."""
-        return self.gives == kind.name or self.gives in kind.gives(config)
+        names = {kind.name, *(vars(base).get("name") for base in type(kind).__mro__)}
+        return self.gives in names or self.gives in kind.gives(config)
 
 
 @dataclass(frozen=True)

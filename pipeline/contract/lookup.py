@@ -61,13 +61,13 @@ def preview_of_finished(stage: CompletedStage) -> object:
 
 
 def stages_giving(run: Path, what: str) -> list[str]:
-    """Stages of a run's recipe, finished or not, that give `what`, or are of the kind of this name."""
+    """Stages of a run's recipe, finished or not, that could fill a role that takes `what`."""
     out = []
     for name, entry in stages_of(run).items():
         where = f"{run / 'recipe.yaml'}: stages.{name}"
         kind = stage_kind(str(entry["kind"]), where)
         fields = {key: value for key, value in entry.items() if key not in ("kind", "inputs")}
-        if what == kind.name or what in kind.gives(kind.config.parse(fields, where)):
+        if Role(what, False, what).fits(kind, kind.config.parse(fields, where)):
             out.append(name)
     return out
 
@@ -94,7 +94,7 @@ def _finished(record: StageRecord, made: dict[Path, CompletedStage]) -> Complete
 def _loadable(record: StageRecord, made: dict[Path, CompletedStage]) -> CompletedStage:
     folder = record.folder
     where, run, exported = str(folder / "artifact.json"), owner_of(folder), in_export(folder)
-    kind = stage_kind(record.kind, where)
+    kind = stage_kind(record.kind, where, read_bundle(run).packages if exported else ())
     if record.version != kind.version and (exported or _gives(kind, record) & {GENERATOR, CAPTIONER}):
         raise UserError(
             f"{where}: made by version {record.version} of stage kind {kind.name}, which is now "
@@ -102,7 +102,6 @@ def _loadable(record: StageRecord, made: dict[Path, CompletedStage]) -> Complete
         )
     inputs = {role: _finished(source, made) for role, source in record.inputs.items()}
     if exported:
-        read_bundle(run)
         _require_roles(kind, inputs, where)
     return CompletedStage(
         record.name,
@@ -200,6 +199,8 @@ class BundleFile(Config):
     """Stages that generate, the default first."""
     captioners: tuple[str, ...] = ()
     """Stages that caption motions."""
+    packages: tuple[str, ...] = Field((), exclude_if=lambda packages: not packages)
+    """Packages beside motionloom that its stages need, as `name==version`."""
     sampling: dict[str, object] = Field(default_factory=dict)
     """Fields of `SamplingConfig` that its motions are best drawn with, where nobody says otherwise."""
 

@@ -5,22 +5,15 @@ train say more (`training/trained_stage.py`). The graph, the dry run, exports, `
 report ask these questions of the stages of a run; a new stage answers them in its own file and is registered
 by one line.
 
-A package adds kinds by an entry point of the group `motionloom.stages` that names a module; a lone file by
-the environment variable `MOTIONLOOM_STAGES`, a comma-separated list of modules or files. The module calls
-`register(MyStage())`; ours come in the same way. A recipe never names code: it is data, and reading one runs
-nothing.
+`register(MyStage())` adds a kind, ours and others'; `datasets/base/register.py` says where that line stands.
 """
 
 from __future__ import annotations
 
-import importlib
-import os
-import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Generic, NoReturn, TypeVar
 
@@ -29,6 +22,9 @@ from pydantic import BaseModel, model_validator
 from pydantic.config import JsonDict
 from rich.console import Console
 
+from motionloom.datasets.base.register import VARIABLE, Table, discover
+from motionloom.datasets.base.register import register as register
+from motionloom.datasets.convert.common.converter import CONVERTERS as CONVERTERS
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import MotionGenerator
@@ -230,6 +226,12 @@ class StageKind(ABC, Generic[C]):
         """`takes`, parsed."""
         return tuple(one if isinstance(one, Every) else Role.parse(one) for one in self.takes)
 
+    def modules(self, config: C) -> Iterable[str]:
+        """Modules that decide what a stage makes, those of its classes: the code of those that are not
+        motionloom's is in its fingerprint (`register.code_of`). A kind that gives none goes by `version`.
+        """
+        return [base.__module__ for base in type(self).__mro__ if issubclass(base, StageKind)]
+
     # Before and while it runs.
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
@@ -316,6 +318,9 @@ class FunctionStage(StageKind):
     shares: bool = False
     offers: frozenset[str] = frozenset()
 
+    def modules(self, config: StageConfig) -> Iterable[str]:
+        return [*super().modules(config), self.function.__module__]
+
     def run(self, context: StageContext) -> None:
         self.function(context)
 
@@ -333,47 +338,22 @@ def _filled(defaults: BaseModel, given: dict[str, object]) -> dict[str, object]:
 
 # The table of kinds.
 
-VARIABLE = "MOTIONLOOM_STAGES"
-_GROUP = "motionloom.stages"
-_KINDS: dict[str, StageKind] = {}
-_loaded = False
-
-K = TypeVar("K", bound=StageKind)
-
-
-def register(kind: K) -> K:
-    """Add a kind to the table; its name must be new."""
-    if _KINDS.setdefault(kind.name, kind) is not kind:
-        raise UserError(f"two stage kinds are called '{kind.name}'; rename one of them")
-    return kind
+KINDS: Table[StageKind] = Table(StageKind, "stage kind")
 
 
 def stage_kinds() -> Mapping[str, StageKind]:
     """All kinds by name, those of other packages included."""
-    global _loaded
-    if not _loaded:
-        _loaded = True
-        for point in entry_points(group=_GROUP):
-            point.load()
-        for module in filter(None, map(str.strip, os.environ.get(VARIABLE, "").split(","))):
-            if module.endswith(".py"):
-                # Loader workers get the path and import the file by its name, too.
-                sys.path.append(str(Path(module).absolute().parent))
-            try:
-                importlib.import_module(Path(module).stem if module.endswith(".py") else module)
-            except ImportError as error:
-                raise UserError(
-                    f"{VARIABLE}={module}: cannot be imported ({error}); name a file, or a module on the path"
-                ) from None
-    return _KINDS
+    discover(ours=True)
+    return KINDS
 
 
-def stage_kind(name: str, where: str) -> StageKind:
-    """A kind by name; `where` is what names it, for the message."""
-    kinds = stage_kinds()
+def stage_kind(name: str, where: str, packages: Iterable[str] = ()) -> StageKind:
+    """A kind by name; `where` is what names it, and `packages` gave it where it was made, for the message."""
+    kinds, install = stage_kinds(), ", ".join(packages)
     if name not in kinds:
         raise UserError(
-            f"{where}: stage kind '{name}' is not known here; name the module that registers it in {VARIABLE}"
+            f"{where}: stage kind '{name}' is not known here; {f'install {install}, or ' if install else ''}"
+            f"name the module that registers it in {VARIABLE}"
         )
     return kinds[name]
 

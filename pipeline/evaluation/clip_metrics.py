@@ -1,15 +1,13 @@
-"""Metrics of single motions: a metric is a function of one `Performance`, and a line in a list here.
+"""Metrics of single motions: a metric is a function of one `Performance`, and a `ClipMetric` here.
 
-Each is measured of generated motion and of every reference baseline, and is a mean over clips. A
-function returns values by the names of its columns, and leaves out what a motion does not show; a value may
-have a weight (`weighted`), such as its number of frames.
+Each is measured of generated motion and of every reference baseline, and is a mean over clips.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,7 +15,9 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.actions.dances import measure_dance
 from motionloom.datasets.actions.measure import agrees
+from motionloom.datasets.base.register import Table, register
 from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.dance import SHORTEST, foot_contact_score, foot_skating, physics
 from motionloom.models.metrics.dance_beats import DEFINITIONS, beat_align
 from motionloom.models.metrics.position import KINDS, position_errors
@@ -26,6 +26,7 @@ from motionloom.pipeline.evaluation.estimate import row_estimates, weighted
 from motionloom.pipeline.evaluation.figures import Estimate, Figure, Metric, Protocol, group_figures
 
 Joints = NDArray[np.float64]
+Of = Literal["captions", "dances"]
 
 MIN_FRAMES = 4
 """Shortest dance whose figures are taken."""
@@ -57,9 +58,28 @@ class Performance:
 class ClipMetric:
     """A function of one motion, and the table and columns of its values."""
 
-    group: str
+    name: str
+    """Title of its table, unlike that of any other metric."""
     measure: Callable[[Performance], Row]
+    """Values by the names of the columns, each a float or `weighted`, such as by frames; what a motion does
+    not show is left out."""
     columns: tuple[Metric, ...]
+    """What it measures, each with a name like `feet.skating` that no other metric has."""
+    of: tuple[Of, ...] = ("captions", "dances")
+    """Measured of motions for captions (`evaluate`), of dances to music (`evaluate_dances`), or of both."""
+
+
+CLIP_METRICS: Table[ClipMetric] = Table(ClipMetric, "clip metric")
+
+
+def _require_own_columns(metric: ClipMetric) -> None:
+    taken = {column.name for other in CLIP_METRICS.values() for column in other.columns}
+    for column in metric.columns:
+        if column.name in taken:
+            raise UserError(f"two clip metrics have a column '{column.name}'; rename one of them")
+
+
+CLIP_METRICS.follow(_require_own_columns)
 
 
 def agreement(performance: Performance) -> Row:
@@ -147,40 +167,11 @@ _ASPECTS = (
     "everything", "action", "direction", "side", "count", "speed", "left_hand", "right_hand", "face", "style",
     "genre", "bpm",
 )  # fmt: skip
-_POSITION = ClipMetric(
-    "Distance to the motion recorded for the same caption or song (lower is better)",
-    position,
-    tuple(
-        Metric(f"position.{error}_{kind}", f"{error.upper()} {title}".strip(), "lower", unit)
-        for kind, title in (("joints", ""), ("root", "root"), ("path", "path"), ("pose", "pose"))
-        for error, unit in (("ape", "m"), ("ave", "m²"))
-    ),
-)
-
-CAPTION_METRICS: tuple[ClipMetric, ...] = (
-    _POSITION,
-    ClipMetric(
-        "Feet, floor and jerk (the nearer to recorded motion, the better)",
-        floor_and_jerk,
-        (
-            Metric("physics.skating", "foot skating"),
-            Metric("physics.floating", "floating", unit="mm"),
-            Metric("physics.penetration", "penetration", unit="mm"),
-            Metric("physics.jitter", "jitter, 100 m/s³"),
-        ),
-    ),
-    ClipMetric(
-        "Does the motion do what its caption says? (measured on the joints)",
-        agreement,
-        tuple(Metric(f"agreement.{name}", name.replace("_", " "), "higher", "share") for name in _ASPECTS),
-    ),
-)
-"""Metrics of motions generated for captions."""
-
 BEAT_ALIGN = ClipMetric(
     "Beat Align (higher is better)",
     beat_alignment,
     tuple(Metric(f"beat_align.{name}", title, "higher") for name, title in _definitions().items()),
+    of=("dances",),
 )
 RECOGNITION = ClipMetric(
     "What is danced, measured on the joints (higher is better; the error: lower)",
@@ -191,11 +182,38 @@ RECOGNITION = ClipMetric(
         Metric("recognition.tempo", "tempo within 5 %", "higher"),
         Metric("recognition.tempo_error", "tempo error", "lower"),
     ),
+    of=("dances",),
 )
-DANCE_METRICS: tuple[ClipMetric, ...] = (
+# Tables of figures have them in this order.
+for _metric in (
     BEAT_ALIGN,
     RECOGNITION,
-    _POSITION,
+    ClipMetric(
+        "Distance to the motion recorded for the same caption or song (lower is better)",
+        position,
+        tuple(
+            Metric(f"position.{error}_{kind}", f"{error.upper()} {title}".strip(), "lower", unit)
+            for kind, title in (("joints", ""), ("root", "root"), ("path", "path"), ("pose", "pose"))
+            for error, unit in (("ape", "m"), ("ave", "m²"))
+        ),
+    ),
+    ClipMetric(
+        "Feet, floor and jerk (the nearer to recorded motion, the better)",
+        floor_and_jerk,
+        (
+            Metric("physics.skating", "foot skating"),
+            Metric("physics.floating", "floating", unit="mm"),
+            Metric("physics.penetration", "penetration", unit="mm"),
+            Metric("physics.jitter", "jitter, 100 m/s³"),
+        ),
+        of=("captions",),
+    ),
+    ClipMetric(
+        "Does the motion do what its caption says? (measured on the joints)",
+        agreement,
+        tuple(Metric(f"agreement.{name}", name.replace("_", " "), "higher", "share") for name in _ASPECTS),
+        of=("captions",),
+    ),
     ClipMetric(
         "Feet (lower is better)",
         feet,
@@ -203,9 +221,15 @@ DANCE_METRICS: tuple[ClipMetric, ...] = (
             Metric("feet.skating", "foot skating", "lower"),
             Metric("feet.contact", "foot contact score", "lower"),
         ),
+        of=("dances",),
     ),
-)
-"""Metrics of dances to music."""
+):
+    register(_metric)
+
+
+def metrics_of(what: Of) -> list[ClipMetric]:
+    """The metrics of motions for captions, or of dances."""
+    return [metric for metric in CLIP_METRICS.values() if what in metric.of]
 
 
 def measure_clip(metrics: Sequence[ClipMetric], performance: Performance) -> Row:
@@ -224,5 +248,5 @@ def clip_figures(
     return [
         figure
         for metric in metrics
-        for figure in group_figures(metric.group, metric.columns, estimates, protocol)
+        for figure in group_figures(metric.name, metric.columns, estimates, protocol)
     ]

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from itertools import chain, count
 from pathlib import Path
 
+from motionloom.datasets.base.register import code_of, distribution_of
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.lookup import FORMAT, BundleFile
 from motionloom.pipeline.contract.sampling import SamplingConfig
@@ -73,11 +74,13 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
         changes = {"stage": name, "config": config, "inputs": inputs}
         made[name] = artifact.model_copy(update=changes).finish(out / name)
     write_json(out / "skeleton.json", _plain(skeleton))
+    modules = {name for stage in needed.values() for name in stage.kind.modules(stage.config)}
     facts = BundleFile(
         format=FORMAT,
         layout=LayoutFacts.of(bundle.layout),
         generators=tuple(names[stage.folder] for stage in makers),
         captioners=tuple(names[stage.folder] for stage in captioners),
+        packages=tuple(sorted({distribution_of(name) for name in code_of(modules)})),
         sampling=sampling,
     )
     write_json(out / BUNDLE_FILE, facts.dump())

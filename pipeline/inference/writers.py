@@ -1,6 +1,6 @@
 """The files that motions can be written as: one `Writer` a format, all of them in `WRITERS`.
 
-A new format is one function here and one line in the table: `generate --format`, the `generate` stage,
+A new format is one function and its `Writer`, registered: `generate --format`, the `generate` stage,
 `GeneratedMotion.save`, the help of the command line and the server take it from there.
 """
 
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator
 
+from motionloom.datasets.base.register import Table, register
 from motionloom.datasets.schema import UserError
 
 if TYPE_CHECKING:
@@ -81,20 +82,27 @@ class Outputs:
 class Writer:
     """One format."""
 
+    name: str
+    """In `--format`, in the `formats` of a recipe's `generate` stage and in the server's API."""
     suffix: str
-    """Suffix behind the name of a motion: `.npz`, `_smplx.npz`."""
+    """Suffix behind the name of a motion: `.npz`, `_smplx.npz`. `GeneratedMotion.save` goes by it."""
     mime: str
+    """Media type, for the server's answers."""
     help: str
+    """A few words for the help of `--format`."""
     write: Callable[[Path, Outputs], object] = field(repr=False)
-    """Writes the clips to the path; a single one, unless `together` is set."""
+    """Writes the clips to the path; a single one, unless it is the file `together`. `clip.shown.joints` are
+    [T, N, 3] in metres, Y up. Raises `UserError` for motions that the format cannot hold."""
     together: str = ""
-    """Name of the file that holds all motions."""
+    """Name of the file that holds all motions; empty where each has only its own."""
     alone: bool = True
     """Whether each motion has a file of its own."""
     default: bool = False
+    """Whether it is written where nobody names formats."""
     slow: bool = False
     """Takes seconds or minutes, so that a server does not offer it."""
     needs_face: bool = False
+    """Left out of what a server offers for motions without a face."""
 
 
 def write_npz(path: Path, outputs: Outputs) -> None:
@@ -224,20 +232,23 @@ def cell_of(clip: OutputClip, label: str = "generated") -> ViewerMotion:
 
 
 _BYTES = "application/octet-stream"
-WRITERS: dict[str, Writer] = {
-    "npz": Writer(".npz", _BYTES, "joints and features as numpy arrays", write_npz, default=True),
-    "bvh": Writer(".bvh", "text/plain; charset=utf-8", "bones for animation tools", write_bvh),
-    "mp4": Writer(".mp4", "video/mp4", "a film", write_mp4, slow=True),
-    "glb": Writer(".glb", "model/gltf-binary", "the skinned body for 3-D tools", write_glb, "motions.glb"),
-    "smplx": Writer("_smplx.npz", _BYTES, "SMPL-X parameters", write_smplx),
-    "arkit": Writer(
-        "_arkit.csv", "text/csv; charset=utf-8", "the face for ARKit", write_arkit, needs_face=True
-    ),
-    "html": Writer(
-        ".html", "text/html; charset=utf-8", "a page to watch", write_html, "index.html", False, default=True
-    ),
-}
+WRITERS: Table[Writer] = Table(Writer, "writer")
 """By the names that `--format` knows."""
+for _writer in (
+    Writer("npz", ".npz", _BYTES, "joints and features as numpy arrays", write_npz, default=True),
+    Writer("bvh", ".bvh", "text/plain; charset=utf-8", "bones for animation tools", write_bvh),
+    Writer("mp4", ".mp4", "video/mp4", "a film", write_mp4, slow=True),
+    Writer("glb", ".glb", "model/gltf-binary", "the skinned body for 3-D tools", write_glb, "motions.glb"),
+    Writer("smplx", "_smplx.npz", _BYTES, "SMPL-X parameters", write_smplx),
+    Writer(
+        "arkit", "_arkit.csv", "text/csv; charset=utf-8", "the face for ARKit", write_arkit, needs_face=True
+    ),
+    Writer(
+        "html", ".html", "text/html; charset=utf-8", "a page to watch", write_html, "index.html", False,
+        default=True,
+    ),
+):  # fmt: skip
+    register(_writer)
 
 
 def default_formats() -> list[str]:

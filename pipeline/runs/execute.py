@@ -148,6 +148,7 @@ def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[Plann
         fingerprint=row.fingerprint,
         seed=recipe.seed_of(stage),
         config=stage.config.dump(),
+        code=dict(row.code),
         lengthened=row.started.lengthened,
         inputs={role: _input(recipe, run, row, rows, name) for role, name in stage.inputs.items()},
     )

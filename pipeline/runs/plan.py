@@ -1,9 +1,9 @@
 """The plan of a run: the action for each stage of a recipe in a run folder, and the reason.
 
 A stage's fingerprint covers its kind and version, its full resolved config, the seed, facts about outside
-files and the fingerprints of its inputs. A stage is finished when its folder holds an `artifact.json` with
-that fingerprint and every output it lists. Anything else runs, and whatever is below it has another
-fingerprint and runs too.
+files, the fingerprints of its inputs and, of a kind from another package, that package's code. A stage is
+finished when its folder holds an `artifact.json` with that fingerprint and every output it lists. Anything
+else runs, and whatever is below it has another fingerprint and runs too.
 
 A training of which only `train.steps` was raised goes on from its last checkpoint: `started.json` holds,
 next to the fingerprint, a digest of all that the fingerprint covers except the number of steps. Where that
@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from motionloom.datasets.base.register import code_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import Every, Stage, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
@@ -90,6 +91,8 @@ class PlannedStage:
     """The request for which the stage is run again: the selection names it (`--from`)."""
     identities: Mapping[str, str]
     """Identities of its inputs from outside when the plan was made."""
+    code: Mapping[str, str]
+    """sha256 of the code from other packages that it runs, by module, when the plan was made."""
 
     @property
     def fingerprint(self) -> str:
@@ -106,7 +109,8 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     # In the recipe's order, since a fingerprint needs those of the inputs.
     for stage in recipe.stages:
         require_elsewhere(run, stage, recipe.outside)
-        facts, folder = _facts(recipe, stage, rows), stage_folder(run, stage.name)
+        code = code_of(stage.kind.modules(stage.config))
+        facts, folder = _facts(recipe, stage, rows, code), stage_folder(run, stage.name)
         before, again = Started.find(folder), request if stage.name in forced else None
         started = Started(
             fingerprint=fingerprint_of(facts),
@@ -118,7 +122,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
         if again is not None and stage.name not in done:
             action, reason = _decide_again(started, before, select)
         else:
-            action, reason = _decide(recipe, stage, started, before, folder, rows, forced)
+            action, reason = _decide(recipe, stage, started, before, folder, rows, forced, code)
         if before is not None and action == "resume":
             lengthened = before.lengthened
         # More steps of the same training are no other training: its checkpoints are a beginning of it.
@@ -131,7 +135,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
             action, reason = "leave", "not selected"
         started = started.model_copy(update={"lengthened": lengthened})
         identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
-        rows[stage.name] = PlannedStage(stage, action, reason, started, again, identities)
+        rows[stage.name] = PlannedStage(stage, action, reason, started, again, identities, code)
     return list(rows.values())
 
 
@@ -161,7 +165,7 @@ def selected(recipe: Recipe, select: Selection) -> set[str]:
     return needed if until is not None else {stage.name for stage in recipe.stages}
 
 
-def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
+def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage], code: Mapping[str, str]) -> Tree:
     """The facts that a stage's fingerprint is the digest of."""
     facts = {
         "kind": stage.kind.name,
@@ -173,6 +177,8 @@ def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
     }
     if any(isinstance(role, Every) for role in stage.kind.roles()):
         facts["order"] = list(stage.inputs)  # the first of several generators is the default
+    if code:
+        facts["code"] = code
     return facts
 
 
@@ -215,13 +221,14 @@ def _decide(
     folder: Path,
     rows: Mapping[str, PlannedStage],
     forced: set[str],
+    code: Mapping[str, str],
 ) -> tuple[Action, str]:
     artifact = Artifact.find(folder)
     if artifact is None or artifact.fingerprint != started.fingerprint:
         if before is not None and before.fingerprint == started.fingerprint:
             return "resume", "started earlier, not finished"
         if artifact is not None:
-            return "run", _difference(recipe, artifact, stage, rows)
+            return "run", _difference(recipe, artifact, stage, rows, code)
         return "run", "never run" if before is None else "settings changed before it finished"
     gone = artifact.missing(folder)
     if gone:
@@ -232,7 +239,13 @@ def _decide(
     return "skip", "finished"
 
 
-def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[str, PlannedStage]) -> str:
+def _difference(
+    recipe: Recipe,
+    artifact: Artifact,
+    stage: Stage,
+    rows: Mapping[str, PlannedStage],
+    code: Mapping[str, str],
+) -> str:
     if artifact.kind != stage.kind.name or artifact.version != stage.kind.version:
         return f"{artifact.kind} v{artifact.version} is now {stage.kind.name} v{stage.kind.version}"
     old_fields, fields = flatten(artifact.config), flatten(stage.config.dump())
@@ -244,6 +257,9 @@ def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[
     if changes:
         more = f" (+{len(changes) - 1} more)" if len(changes) > 1 else ""
         return f"changed: {changes[0]}{more}"
+    modules = [name for name, _ in sorted(code.items() ^ artifact.code.items())]
+    if modules:
+        return f"code of {' and '.join(dict.fromkeys(modules))} changed"
     for role, name in stage.inputs.items():
         old = artifact.inputs.get(role)
         if old is None or old.fingerprint != _fingerprint(recipe, name, rows):

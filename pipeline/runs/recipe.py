@@ -24,9 +24,9 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
+from motionloom.datasets.base.register import VARIABLE
 from motionloom.datasets.schema import Config, UserError, nearest
 from motionloom.pipeline.contract.stage import (
-    VARIABLE,
     CompletedStage,
     Every,
     Stage,

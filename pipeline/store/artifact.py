@@ -14,9 +14,8 @@ import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
-from pydantic import Field, SerializerFunctionWrapHandler, field_validator, model_serializer
+from pydantic import Field, field_validator
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
@@ -45,13 +44,8 @@ class InputStage(Config):
 
     stage: str = Field(pattern=STAGE_NAME)
     fingerprint: str
-    folder: str | None = None
+    folder: str | None = Field(None, exclude_if=lambda folder: folder is None)
     """Folder of a stage outside the run, seen from the run's. None: a stage of the run itself."""
-
-    @model_serializer(mode="wrap")
-    def _only_what_is(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Stages of the run itself are written without the folder that they do not have."""
-        return {name: value for name, value in handler(self).items() if value is not None}
 
     def place(self, stage: Path) -> Path:
         """Its folder; `stage` is that of the stage which it fed."""
@@ -79,6 +73,8 @@ class Artifact(Config):
     fingerprint: str
     seed: int
     config: dict[str, object]
+    code: dict[str, str] = Field(default_factory=dict, exclude_if=lambda code: not code)
+    """sha256 of the code from other packages than motionloom that made it, by module."""
     lengthened: tuple[int, ...] = ()
     """Steps at which learning-rate schedules ended that were lengthened when more steps were asked for."""
     inputs: dict[str, InputStage]

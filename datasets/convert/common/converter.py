@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.register import Table
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.feature_step import FeatureStep
@@ -140,3 +141,6 @@ class Converter(ABC, Generic[Cfg, C]):
 
 
 AnyConverter = Converter[Any, Any]
+
+CONVERTERS: Table[type[AnyConverter]] = Table(Converter, "converter", classes=True)
+"""Those that other packages have registered; `convert/registry.py` finds ours."""

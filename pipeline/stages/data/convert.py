@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.convert.captions.options import digest_of
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
-from motionloom.datasets.convert.common.converter import AnyConverter
+from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter
 from motionloom.datasets.convert.registry import converters, prepare
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import StageConfig, StageContext, register
@@ -28,28 +29,35 @@ def _stage_config(kind: type[AnyConverter]) -> type[StageConfig]:
 class ConvertStage(DataStage):
     """Shards converted from a source."""
 
+    def __init__(self, converter: type[AnyConverter]) -> None:
+        summary = f"shards from {converter.title}"
+        super().__init__(converter.name, summary, _stage_config(converter), self.convert)
+        self.converter = converter
+
+    def modules(self, config: Any) -> Iterable[str]:
+        return [*super().modules(config), *(base.__module__ for base in self.converter.__mro__)]
+
     def external(self, config: ConvertConfig) -> dict[str, Any]:
         return source_facts(config)
 
-
-def run_convert(context: StageContext) -> None:
-    """Convert the source into the stage's folder."""
-    out = context.folder / SHARDS
-    workers = context.hardware.convert_workers
-    shown = not context.console.quiet
-    conversion = prepare(context.config, out=out, workers=workers, progress=shown)
-    manifest = run_conversion(
-        conversion,
-        out,
-        workers=workers,
-        progress=shown,
-        say=lambda line: context.console.print(f"    {line}", markup=False, soft_wrap=True),
-    )
-    say_shards(context, manifest)
-    if conversion.plan.captions:
-        context.console.print(
-            f"    {conversion.plan.captions}", markup=False, highlight=False, soft_wrap=True
+    def convert(self, context: StageContext) -> None:
+        """Convert the source into the stage's folder."""
+        out = context.folder / SHARDS
+        workers = context.hardware.convert_workers
+        shown = not context.console.quiet
+        conversion = prepare(context.config, kind=self.converter, out=out, workers=workers, progress=shown)
+        manifest = run_conversion(
+            conversion,
+            out,
+            workers=workers,
+            progress=shown,
+            say=lambda line: context.console.print(f"    {line}", markup=False, soft_wrap=True),
         )
+        say_shards(context, manifest)
+        if conversion.plan.captions:
+            context.console.print(
+                f"    {conversion.plan.captions}", markup=False, highlight=False, soft_wrap=True
+            )
 
 
 def source_facts(config: ConvertConfig) -> dict[str, Any]:
@@ -72,5 +80,6 @@ def source_facts(config: ConvertConfig) -> dict[str, Any]:
     return {"files": files, "steering": steering}
 
 
+CONVERTERS.follow(lambda kind: register(ConvertStage(kind)))
 for _kind in converters():
-    register(ConvertStage(_kind.name, f"shards from {_kind.title}", _stage_config(_kind), run_convert))
+    register(_kind)

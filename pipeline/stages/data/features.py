@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -56,6 +57,9 @@ class FeaturesStage(StageKind[FeaturesConfig]):
         self.summary = f"statistics of {modality.name} features"
         self.file = f"{modality.name}.safetensors"
 
+    def modules(self, config: FeaturesConfig) -> Iterable[str]:
+        return [*super().modules(config), type(self.modality).__module__]
+
     def run(self, context: StageContext) -> None:
         stats = frame_statistics(context.given["data"].split("train"), self.modality)
         wanted = context.config.width or self.width
@@ -80,6 +84,4 @@ class FeaturesStage(StageKind[FeaturesConfig]):
         copy_files(stage.folder, target, (self.file,))
 
 
-for _modality in MODALITIES.values():
-    if _modality.width is not None:
-        register(FeaturesStage(_modality))
+MODALITIES.follow(lambda modality: modality.width is not None and register(FeaturesStage(modality)))

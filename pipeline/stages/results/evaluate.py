@@ -16,12 +16,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import FACE_ALIGNMENT, GENERATOR, Every, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, as_rows
 from motionloom.pipeline.evaluation.cases import Case, extreme_cases, write_cases
-from motionloom.pipeline.evaluation.clip_metrics import (
-    CAPTION_METRICS,
-    Performance,
-    clip_figures,
-    measure_clip,
-)
+from motionloom.pipeline.evaluation.clip_metrics import Performance, clip_figures, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.figures import (
     MODEL,
     RECORDED,
@@ -213,8 +208,8 @@ class _Evaluation(EvaluationUnits):
                 Performance(joints, t.joints, fps, face, t.truth)
                 for (joints, face), t in zip(motions, self.truths, strict=True)
             ]
-            rows[row] = [[measure_clip(CAPTION_METRICS, one) for one in performances]]
-        return clip_figures(CAPTION_METRICS, rows, self.protocol)
+            rows[row] = [[measure_clip(metrics_of("captions"), one) for one in performances]]
+        return clip_figures(metrics_of("captions"), rows, self.protocol)
 
     def movement(self, made: Sequence[Arrays]) -> list[Figure]:
         """Figures of kinetic and geometric features."""

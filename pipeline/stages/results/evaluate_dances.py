@@ -15,13 +15,13 @@ from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, St
 from motionloom.pipeline.contract.units import Arrays, Row, even_slices
 from motionloom.pipeline.evaluation.clip_metrics import (
     BEAT_ALIGN,
-    DANCE_METRICS,
     MIN_FRAMES,
     RECOGNITION,
     Joints,
     Performance,
     clip_figures,
     measure_clip,
+    metrics_of,
 )
 from motionloom.pipeline.evaluation.dances import (
     SOUND,
@@ -169,10 +169,10 @@ class _DanceEvaluation(Evaluation):
         apart = other_songs(clips, self.config.shuffles, self.context.seed)
         if any(apart):
             rows[OTHER_MUSIC] = self.under_other_music(motions[MODEL], apart)
-        figures = clip_figures(DANCE_METRICS, rows, self.protocol)
+        figures = clip_figures(metrics_of("dances"), rows, self.protocol)
         figures += self.way(rows) if any(apart) else []
         chance = plain({f"recognition.{name}": share for name, share in commonest(clips).items()})
-        figures += group_figures(RECOGNITION.group, RECOGNITION.columns, {CHANCE: chance}, self.protocol)
+        figures += group_figures(RECOGNITION.name, RECOGNITION.columns, {CHANCE: chance}, self.protocol)
         features = {
             row: [all_features(one, self.fps, self.config.feature_fps) for one in repeats]
             for row, repeats in motions.items()
@@ -205,7 +205,7 @@ class _DanceEvaluation(Evaluation):
     def each(self, motions: Sequence[Joints]) -> list[Row]:
         """The values of one motion for each clip, against the clip's own music."""
         pairs = zip(motions, self.clips, strict=True)
-        return [measure_clip(DANCE_METRICS, _performance(joints, clip)) for joints, clip in pairs]
+        return [measure_clip(metrics_of("dances"), _performance(joints, clip)) for joints, clip in pairs]
 
     def under_other_music(
         self, repeats: Sequence[Sequence[Joints]], apart: Sequence[Sequence[int]]
@@ -238,7 +238,7 @@ class _DanceEvaluation(Evaluation):
             other = row_estimates(rows[OTHER_MUSIC][repeat * turns : (repeat + 1) * turns])
             ways.append(dict(_ways(row_estimates([made]), other, true)))
         return group_figures(
-            BEAT_ALIGN.group, WAY, {MODEL: set_estimates(ways, self.config.decodings)}, self.protocol
+            BEAT_ALIGN.name, WAY, {MODEL: set_estimates(ways, self.config.decodings)}, self.protocol
         )
 
 

@@ -16,7 +16,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
-from motionloom.pipeline.evaluation.clip_metrics import CAPTION_METRICS, Performance, measure_clip
+from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.movement import features_of
 from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors, read_basis
@@ -206,7 +206,7 @@ class EvaluationUnits(Evaluation):
         out = as_table([clip_errors(tokenizer, self._nearest, truth, body) for truth, body in pairs], JOINTS)
         fps, layout = self.dataset.layout.fps, tokenizer.layout
         shown = [Performance(joints_of(body, layout), t.joints, fps, t.face, t.truth) for t, body in pairs]
-        out |= as_table([measure_clip(CAPTION_METRICS, one) for one in shown], CLIP)
+        out |= as_table([measure_clip(metrics_of("captions"), one) for one in shown], CLIP)
         faces = self.context.given.get("face_tokenizer", tokenizer)
         models_faces = faces.layout.has("face") and faces.net.part in ("face", "all")
         if models_faces:
@@ -242,7 +242,7 @@ class EvaluationUnits(Evaluation):
             Performance(m.joints, t.joints, fps, m.face, t.truth)
             for t, m in zip(truths, motions, strict=True)
         ]
-        out = as_table([measure_clip(CAPTION_METRICS, one) for one in made_for], CLIP)
+        out = as_table([measure_clip(metrics_of("captions"), one) for one in made_for], CLIP)
         moves = [features_of(m.joints, fps) for m in motions]
         out |= {MOVEMENT + kind: np.stack([move[kind] for move in moves]) for kind in moves[0]}
         if draw == 0:

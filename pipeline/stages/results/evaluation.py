@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.contract.units import Arrays, even_slices
 from motionloom.pipeline.evaluation.cases import shown_cases
+from motionloom.pipeline.evaluation.clip_metrics import CLIP_METRICS
 from motionloom.pipeline.evaluation.figures import (
     FILE_NAME,
     Fact,
@@ -43,6 +44,9 @@ class EvaluationStage(StageKind):
 
     shares = True
     offers = frozenset({"figures", SHOWING})
+
+    def modules(self, config: Any) -> Iterable[str]:
+        return [*super().modules(config), *(one.measure.__module__ for one in CLIP_METRICS.values())]
 
     @abstractmethod
     def evaluation(self, context: StageContext) -> Evaluation:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from pydantic import Field
 
 from motionloom.datasets.base.printable import printable
@@ -19,7 +21,7 @@ from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_fo
 from motionloom.pipeline.evaluation.truth import has_caption, recorded_seconds, spread, truth_of
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions
-from motionloom.pipeline.inference.writers import Format, default_formats
+from motionloom.pipeline.inference.writers import WRITERS, Format, default_formats
 from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
 
@@ -52,6 +54,9 @@ class GenerateStage(StageKind):
     offers = frozenset({"motions"})
     takes = ("data", Every("generators", GENERATOR))
     version = 8  # notes where the clips state their truth
+
+    def modules(self, config: GenerateConfig) -> Iterable[str]:
+        return [*super().modules(config), *(WRITERS[name].write.__module__ for name in config.formats)]
 
     def run(self, context: StageContext) -> None:
         from motionloom.pipeline.inference.outputs import page_note, write_motions
