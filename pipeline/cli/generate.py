@@ -116,7 +116,7 @@ def generate(
 class _Request:
     """What drives the motions, as the command line has it."""
 
-    model: Path
+    model: str
     device: str
     captions: list[str]
     faces: list[str] | None
@@ -192,7 +192,7 @@ def _generate_files(
             motions,
             formats,
             title=page_title([motion.caption for motion in motions], songs, asked.script),
-            note=page_note(len(motions), asked.model.resolve().name, asked.seed, notes),
+            note=page_note(len(motions), Path(asked.model).resolve().name, asked.seed, notes),
             seed=asked.seed,
             names=None if asked.captions else each([Excerpt.named(path).path.stem for path in asked.songs]),
             figure=posing,
@@ -213,7 +213,7 @@ def formats_of(formats: str | None) -> list[str]:
     return wanted
 
 
-def open_model(folder: Path, device: str, console: Console) -> MotionModel:
+def open_model(folder: str, device: str, console: Console) -> MotionModel:
     """A model; says which is taken, where a name could mean a folder or one that comes with the package."""
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.shipped_models import say_model
@@ -279,7 +279,7 @@ def _stream(asked: _Request, out: Path | None) -> None:
         bundle, driver, seed=asked.seed, sampling=asked.sampling, notice=partial(print_note, aside)
     )
     with _stream_file(out) as file:
-        file.write(heading(stream.layout, stream.seed, asked.model.resolve().name))
+        file.write(heading(stream.layout, stream.seed, Path(asked.model).resolve().name))
         file.flush()
         started, first, frames = time.perf_counter(), math.nan, 0
         try:

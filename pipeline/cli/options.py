@@ -13,9 +13,10 @@ from pydantic_core import to_jsonable_python
 from motionloom.datasets.schema import UserError, nearest
 
 ModelFolder = Annotated[
-    Path,
+    str,
     typer.Argument(
-        help="A run folder (runs/NAME), an exported folder, or a model of the package (see info)."
+        help="A run folder (runs/NAME), an exported folder, a model of the package (see info), or "
+        "OWNER/NAME of one on the hub."
     ),
 ]
 RunFolder = Annotated[Path, typer.Argument(help="A run folder (runs/NAME).")]

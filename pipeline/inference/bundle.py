@@ -46,7 +46,7 @@ from motionloom.pipeline.inference.requests import (
     ticks_of,
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
-from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model, say_model
+from motionloom.pipeline.inference.shipped_models import find_model, say_model
 from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.known_captions import Unknown
@@ -84,14 +84,12 @@ class Bundle:
 
     @staticmethod
     def open(name: Path | str, device: torch.device = CPU) -> Bundle:
-        """Open a run folder, an exported folder, or a model that comes with the package, by its name."""
-        folder = model_folder(name)
+        """Open a run folder, an exported folder, a model that comes with the package, or one of the hub."""
+        folder = find_model(name)
         if (folder / BUNDLE_FILE).is_file():
             found = open_exported(folder), StageCache(device), exported_sampling(folder)
             return Bundle._of(folder, (*found, open_exported(folder, CAPTIONER)))
         if not (folder / "recipe.yaml").is_file():
-            if not folder.exists():
-                raise UserError(no_such_model(name))
             shipped = say_model(name)
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no {BUNDLE_FILE})"

@@ -18,13 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from huggingface_hub import ModelHubMixin, snapshot_download
-from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+from huggingface_hub import ModelHubMixin
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.places import hub_is_away, require_hub_name
 from motionloom.datasets.conditions import Conditions
-from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.sampling import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Prompt
@@ -38,7 +35,7 @@ from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
-from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
+from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.inference.stream import MotionStream, segments_of
 from motionloom.pipeline.launch.hardware import choose_device, threads_for
 from motionloom.pipeline.store.known_captions import Unknown
@@ -58,7 +55,7 @@ class MotionModel(
     """Captions, music or both to whole-body motions."""
 
     def __init__(self, folder: Path | str, device: str | torch.device = "auto") -> None:
-        self.folder = model_folder(folder)
+        self.folder = find_model(folder)
         self.bundle = Bundle.open(self.folder, choose_device(device))
         # The mixin would write our argument, a local path, into the config.json that the hub wants.
         self._hub_mixin_config = dict(HUB_CONFIG)
@@ -77,26 +74,10 @@ class MotionModel(
         """A folder, a model that comes with the package, or a name on the hub (`owner/name`).
 
         `options` are `device` (auto: a GPU if there is one; cpu, cuda, cuda:N) and the hub's (revision,
-        token, local_files_only).
+        token, local_files_only). Raises `UserError` where there is no such model.
         """
-        name = pretrained_model_name_or_path
-        if model_folder(
-            name
-        ).is_dir():  # the hub's own way in warns of a run folder, which has no config.json
-            return cls(name, options.get("device", "auto"))
-        if isinstance(name, Path) or "/" not in name:
-            raise UserError(no_such_model(name))
-        require_hub_name(name)
-        away = hub_is_away()
-        if away:
-            options["local_files_only"] = True
-        try:
-            return super().from_pretrained(name, **options)
-        except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            if away:
-                reason = "it cannot be reached from here, and its cache does not hold it"
-            raise UserError(f"{name}: no such folder, and the hub does not give it ({reason})") from None
+        device = options.pop("device", "auto")
+        return cls(find_model(pretrained_model_name_or_path, **options), device)
 
     def generate(
         self,
@@ -247,29 +228,6 @@ class MotionModel(
             shutil.copytree(self.folder, save_directory, dirs_exist_ok=True)
         else:
             write_bundle(self.folder, save_directory)
-
-    @classmethod
-    def _from_pretrained(
-        cls,
-        *,
-        model_id: str,
-        revision: str | None = None,
-        cache_dir: str | Path | None = None,
-        force_download: bool = False,
-        local_files_only: bool = False,
-        token: str | bool | None = None,
-        device: str | torch.device = "auto",
-        **kwargs: Any,
-    ) -> MotionModel:
-        """Open a folder, or fetch one from the hub first."""
-        if Path(model_id).is_dir():
-            return cls(model_id, device)
-        folder = snapshot_download(
-            model_id, revision=revision, cache_dir=cache_dir, force_download=force_download,
-            local_files_only=local_files_only, token=token,
-            allow_patterns=["*.json", "*.safetensors", "*.txt", "*.model"],
-        )  # fmt: skip
-        return cls(folder, device)
 
 
 def _warn(unknown: Unknown | str) -> None:

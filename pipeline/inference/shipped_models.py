@@ -1,7 +1,8 @@
-"""The trained models that come with the package, and which folder a model's name means.
+"""The folder that a model's name means: one that is there, a model of the package, or one of the hub.
 
-Each is an exported folder in `models/pretrained/` with its card (`README.md`), known by the folder's name:
-`motionloom generate synthetic "a person waves"`. A folder of that name in the current directory goes first.
+Those of the package are exported folders in `models/pretrained/` with their card (`README.md`), known by
+the folder's name: `motionloom generate synthetic "a person waves"`. A folder of that name in the current
+directory goes first.
 """
 
 from __future__ import annotations
@@ -11,10 +12,14 @@ import json
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
-from motionloom.datasets.base.places import no_such_folder
+from motionloom.datasets.base.places import hub_is_away, means_folder, no_such_folder
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 
+_FILES = ["*.json", "*.safetensors", "*.txt", "*.model"]
+"""Files of an export; a hub's folder may hold others."""
 CARD_FIGURES = "card.json"
 """Beside a model's card: its figures, and what it is in one line."""
 
@@ -53,6 +58,35 @@ def model_folder(name: Path | str) -> Path:
     folder = Path(name)
     shipped = None if folder.exists() else shipped_models().get(str(name))
     return folder if shipped is None else shipped.folder
+
+
+def find_model(name: Path | str, **options: Any) -> Path:
+    """The folder of a model: as `model_folder`, or else, of a name `owner/name`, a copy from the hub.
+
+    `options` are the hub's (revision, token, cache_dir, force_download, local_files_only). Raises `UserError`
+    where no folder, no model of the package and no model of the hub has this name; a `Path` is no hub name.
+    """
+    folder = model_folder(name)
+    if folder.exists():
+        return folder
+    if isinstance(name, Path) or "/" not in name or means_folder(name):
+        raise UserError(no_such_model(name))
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+
+    away = hub_is_away()
+    if away:
+        options["local_files_only"] = True
+    try:
+        return Path(snapshot_download(name, allow_patterns=_FILES, **options))
+    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError) as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        if away:
+            reason = "it cannot be reached from here, and its cache does not hold it"
+        raise UserError(
+            f"{name}: no such folder, no model of that name comes with motionloom, and the hub does not give "
+            f"it ({reason})"
+        ) from None
 
 
 def say_model(name: Path | str) -> str | None:

@@ -15,7 +15,7 @@ from rich.console import Console
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.inference.shipped_models import model_folder, say_model
+from motionloom.pipeline.inference.shipped_models import find_model, say_model
 from motionloom.pipeline.serve.app import Site
 from motionloom.pipeline.serve.guard import HEADERS, is_loopback
 from motionloom.pipeline.serve.requests import ServeConfig
@@ -25,17 +25,16 @@ _GRACE = 5
 """Seconds that open requests have to end in when the server stops."""
 
 
-def serve(folder: Path, config: ServeConfig, *, device: str = "auto", console: Console) -> None:
-    """Serve a run folder, an exported one or a model of the package; returns after Ctrl-C."""
-    if not model_folder(folder).is_dir():
-        MotionModel.from_pretrained(folder)  # raises an error that names the models that exist
+def serve(folder: Path | str, config: ServeConfig, *, device: str = "auto", console: Console) -> None:
+    """Serve a run folder, an exported one, a model of the package or one of the hub, until Ctrl-C."""
+    place = find_model(folder)
     # The address is taken before the model is loaded, so that a taken port is reported at once.
     with closing(listen(config)) as listener:
-        model = MotionModel.from_pretrained(folder, device=device)
+        model = MotionModel.from_pretrained(place, device=device)
         if (shipped := say_model(folder)) is not None:
             console.print(shipped, markup=False, highlight=False, soft_wrap=True)
         warm(model)
-        worker, name = Worker(config.waiting), folder.resolve().name
+        worker, name = Worker(config.waiting), Path(folder).resolve().name
         server = server_of(Site(model, config, worker, name), worker)
         host, port = listener.getsockname()[:2]
         address = f"[{host}]" if ":" in host else host

@@ -1,7 +1,8 @@
-"""A new converter is one folder: command line and recipes find it there."""
+"""A converter from outside is one file: command line and recipes find it where it is registered."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Split
 from motionloom.datasets.shards.sample import Sample
+from motionloom.pipeline import register
 
 
 class ToyConfig(ConvertConfig):
@@ -43,6 +45,7 @@ class ToyClip(NamedTuple):
         return self.path.name
 
 
+@register
 class Toy(Converter[ToyConfig, ToyClip]):
     name, title, summary, example = "toy", "Toys", "Toys to shards.", "toys shards"
     config_class = ToyConfig
@@ -73,21 +76,10 @@ stages:
   stats: {kind: stats}
 """
 
-COMMAND = """
-import sys
-import motionloom.datasets.convert as convert
-convert.__path__.append(sys.argv.pop(1))
-from motionloom.pipeline.cli.main import main
-main()
-"""
-
 
 @pytest.fixture
 def toys(tmp_path: Path) -> Path:
-    folder = tmp_path / "converters" / "toy"
-    folder.mkdir(parents=True)
-    (folder / "__init__.py").touch()
-    (folder / "convert.py").write_text(TOY)
+    (tmp_path / "toys.py").write_text(TOY)
     source = tmp_path / "toys"
     source.mkdir()
     for number in range(3):
@@ -96,13 +88,14 @@ def toys(tmp_path: Path) -> Path:
 
 
 def motionloom(folder: Path, *words: str) -> str:
-    command = [sys.executable, "-P", "-c", COMMAND, str(folder / "converters"), *words]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", *words]
+    given = {**os.environ, "MOTIONLOOM_STAGES": str(folder / "toys.py")}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=given)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
-def test_a_folder_is_a_command_and_a_stage(toys: Path) -> None:
+def test_a_file_is_a_command_and_a_stage(toys: Path) -> None:
     assert "Toys to shards" in motionloom(toys, "data", "convert", "toy", "--help")
     motionloom(toys, "data", "convert", "toy", str(toys / "toys"), str(toys / "out"), "-s", "size=1.05")
     made = Manifest.load_json(toys / "out" / "manifest.json")

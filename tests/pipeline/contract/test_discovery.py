@@ -1,15 +1,17 @@
-"""A new baseline is its folder: nothing names it."""
+"""A new baseline is its folder; a file of one's own is named by a variable: nothing else names them."""
 
 from __future__ import annotations
 
 import runpy
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from motionloom.datasets.base import register
 from motionloom.pipeline import baselines
 from motionloom.pipeline.contract import stage
 from motionloom.pipeline.runs.api import run_recipe
@@ -17,8 +19,16 @@ from motionloom.pipeline.runs.api import run_recipe
 PACER = Path(__file__).resolve().parents[2] / "helpers/pacer"
 
 
+@pytest.fixture(autouse=True)
+def kinds_are_put_back() -> Iterator[None]:
+    before = dict(stage.stage_kinds())
+    yield
+    for name in stage.KINDS.keys() - before.keys():
+        del stage.KINDS[name]
+    register.discover.cache_clear()
+
+
 def test_a_folder_beside_the_baselines_is_a_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stage, "_KINDS", dict(stage.stage_kinds()))
     shutil.copytree(PACER, tmp_path / "pacer")
     monkeypatch.setattr(baselines, "__path__", [*baselines.__path__, str(tmp_path)])
     runpy.run_module("motionloom.pipeline.stages.table")
@@ -31,10 +41,8 @@ def test_the_example_of_the_documents_runs_from_its_file(
 ) -> None:
     text = (PACER.parents[2] / "docs/architecture.md").read_text()
     (tmp_path / "count_clips.py").write_text(text.split("```python\n")[1].split("```")[0])
-    monkeypatch.setattr(stage, "_KINDS", dict(stage.stage_kinds()))
-    monkeypatch.setattr(stage, "_loaded", False)
+    register.discover.cache_clear()
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(stage, "entry_points", lambda group: ())
     monkeypatch.setenv("MOTIONLOOM_STAGES", str(tmp_path / "count_clips.py"))
     (tmp_path / "mine.yaml").write_text(
         "name: mine\nstages: {data: {kind: synth, clips: 4, layout: body133, val_fraction: 0, "

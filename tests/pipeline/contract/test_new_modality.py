@@ -16,10 +16,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from motionloom.datasets.modalities.table import MODALITIES
+from motionloom.pipeline import register
 from pulse_modality import PULSE
 
-MODALITIES[PULSE.name] = PULSE  # the one line
+register(PULSE)  # the one line
 
 import numpy as np
 from rich.console import Console

@@ -21,6 +21,7 @@ import pytest
 from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.base.register import VARIABLE
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract import stage as registry
 from motionloom.pipeline.inference.bundle import Bundle
@@ -60,8 +61,8 @@ def environment(stages: str | None = "pacer.stage") -> dict[str, str]:
     """Of the program: helpers on Python's path, and the module that registers the kind."""
     path = os.pathsep.join(filter(None, (str(HELPERS), os.environ.get("PYTHONPATH"))))
     given = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "COLUMNS": "140"}
-    given.pop(registry.VARIABLE, None)
-    return given if stages is None else {**given, registry.VARIABLE: stages}
+    given.pop(VARIABLE, None)
+    return given if stages is None else {**given, VARIABLE: stages}
 
 
 def start(*arguments: object, stages: str | None = "pacer.stage") -> subprocess.Popen[str]:
@@ -109,11 +110,11 @@ def export(run: Path) -> Path:
 @pytest.fixture
 def known(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The kind in this process, for one test."""
-    monkeypatch.setattr(registry, "_KINDS", dict(registry.stage_kinds()))
+    registry.stage_kinds()
     monkeypatch.delitem(sys.modules, "pacer.stage", raising=False)
     importlib.import_module("pacer.stage")
     yield
-    sys.modules.pop("pacer.stage")
+    del sys.modules["pacer.stage"], registry.KINDS["pacer"]
 
 
 def test_dry_run_counts_it_without_data(recipe: Path) -> None:
@@ -184,11 +185,11 @@ def test_the_recipe_schema_has_it(known: None) -> None:
 
 def test_without_the_module_it_is_one_sentence(recipe: Path, run: Path, export: Path) -> None:
     said = program("run", recipe, "--out", recipe.parent / "other", code=2, stages=None)
-    assert "stages.pacer.kind = 'pacer'" in said and registry.VARIABLE in said
+    assert "stages.pacer.kind = 'pacer'" in said and VARIABLE in said
     assert said.startswith("error: ") and len(said.splitlines()) == 1
     assert "pacer" not in registry.stage_kinds()
     for folder in (run, export):
-        with pytest.raises(UserError, match=f"'pacer' .*{registry.VARIABLE}"):
+        with pytest.raises(UserError, match=f"'pacer' .*{VARIABLE}"):
             Bundle.open(folder)
     said = program("run", recipe, "--dry-run", code=2, stages="pacer.stage, no_such_module")
     assert "MOTIONLOOM_STAGES=no_such_module: cannot be imported" in said and len(said.splitlines()) == 1

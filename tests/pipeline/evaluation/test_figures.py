@@ -101,8 +101,8 @@ def test_a_new_metric_is_one_function_and_one_line(tmp_path: Path, monkeypatch: 
     line = ClipMetric(
         "How far motions get", reach, (Metric("reach.root", "reach of the root", "higher", "m"),)
     )
-    monkeypatch.setattr(clip_metrics, "CAPTION_METRICS", (*clip_metrics.CAPTION_METRICS, line))
-    metrics, rng = clip_metrics.CAPTION_METRICS, np.random.default_rng(0)
+    monkeypatch.setitem(clip_metrics.CLIP_METRICS, line.name, line)
+    metrics, rng = clip_metrics.metrics_of("captions"), np.random.default_rng(0)
     real = [rng.normal(size=(20, 22, 3)) for _ in range(5)]
 
     def file(scale: float) -> FigureFile:

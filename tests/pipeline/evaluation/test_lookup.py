@@ -8,7 +8,7 @@ import pytest
 
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.evaluation.clip_metrics import CAPTION_METRICS, Performance, measure_clip
+from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.reference_baselines import by_nearest_caption, by_nearest_labels
 from motionloom.pipeline.evaluation.truth import has_caption, truth_of
 
@@ -37,7 +37,9 @@ def test_a_lookup_finds_training_motion_of_the_action(splits: tuple[ShardDataset
             assert one.truth["action"] == t.truth["action"]
             assert not (one.truth["action"] == "kick" and one.truth["side"] == "left")
         values = [
-            measure_clip(CAPTION_METRICS, Performance(one.joints, t.joints, test.layout.fps, None, t.truth))
+            measure_clip(
+                metrics_of("captions"), Performance(one.joints, t.joints, test.layout.fps, None, t.truth)
+            )
             for one, t in zip(found, truths, strict=True)
         ]
         new = [value["agreement.everything"] for value, held in zip(values, held_out, strict=True) if held]

@@ -92,8 +92,8 @@ def write_csv(path: Path, outputs: Outputs) -> None:
 
 @pytest.fixture
 def csv(monkeypatch: pytest.MonkeyPatch) -> None:
-    writer = Writer("_root.csv", "text/csv", "the root's way", write_csv, together="all.csv")
-    monkeypatch.setitem(WRITERS, "root", writer)
+    writer = Writer("root", "_root.csv", "text/csv", "the root's way", write_csv, together="all.csv")
+    monkeypatch.setitem(WRITERS, writer.name, writer)
 
 
 @pytest.mark.usefixtures("csv")

@@ -178,8 +178,7 @@ def test_a_model_that_is_no_folder_is_answered_without_the_hub(
     def asked(*arguments: object, **options: object) -> object:
         raise AssertionError("the hub was asked")
 
-    monkeypatch.setattr("huggingface_hub.hub_mixin.hf_hub_download", asked)
-    monkeypatch.setattr("motionloom.pipeline.inference.model.snapshot_download", asked)
+    monkeypatch.setattr("huggingface_hub.snapshot_download", asked)
     with pytest.raises(UserError, match="no such folder"):
         MotionModel.from_pretrained(name)
 

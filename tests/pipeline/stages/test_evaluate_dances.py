@@ -22,7 +22,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.dances import DanceConditions, DanceConfig
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, synthesize
 from motionloom.models.metrics.dance import dance_fid
-from motionloom.pipeline.evaluation.clip_metrics import DANCE_METRICS, Performance, measure_clip
+from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.dances import (
     DanceClip,
     commonest,
@@ -109,7 +109,7 @@ def test_beats_without_a_truth_are_tracked(data: Splits, monkeypatch: pytest.Mon
 def values(pairs: Iterable[tuple[np.ndarray, DanceClip]]) -> dict[str, float]:
     """Means over motions, each held against a clip."""
     rows = [
-        measure_clip(DANCE_METRICS, Performance(m, c.joints, c.fps, truth=c.truth, beats=c.beats))
+        measure_clip(metrics_of("dances"), Performance(m, c.joints, c.fps, truth=c.truth, beats=c.beats))
         for m, c in pairs
     ]
     return {name: found.value for name, found in row_estimates([rows]).items()}
