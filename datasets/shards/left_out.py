@@ -14,7 +14,7 @@ from pathlib import Path
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.schema import Dropped
+from motionloom.datasets.schema import Dropped, UserError
 
 LEFT_OUT_FILE = "left-out.txt"
 """Beside the manifest, when there is anything to list: kind, source and reason of each, between tabs."""
@@ -22,6 +22,12 @@ LEFT_OUT_FILE = "left-out.txt"
 _QUOTED = re.compile(r"'[^']*'")
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:[.,]\d+)*(?:e[+-]?\d+)?")
 _FILE = re.compile(r"[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
+
+
+def drop(label: str, error: Exception) -> Dropped:
+    """The manifest's record of a clip or file that failed."""
+    text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
 
 
 @dataclass(frozen=True)

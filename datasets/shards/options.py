@@ -18,14 +18,10 @@ SOURCE_CHECKSUM = "source_sha256"
 
 @dataclass(frozen=True)
 class Part:
-    """One machine's share of a conversion: every `count`-th task from `index` (from 0) on.
-
-    `step` is `shards`, or `features` for the sources that need that step first.
-    """
+    """One machine's share of a conversion: every `count`-th shard from `index` (from 0) on."""
 
     index: int
     count: int
-    step: Literal["features", "shards"] = "shards"
 
     def __post_init__(self) -> None:
         if not 0 <= self.index < self.count:
@@ -86,10 +82,6 @@ class WriteOptions:
     progress: bool = True
     part: Part | None = None
     """Make this part only, and no manifest. Parts may run at once; a run without one excludes all others."""
-
-    @property
-    def features_only(self) -> bool:
-        return self.part is not None and self.part.step == "features"
 
     def has(self, position: int) -> bool:
         return self.part is None or self.part.has(position)

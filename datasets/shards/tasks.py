@@ -20,6 +20,7 @@ from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SPLITS, Dropped, MotionType, ShardInfo, Split, UserError
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, Written, clip_entries, index_path
+from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import DropClip, Sample, encode_sample
 
@@ -193,25 +194,24 @@ def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -
             )
             for sample in samples
         ]
-    except DropClip as drop:
-        return Dropped(source=label, reason=str(drop))
+    except DropClip as decision:
+        return Dropped(source=label, reason=str(decision))
     except MemoryError:
         raise
     # A full disk is no fault of this clip: such errors stop the run, and what is finished stays.
     except Exception as error:  # a converter meets whatever a bad file makes of its libraries
         if of_the_machine(error):
             raise
-        reason = f"{type(error).__name__}: {error}" if not isinstance(error, UserError) else str(error)
+        failed = drop(label, error)
         if task.strict:
-            raise UserError(f"{label}: {reason} (strict: the run stops at the first bad item)") from error
-        return Dropped(source=label, reason=reason)
+            raise UserError(
+                f"{label}: {failed.reason} (strict: the run stops at the first bad item)"
+            ) from error
+        return failed
 
 
-def finished_shard(task: ShardTask[Any], *, verify: bool = True) -> Result | None:
-    """Return an earlier run's result of `task` from the same inputs, or None when it must be made.
-
-    `verify` reads the tar and compares its sha256; else its size will do.
-    """
+def finished_shard(task: ShardTask[Any]) -> Result | None:
+    """Return an earlier run's result of `task` from the same inputs, or None when it must be made."""
     path = index_path(task.path)
     try:
         index = ShardIndex.load_json(path)
@@ -222,6 +222,6 @@ def finished_shard(task: ShardTask[Any], *, verify: bool = True) -> Result | Non
     if index.shard is not None:
         if not task.path.exists() or task.path.stat().st_size != index.shard.bytes:
             return None
-        if verify and sha256_of(task.path) != index.shard.sha256:
+        if sha256_of(task.path) != index.shard.sha256:
             return None
     return index.shard, index.dropped

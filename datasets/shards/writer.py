@@ -46,7 +46,7 @@ from motionloom.datasets.shards.tasks import (
 T = TypeVar("T")
 
 WORK_FOLDER = ".work"
-"""Inside the folder of the shards: what a features step makes; removed when the manifest stands."""
+"""Inside the folder of the shards: unpacked archives and old shards; removed when the manifest stands."""
 
 OLD_FOLDER = "old"
 """Inside it: shards of an earlier run whose clips are taken over."""
@@ -105,11 +105,9 @@ class DatasetWriter(Generic[T]):
     ) -> None:
         self.out, self.pool = out, pool
         self._facts, self._how = facts, how
-        # Every part of a features step looks at all shards: any of them may need its features.
-        self._tasks = [task for at, task in enumerate(tasks) if how.features_only or how.has(at)]
-        find = partial(finished_shard, verify=not how.features_only)
+        self._tasks = [task for at, task in enumerate(tasks) if how.has(at)]
         with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
-            self._results = list(threads.map(find, self._tasks))
+            self._results = list(threads.map(finished_shard, self._tasks))
         self._todo = [at for at, result in enumerate(self._results) if result is None]
         self._news = ""
         if self._todo:
@@ -174,7 +172,7 @@ class DatasetWriter(Generic[T]):
 
     @property
     def work_folder(self) -> Path:
-        """For what a features step makes; removed with everything in it when the manifest stands."""
+        """For unpacked archives; removed with everything in it when the manifest stands."""
         return self.out / WORK_FOLDER
 
     def pending(self) -> list[T]:
@@ -187,7 +185,7 @@ class DatasetWriter(Generic[T]):
 
         A part returns a manifest that covers the part alone.
         """
-        results = [] if self._how.features_only else self._shards(convert)
+        results = self._shards(convert)
         shards = [shard for shard, _ in results if shard is not None]
         failed = [drop for _, drops in results for drop in drops]
         facts = self._facts

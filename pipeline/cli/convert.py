@@ -11,7 +11,6 @@ import difflib
 import inspect
 import json
 import shlex
-import time
 import typing
 from collections.abc import Iterable
 from pathlib import Path
@@ -84,7 +83,6 @@ def _command(name: str) -> Any:
 
     def run(source: Path, out: Path, plan: bool, workers: int, sets: list[str] | None, as_json: bool,
             **everyday: Any) -> None:  # fmt: skip
-        started = time.perf_counter()  # the imports are the larger part of a short conversion
         if as_json and not plan:
             raise UserError("--json is for the plan: give --plan too")
         settings = {key: value for key, value in everyday.items() if value is not None}
@@ -92,9 +90,7 @@ def _command(name: str) -> Any:
         _require_known(settings, config, f"data convert {name}")
         fields = {"source": source, **settings}
         console = make_console(aside=as_json)
-        convert_command(
-            name, fields, out, plan=plan, workers=workers, console=console, started=started, as_json=as_json
-        )
+        convert_command(name, fields, out, plan=plan, workers=workers, console=console, as_json=as_json)
 
     parameters = [
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),
@@ -175,23 +171,18 @@ def convert_command(
     plan: bool,
     workers: int,
     console: Console,
-    started: float | None = None,
     as_json: bool = False,
 ) -> None:
-    """Plan a conversion, or run it.
-
-    `started` is when the command began (`time.perf_counter()`), for the time that a plan estimates.
-    """
+    """Plan a conversion, or run it."""
     from motionloom.datasets.convert.common.conversion import run_conversion
     from motionloom.datasets.convert.registry import converter_named, prepare
 
-    started = time.perf_counter() if started is None else started
     converter = converter_named(kind)
     config = converter.config_class.parse(fields, f"data convert {kind}")
     shown = not console.quiet
     if plan:
         conversion = prepare(config, kind=converter, maps=out, workers=workers, progress=shown).looked()
-        planned = conversion.estimated(workers, started)
+        planned = conversion.estimated(workers)
         licensed = bool(conversion.converter.licence(planned))
         line = proposed(kind, config, out, planned, licensed=licensed) if planned.items else ""
         if as_json:

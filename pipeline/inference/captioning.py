@@ -11,10 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import HANDS, PRESENT_ALL, Dropped, UserError
+from motionloom.datasets.shards.left_out import drop
+from motionloom.datasets.shards.sample import Sample
 from motionloom.pipeline.contract.captioning import MotionCaptioner, Sentence
 from motionloom.pipeline.inference.edits.clip_file import LEAST_FRAMES, features_for, read_clip
 from motionloom.pipeline.inference.model import MotionModel
@@ -109,17 +112,21 @@ def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped
                 raise
             hands, given["fingers"] = False, "missing"
             conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), maps=Path(maps))
-    plan, converter = conversion.plan, conversion.converter
-    yield from (*plan.broken, *plan.rejected, *plan.dropped)
-    clips = {clip.label(): clip for _, clip in plan.items}
-    step = converter.features(list(clips.values()))
-    assert step is not None  # mocap is read batch by batch
-    for batch in step.batches:
-        for label, made in batch.clips():
-            if isinstance(made, Dropped):
-                yield made
-            else:
-                yield ReadClip(clips[label].id, clips[label].found.path, made, HANDS * hands)
+        plan, converter = conversion.plan, conversion.converter
+        yield from (*plan.broken, *plan.rejected, *plan.dropped)
+        clips = [clip for _, clip in plan.items]
+        with Workers(1) as pool:
+            converter.unpack(clips, Path(maps), pool, progress=False)
+        for clip in clips:
+            try:
+                sample = converter.convert(clip)
+            except MemoryError:
+                raise
+            except Exception as error:  # whatever a bad file makes of the libraries below
+                yield drop(clip.label(), error)
+                continue
+            assert isinstance(sample, Sample)
+            yield ReadClip(clip.id, clip.found.path, sample.motion, HANDS * hands)
 
 
 def caption_clips(

@@ -20,7 +20,7 @@ from motionloom.datasets.convert.captions.options import CaptionConfig, Captione
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id, inside, read_in_threads
-from motionloom.datasets.convert.common.plan import ConversionPlan, drop
+from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import (
     hash_split,
     keep_mirrors_together,
@@ -29,6 +29,7 @@ from motionloom.datasets.convert.common.splits import (
 )
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
+from motionloom.datasets.shards.left_out import drop
 
 SUFFIX = ".npz"
 LICENCE = "AMASS-noncommercial"

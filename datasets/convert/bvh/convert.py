@@ -1,20 +1,24 @@
 """BVH folders and archives -> shards: any skeleton, through a joint map (`datasets/motion/bvh/joint_map.py`).
 
-An archive is unpacked once although its clips go to many shards: one task a batch (an archive, or 64 loose
-files) encodes its clips into a file of the work folder, and the shards are copied from those files.
+An archive can only be read from front to back and its clips go to many shards, so those that are wanted are
+copied, packed again one by one, to the work folder before shards are written.
 """
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Iterator, Sequence
+import zlib
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.base.files import sha256_of_json, write_bytes
+from motionloom.datasets.base.pool import Workers
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.convert.bvh.plan import (
     BvhClip,
     BvhConfig,
@@ -26,21 +30,22 @@ from motionloom.datasets.convert.bvh.plan import (
 from motionloom.datasets.convert.bvh.settle import added_frames
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.facts import Audit
-from motionloom.datasets.convert.common.feature_step import FeatureBatch, FeatureStep
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.look import SourceJoints, named_unit
-from motionloom.datasets.convert.common.plan import ConversionPlan, drop
+from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.bvh.joint_map import JointMap, metres, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
-from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 
 _NAMED_JOINTS = 12
 """Joints without a row that are named; a hand alone has twenty."""
+_QUICK = 1
+"""Level of zlib: text of joints shrinks to a third, and little more with more effort."""
 
 
 class Bvh(Converter[BvhConfig, BvhClip]):
@@ -56,6 +61,8 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         super().__init__(config)
         self.own_maps = load_maps(config.joint_map, config.mapped_skeleton())  # a wrong one fails here
         self.maps: JointMaps = {}
+        self.unpacked: Path | None = None
+        """Folder of the clips of archives, by the sha256 of their files."""
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
         plan, self.maps = plan_bvh(self.config, self.own_maps, settings, Audit(self.stated()))
@@ -77,21 +84,21 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def in_order(self, clip: BvhClip) -> bool:
         return clip.batch.archive is not None
 
-    def features(self, clips: Sequence[BvhClip]) -> FeatureStep[BvhClip]:
-        made_from = sha256_of_json([self.version, self.options()])
-        groups: dict[int, list[BvhClip]] = {}
+    def unpack(self, clips: Sequence[BvhClip], folder: Path, pool: Workers, *, progress: bool) -> None:
+        self.unpacked = folder
+        wanted: dict[Batch, dict[str, str]] = {}
         for clip in clips:
-            groups.setdefault(clip.number, []).append(clip)
-        batches = []
-        for number, group in sorted(groups.items()):
-            labels = {clip.label(): self._content(clip) for clip in group}
-            encode = partial(self._batch, group[0].batch, tuple(labels))
-            batches.append(FeatureBatch(number, labels, self.layout.dim, made_from, encode))
-        return FeatureStep(batches, operator.attrgetter("number"), self._sample)
+            if clip.batch.archive is not None and not (folder / clip.found.sha256).exists():
+                wanted.setdefault(clip.batch, {})[clip.label()] = clip.found.sha256
+        with Meter("unpacking archives", len(wanted), shown=progress and bool(wanted)) as meter:
+            for _ in pool.run(partial(_copy, folder), list(wanted.items())):
+                meter.advance()
 
     def convert(self, clip: BvhClip) -> Sample:
-        """Return the sample of one clip. An archive is read up to it: for many clips, make the batch."""
-        return self._sample(clip, self.encode(clip.label(), self._read(clip)))
+        """Return the sample of one clip. An archive that is not unpacked is read up to it."""
+        motion = self.encode(clip.label(), self._read(clip))
+        hands = self.layout.num_joints > BODY_JOINTS and self.config.fingers != "missing"
+        return Sample(meta=self.meta(clip, motion, hands=hands), motion=motion, texts=list(clip.texts))
 
     def joints(self, clip: BvhClip) -> SourceJoints:
         """The joints as the map reads them, and the joints that no row of it names."""
@@ -158,6 +165,9 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def _read(self, clip: BvhClip) -> bytes:
         batch = clip.batch
+        if self.unpacked is not None:
+            with suppress(FileNotFoundError):
+                return zlib.decompress((self.unpacked / clip.found.sha256).read_bytes())
         if batch.archive is None:  # no need to read the loose files before it
             batch = Batch(batch.root, None, (clip.found.path,))
         for file in batch.read():
@@ -165,30 +175,15 @@ class Bvh(Converter[BvhConfig, BvhClip]):
                 return file.data
         raise UserError(f"{clip.label()}: no longer in the source")
 
-    def _sample(self, clip: BvhClip, motion: NDArray[np.float32]) -> Sample:
-        hands = self.layout.num_joints > BODY_JOINTS and self.config.fingers != "missing"
-        return Sample(meta=self.meta(clip, motion, hands=hands), motion=motion, texts=list(clip.texts))
 
-    def _batch(
-        self, batch: Batch, labels: tuple[str, ...]
-    ) -> Iterator[tuple[str, NDArray[np.float32] | Dropped]]:
-        waiting = set(labels)
-        try:
-            for file in batch.read():
-                if file.label not in waiting:  # a second member of the same name finds nothing
-                    continue
-                waiting.remove(file.label)
-                try:
-                    if file.error:
-                        raise UserError(f"{file.label}: {file.error}")
-                    yield file.label, self.encode(file.label, file.data)
-                except MemoryError:
-                    raise
-                except Exception as error:  # whatever a bad file makes of the libraries below
-                    yield file.label, drop(file.label, error)
-                if not waiting:
-                    return
-        except UserError as error:
-            for label in labels:
-                if label in waiting:
-                    yield label, drop(label, error)
+def _copy(folder: Path, task: tuple[Batch, dict[str, str]]) -> None:
+    """Copy the named files of an archive into a folder, each packed and under the name given for it."""
+    batch, names = task
+    waiting = dict(names)
+    with suppress(UserError):  # damaged from here on, as the plan has said
+        for file in batch.read():
+            # A second member of the same name finds nothing.
+            if (name := waiting.pop(file.label, None)) is not None and not file.error:
+                write_bytes(folder / name, zlib.compress(file.data, _QUICK))
+            if not waiting:
+                return

@@ -253,8 +253,6 @@ class BvhClip:
     """A clip of the plan."""
 
     batch: Batch
-    number: int
-    """Position of its batch in the source."""
     found: FoundFile
     id: str
     split: Split
@@ -357,7 +355,7 @@ def _decide(
         )
         texts = listing.texts_of(clip.path)
         split, about = listing.split_of(clip.path), config.about(clip.path)
-        planned = BvhClip(batches[number], number, clip, clip_id, split, texts, frames, fps, about)
+        planned = BvhClip(batches[number], clip, clip_id, split, texts, frames, fps, about)
         draft.decide(planned, texts, reason)
     if other_rate:
         draft.notes.append(

@@ -1,15 +1,14 @@
 """`Conversion`: one source, planned and ready to be written; the same few steps for every converter.
 
-`run_conversion` goes straight down: features step (where the source needs one), shards, index, manifest.
+`run_conversion` goes straight down: archives are unpacked, then shards, index and manifest are written.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import operator
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +22,6 @@ from motionloom.datasets.convert.common.plan import C, ConversionPlan, limited
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped
 from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions
-from motionloom.datasets.shards.tasks import Convert
 from motionloom.datasets.shards.writer import dataset_writer
 
 SCAN_FILE = ".scan.json"
@@ -85,53 +83,26 @@ class Conversion(Generic[C]):
         self.plan.look = self.look()
         return self
 
-    def estimated(self, workers: int, started: float | None = None) -> ConversionPlan[C]:
-        """The plan with disk and time: bytes by the frame counts, time by converting a few clips.
-
-        `started` is when this process began to plan (`time.perf_counter()`): a conversion needs that long
-        again before its first clip, and every worker process about as long to start.
-        """
-        plan = self.plan
-        start_up = 0.0 if started is None else time.perf_counter() - started
+    def estimated(self, workers: int) -> ConversionPlan[C]:
+        """The plan with disk and time: bytes by the frame counts, time by converting a few clips."""
+        plan, convert = self.plan, self.converter.convert
         width = self.config.motion_layout().dim * (2 if self.config.motion_type == "float16" else 4)
         plan.bytes_needed = sum(plan.frames.values()) * width + len(plan.items) * 4096
-        if (trial := self._trial()) is not None:
-            first, each = trial
-            pool = min(workers, self._tasks())
-            # What the first clip takes longer is imports, which every process of a pool pays for once more.
-            once = start_up + max(0.0, first - each) * (2 if pool > 1 else 1)
-            plan.seconds_needed = once + each * len(plan.items) / max(1, pool)
-        return plan
-
-    def _tasks(self) -> int:
-        if (features := self.converter.features([clip for _, clip in self.plan.items])) is not None:
-            return len(features.batches)
-        return sum(-(-count // _CLIPS_PER_SHARD) for count in self.plan.counts().values())
-
-    def _trial(self) -> tuple[float, float] | None:
-        """Seconds that the first clip takes, imports included, and those after it; None without any."""
-        if not self.plan.items:
-            return None
-        first, start, count = 0.0, time.perf_counter(), 0
-        for count, _ in enumerate(self._trial_clips()):
-            now = time.perf_counter()
-            if count == 0:
-                first, start = now - start, now
-            elif now - start > _TRIAL_SECONDS:
-                break
-        return first, (time.perf_counter() - start) / max(count, 1)
-
-    def _trial_clips(self) -> Iterator[object]:
-        """Convert a few clips: the first, which pays for imports, and then all of them from the first on."""
-        if (features := self.converter.features([clip for _, clip in self.plan.items])) is not None:
-            yield from itertools.islice(features.batches[0].clips(), 1)
-            yield from features.batches[0].clips()
-            return
-        chosen = [clip for _, clip in limited(self.plan.items, _label, _TRIAL_CLIPS)]
-        for clip in (chosen[0], *chosen):
+        clips = [clip for _, clip in plan.items]
+        if clips and not self.converter.in_order(clips[0]):
+            clips = [clip for _, clip in limited(plan.items, _label, _TRIAL_CLIPS)]
+        start, count = time.perf_counter(), 0
+        for clip in clips[:_TRIAL_CLIPS]:
             with contextlib.suppress(Exception):  # the real run reports it; here only time counts
-                self.converter.convert(clip)
-            yield clip
+                convert(clip)
+            count += 1
+            if time.perf_counter() - start > _TRIAL_SECONDS:
+                break
+        if count:
+            each = (time.perf_counter() - start) / count
+            shards = sum(-(-number // _CLIPS_PER_SHARD) for number in plan.counts().values())
+            plan.seconds_needed = each * len(plan.items) / max(1, min(workers, shards))
+        return plan
 
 
 def run_conversion(
@@ -154,16 +125,11 @@ def run_conversion(
     """
     how = WriteOptions(workers, clips_per_shard, seed, conversion.config.strict, progress, part)
     plan = conversion.plan
-    convert: Convert[C] = conversion.converter.convert
     plan.require_settled()
     if plan.items and not conversion.converter.licence(plan):
         raise UserError(f"{plan.name}: say under which licence the clips are: --set licence=CC-BY-4.0")
     if how.strict:
         plan.require_whole()
-    if how.features_only and conversion.converter.features([]) is None:
-        raise UserError(
-            f"{conversion.converter.name}: this source has no features step; run the parts of 'shards'"
-        )
     depends_on = conversion.converter.depends_on
     with dataset_writer(
         out, plan.items, conversion.facts(), how, describe=_label, depends_on=depends_on
@@ -178,9 +144,8 @@ def run_conversion(
                 for warning in seen.warnings:
                     say(f"warning: {warning}")
         # Archives are read front to back once, before shards pick clips in their own order.
-        if (features := conversion.converter.features(writer.pending())) is not None:
-            convert = features.make(writer.pending(), writer.work_folder, writer.pool, how, say)
-        manifest = writer.write(convert)
+        conversion.converter.unpack(writer.pending(), writer.work_folder, writer.pool, progress=progress)
+        manifest = writer.write(conversion.converter.convert)
     if part is None:
         _require_most(conversion, manifest, out)
     return manifest

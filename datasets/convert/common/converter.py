@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.register import Table
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import Published
-from motionloom.datasets.convert.common.feature_step import FeatureStep
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import C, ConversionPlan, facts_of
 from motionloom.datasets.motion.layout import MotionLayout
@@ -110,12 +110,8 @@ class Converter(ABC, Generic[Cfg, C]):
         """Whether the first clips of a clip's subset are the cheapest to read, as in an archive."""
         return False
 
-    def features(self, clips: Sequence[C]) -> FeatureStep[C] | None:
-        """The step before the shards that decodes clips together; None where they are read one by one.
-
-        The samples must be those of `convert`.
-        """
-        return None
+    def unpack(self, clips: Sequence[C], folder: Path, pool: Workers, *, progress: bool) -> None:
+        """Copy what cannot be read clip by clip, as in an archive, to a folder that `convert` then reads."""
 
     def meta(
         self,

@@ -27,7 +27,7 @@ from motionloom.datasets.motion.frame_rate import wrong_rate
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import MOST, PERSON_METRES, PlausibilityStats, measure
 from motionloom.datasets.schema import Dropped, UserError
-from motionloom.datasets.shards.left_out import grouped
+from motionloom.datasets.shards.left_out import drop, grouped
 
 ADULT_METRES = 1.7
 """Height of an ordinary adult: of two units that make a person of a figure, the nearer one is meant."""
@@ -255,8 +255,7 @@ def look_at(
             if not np.isfinite(seen.joints).all():
                 raise UserError(f"{label(item)}: NaN or infinity")
         except Exception as error:  # whatever a bad file makes of the libraries below; the conversion says it
-            reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-            failed.append((name, Dropped(source=label(item), reason=reason.removeprefix(f"{label(item)}: "))))
+            failed.append((name, drop(label(item), error)))
             continue
         # Ten frames a second are enough for medians, and keep hundreds of clips in memory.
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))

@@ -21,7 +21,7 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import Audit, Facts, parse_where, require_known
 from motionloom.datasets.convert.common.look import Look
 from motionloom.datasets.schema import SPLITS, AuditRow, Dropped, Split, UserError
-from motionloom.datasets.shards.left_out import grouped, grouped_notes
+from motionloom.datasets.shards.left_out import drop, grouped, grouped_notes
 
 
 class PlannedClip(Protocol):
@@ -262,12 +262,6 @@ def limited(
         return list(items)
     kept = set(sorted(sha256_of_json(key(item)) for _, item in items)[:limit])
     return [item for item in items if sha256_of_json(key(item[1])) in kept]
-
-
-def drop(label: str, error: Exception) -> Dropped:
-    """The manifest's record of a clip that failed."""
-    text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
-    return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
 
 
 def _some(lines: Sequence[object], limit: int = 5) -> str:

@@ -21,9 +21,9 @@ from pathlib import Path, PurePosixPath
 
 from motionloom.datasets.base.files import sha256_of_json, write_json
 from motionloom.datasets.convert.common.files import read_in_threads
-from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.motion.bvh.asf import JOINED
 from motionloom.datasets.schema import Config, Dropped, UserError
+from motionloom.datasets.shards.left_out import drop
 
 ARCHIVES = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".txz", ".tar.bz2")
 LOOSE_FILES_PER_BATCH = 64

@@ -30,7 +30,7 @@ from motionloom.datasets.convert.captions.humanml_text import read_humanml_capti
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
 from motionloom.datasets.convert.common.files import read_in_threads
-from motionloom.datasets.convert.common.plan import ConversionPlan, drop
+from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.motionx.files import (
     HUMANML,
@@ -59,6 +59,7 @@ from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Relea
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError
+from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.text.clean import emotion_of
 

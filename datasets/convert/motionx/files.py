@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.convert.common.files import check_id, inside, read_text_file
-from motionloom.datasets.convert.common.plan import drop
 from motionloom.datasets.schema import Caption, Dropped, UserError
+from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.text.clean import clean_caption, usable_caption
 
 HUMANML = "humanml"

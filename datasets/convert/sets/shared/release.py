@@ -22,7 +22,7 @@ from motionloom.datasets.convert.common.facts import Audit, Fact
 from motionloom.datasets.convert.common.features import features_of, frames_after
 from motionloom.datasets.convert.common.files import inside, read_in_threads
 from motionloom.datasets.convert.common.look import SourceJoints
-from motionloom.datasets.convert.common.plan import ConversionPlan, drop
+from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import (
     hash_split,
     keep_mirrors_together,
@@ -30,6 +30,7 @@ from motionloom.datasets.convert.common.splits import (
     split_files,
 )
 from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
+from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.sample import Sample
 
 _END_TOLERANCE = 0.5
