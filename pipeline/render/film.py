@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import suppress
+from fractions import Fraction
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,6 @@ from motionloom.pipeline.render.scene import SOLE, Actor, Ground, detail_for, dr
 from motionloom.pipeline.render.sound import RATE, film_sound
 
 Progress = Callable[[int, int], None]
-Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 
 def write_mp4(
@@ -45,70 +45,42 @@ def write_mp4(
     for H.264.
     """
     try:
-        import imageio_ffmpeg  # the binary is looked up on import: only for those who film
+        from imageio_ffmpeg import get_ffmpeg_exe  # the binary is looked up: only for those who film
     except ModuleNotFoundError:
         raise UserError(f"{path}: films need imageio-ffmpeg; pip install 'motionloom[film]'") from None
     width, height = (side + side % 2 for side in size)
     actor = _actor(joints, skeleton, figure, face_controls)
     frames = _frames(actor, fps, _subtitle(caption, (width, height)), (width, height))
-    # Named, because the temporary file's ending does not say it.
-    form = ["-f", "mp4", "-movflags", "+faststart"]
     with atomic_path(path) as temporary:
         wav = temporary.with_suffix(".wav")
-        writer = imageio_ffmpeg.write_frames(
-            str(temporary),
-            (width, height),
-            fps=fps,
-            codec="libx264",
-            pix_fmt_out="yuv420p",
-            macro_block_size=2,
-            output_params=["-preset", "veryfast", "-crf", "20", *form]
-            + ([] if sound is None else ["-ar", str(RATE), "-b:a", "128k"]),
-            audio_path=None if sound is None else str(wav),
-            audio_codec=None if sound is None else "aac",
-            ffmpeg_log_level="error",
-        )
+        sounds, codec = ["-an"], list[str]()
+        if sound is not None:
+            sounds = ["-i", str(wav)]
+            codec = ["-ar", str(RATE), "-b:a", "128k", "-acodec", "aac", "-map", "0:v:0", "-map", "1:a:0"]
+        pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+        rate = str(Fraction(fps).limit_denominator())  # as a fraction, so that 24000/1001 is not rounded
+        video = ["-vcodec", "libx264", "-pix_fmt", "yuv420p", "-preset", "veryfast", "-crf", "20"]
+        # Named, because the temporary file's ending does not say it.
+        form = ["-f", "mp4", "-movflags", "+faststart", str(temporary)]
+        command = [get_ffmpeg_exe(), "-y", "-v", "error", *pictures, "-r", rate, "-i", "-", *sounds]
         try:
             if sound is not None:
                 wav.write_bytes(film_sound(sound, len(joints) / fps))
-            with closing(writer):
-                writer.send(None)  # starts ffmpeg, which opens the WAV
-                for done, frame in enumerate(frames, start=1):
-                    writer.send(frame)
-                    if progress is not None:
-                        progress(done, len(joints))
-        except OSError as error:
-            if error.errno is not None:
-                raise
-            raise UserError(_unfinished(path, str(error))) from None  # ffmpeg has ended before us
+            with Popen([*command, *video, *codec, *form], stdin=PIPE, stderr=PIPE) as ffmpeg:
+                assert ffmpeg.stdin is not None
+                with suppress(BrokenPipeError):  # ffmpeg has ended before us, and says why
+                    for done, frame in enumerate(frames, start=1):
+                        ffmpeg.stdin.write(frame.tobytes())
+                        if progress is not None:
+                            progress(done, len(joints))
+                _, words = ffmpeg.communicate()
         finally:
             wav.unlink(missing_ok=True)
-        # ffmpeg's exit code does not reach us, so the file itself must say that it is complete.
-        if not _is_whole(temporary):
-            raise UserError(_unfinished(path, "its file is cut short"))
-
-
-def _unfinished(path: Path, why: str) -> str:
-    reason = (why.strip().splitlines() or ["no reason given"])[0]
-    return f"{path}: ffmpeg could not write the film ({reason}); is the disk full? No film is left there"
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether the boxes of an MP4 file, its index among them, fill it to the end; ffmpeg's own exit code is
-    not passed on to us.
-    """
-    names, at, size = set(), 0, path.stat().st_size
-    with path.open("rb") as file:
-        while at + 8 <= size:
-            file.seek(at)
-            length, name = struct.unpack(">I4s", file.read(8))
-            if length == 1:
-                length = struct.unpack(">Q", file.read(8))[0]
-            if length < 8:
-                return False
-            names.add(name)
-            at += length
-    return at == size and {b"moov", b"mdat"} <= names
+        if ffmpeg.returncode:
+            reason = (words.decode(errors="replace").strip().splitlines() or ["no reason given"])[0]
+            raise UserError(
+                f"{path}: ffmpeg could not write the film ({reason}); is the disk full? No film is left there"
+            )
 
 
 def _actor(

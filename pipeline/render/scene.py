@@ -23,8 +23,15 @@ from PIL import Image, ImageDraw
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.body.face import CONTROLS, control_weights
-from motionloom.pipeline.render.body.mesh import FIRST_OF_HEAD, Body, Detail, body_for, colours
-from motionloom.pipeline.render.body.posing import Posing, posing_of
+from motionloom.pipeline.render.body.mesh import (
+    FIRST_OF_HEAD,
+    Body,
+    Detail,
+    Posing,
+    body_for,
+    colours,
+    posing_of,
+)
 from motionloom.pipeline.render.camera import FIELD_OF_VIEW, NEAR, Camera
 
 Floats = NDArray[np.float64]

@@ -6,9 +6,6 @@ Pages carry MP3 at a constant bit rate. Why this format **[ours]**:
 * A constant rate makes a seek exact: Chromium finds a place in an MP3 by arithmetic on the bytes, which is
   only right where all frames are equally long.
 * The encoder's delay stands in its header, so players skip it: sample 0 is heard at 0 s, with frame 0.
-
-Where libsndfile was built without MP3 the page carries 16-bit PCM in a WAV, which plays everywhere too but
-takes seven times the room.
 """
 
 from __future__ import annotations
@@ -65,19 +62,21 @@ def embed_sounds(uses: Iterable[tuple[Sound | None, float]]) -> tuple[list[Sound
 
 
 def _encode(samples: NDArray[np.float32]) -> SoundData:
-    data, mime = _mp3(samples), "audio/mpeg"
-    if data is None:
-        data, mime = wav_bytes(samples), "audio/wav"
-    return {"mime": mime, "seconds": len(samples) / RATE, "data": base64.b64encode(data).decode("ascii")}
+    data = base64.b64encode(_mp3(samples)).decode("ascii")
+    return {"mime": "audio/mpeg", "seconds": len(samples) / RATE, "data": data}
 
 
 def film_sound(sound: Sound, seconds: float) -> bytes:
-    """A WAV of exactly `seconds`: cut, or filled up with silence."""
+    """A 16-bit mono WAV of exactly `seconds`: cut, or filled up with silence."""
+    import soundfile  # only pages and films with sound pay for the import
+
     samples = playable(sound)
     wanted = round(seconds * RATE)
     out = np.zeros(wanted, np.float32)
     out[: len(samples)] = samples[:wanted]
-    return wav_bytes(out)
+    file = io.BytesIO()
+    soundfile.write(file, out, RATE, format="WAV", subtype="PCM_16")
+    return file.getvalue()
 
 
 def playable(sound: Sound) -> NDArray[np.float32]:
@@ -87,21 +86,10 @@ def playable(sound: Sound) -> NDArray[np.float32]:
     return np.clip(resample_sound(sound.samples, sound.rate, RATE), -1.0, 1.0)
 
 
-def wav_bytes(samples: NDArray[np.floating]) -> bytes:
-    """A 16-bit mono WAV of samples [S] in -1..1 at `RATE` Hz."""
-    import soundfile  # only pages and films with sound pay for the import
-
-    file = io.BytesIO()
-    soundfile.write(file, samples, RATE, format="WAV", subtype="PCM_16")
-    return file.getvalue()
-
-
-def _mp3(samples: NDArray[np.float32]) -> bytes | None:
-    """MP3 of samples [S] at `BIT_RATE`, or None where libsndfile cannot write MP3."""
+def _mp3(samples: NDArray[np.float32]) -> bytes:
+    """MP3 of samples [S] at `BIT_RATE`."""
     import soundfile
 
-    if "MP3" not in soundfile.available_formats():
-        return None
     file = io.BytesIO()
     # libsndfile spreads its 0..1 evenly over MPEG-1's rates, 320 down to 32 kbit/s.
     level = (320_000 - BIT_RATE) / (320_000 - 32_000)

@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -28,7 +29,7 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.embed import PoseData, mesh_data, packed, pose_data
 from motionloom.pipeline.render.body.face import FACE_CONTROLS, FACE_NEUTRAL
-from motionloom.pipeline.render.body.posing import human_skeleton, posing_of
+from motionloom.pipeline.render.body.mesh import human_skeleton, posing_of
 from motionloom.pipeline.render.sound import ScoreData, Segments, SoundData, embed_sounds, score_data
 
 SCRIPTS = [
@@ -252,13 +253,8 @@ def safe_json(data: object) -> str:
 
 
 def fill(template: str, **parts: str) -> str:
-    """Replace each `@@NAME@@` once, in one pass, so that inserted text is never searched again."""
-    out = []
-    rest = template
-    while "@@" in rest:
-        before, name, rest = rest.split("@@", 2)
-        out += [before, parts[name]]
-    return "".join([*out, rest])
+    """Replace each `@@NAME@@`, in one pass, so that inserted text is never searched again."""
+    return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], template)
 
 
 @cache

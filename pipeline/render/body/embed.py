@@ -17,8 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.body.face import CONTROLS
-from motionloom.pipeline.render.body.mesh import asset, figure_size, stretches
-from motionloom.pipeline.render.body.posing import Posing
+from motionloom.pipeline.render.body.mesh import Posing, asset, figure_size, human_skeleton, stretches
 
 _TURN_STEPS = 1022
 _STILL = 1e-5
@@ -72,7 +71,8 @@ def _detail(name: str) -> dict[str, object]:
 def pose_data(posing: Posing) -> PoseData:
     """The bones, and rotations of joints that turn by themselves."""
     skeleton, parents = posing.skeleton, np.asarray(posing.skeleton.parents)
-    known = Skeleton.named("smplx52" if len(skeleton) == len(Skeleton.named("smplx52")) else "smpl22")
+    known = human_skeleton(skeleton.parents)
+    assert known is not None  # only bodies are posed
     alike = np.abs(posing.turns - posing.turns[:, parents]).max(axis=(0, 2, 3)) < _STILL
     alike[0] = False
     return {

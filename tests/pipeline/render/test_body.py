@@ -31,8 +31,17 @@ from motionloom.pipeline.render.body.face import (
     synthetic_arkit,
     synthetic_face_controls,
 )
-from motionloom.pipeline.render.body.mesh import Body, Detail, asset, body_for, colours, neutral_body
-from motionloom.pipeline.render.body.posing import human_skeleton, posing_of, single_bones
+from motionloom.pipeline.render.body.mesh import (
+    Body,
+    Detail,
+    asset,
+    body_for,
+    colours,
+    human_skeleton,
+    neutral_body,
+    posing_of,
+    single_bones,
+)
 from motionloom.pipeline.render.scene import Actor
 from motionloom.pipeline.render.viewer import ViewerMotion, has_bodies, viewer_data, viewer_script
 

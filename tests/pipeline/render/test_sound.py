@@ -72,16 +72,6 @@ def test_one_sound_is_carried_once_and_as_long_as_its_longest_motion(song: Make)
     assert embed_sounds([(tune, 1.0), (slower, 1.0)])[1] == [0, 1]
 
 
-def test_without_an_mp3_encoder_the_page_carries_a_wav(song: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(soundfile, "available_formats", lambda: {"WAV": "WAV"})
-    tune = song(1.0)
-    (made,), _ = embed_sounds([(tune, 0.5)])
-    assert made["mime"] == "audio/wav"
-    heard, rate = soundfile.read(io.BytesIO(base64.b64decode(made["data"])))
-    assert rate == RATE and soundfile.info(io.BytesIO(base64.b64decode(made["data"]))).subtype == "PCM_16"
-    np.testing.assert_allclose(heard, playable(tune)[: RATE // 2], atol=2 / 32767)
-
-
 def test_score_keeps_what_lies_within_the_motion() -> None:
     beats = [1.0, -0.2, 0.5, 2.0, 2.5, 0.5]
     segments = [(0, 1.2, "walks"), Segment(1.2, 9.0, "song", "music"), (2.0, 3.0, "too late")]

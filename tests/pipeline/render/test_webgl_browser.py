@@ -12,7 +12,7 @@ from scipy.ndimage import binary_dilation
 
 from motionloom.datasets.motion.body.rigid import fit_rigid
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline.render.body.posing import posing_of
+from motionloom.pipeline.render.body.mesh import posing_of
 from motionloom.pipeline.render.camera import VIEWS, Camera
 from motionloom.pipeline.render.scene import Actor, cover
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
