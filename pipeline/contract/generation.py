@@ -161,13 +161,17 @@ class TokenFlow(Protocol):
 
 
 class FrameFlow(Protocol):
-    """Frames of tokens as they come."""
+    """Frames of tokens as they come, as the decoder has them."""
 
-    def push(self, codes: Mapping[str, Tensor]) -> Motion | None:
-        """More tokens -> the features [T, C] that are final now, in their own units; None = none yet."""
+    def push(self, codes: Mapping[str, Tensor]) -> Tensor | None:
+        """More tokens -> the frames that are final now; None = none yet."""
 
-    def finish(self) -> Motion | None:
+    def finish(self) -> Tensor | None:
         """No more tokens follow: the rest."""
+
+
+Decoding = tuple[FrameFlow, Callable[[Tensor], Motion]]
+"""A decoder, and what makes features [T, C] in their own units of its frames."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +183,7 @@ class Streaming:
     tokens: Callable[[int, SamplingConfig, StreamConfig], TokenFlow]
     """Start the tokens of a motion, by its seed. Of one caption they are those of `generate` by the same
     seed, as long as the network's block holds them."""
-    frames: Callable[[int, SamplingConfig, StreamConfig], FrameFlow]
+    frames: Callable[[int, SamplingConfig, StreamConfig], Decoding]
     """Start the decoder of these tokens, by the same seed."""
 
 

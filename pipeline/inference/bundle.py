@@ -31,9 +31,9 @@ from motionloom.pipeline.inference.checks import find_mismatches, unknown_captio
 from motionloom.pipeline.inference.generators.idle_pose import blend_to_idle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
-    PromptEncoder,
     alike,
     caption_list,
+    encode_prompts,
     frames_of,
     prompts_of,
     repeated_rows,
@@ -76,7 +76,6 @@ class Bundle:
         self.recommended = recommended or SamplingConfig()
         """How its motions are best drawn; fields that are not set here are nobody's recommendation."""
         self._generators: dict[Path, MotionGenerator] = {}
-        self._encoders: dict[Path, PromptEncoder] = {}
         for stage in (*self.stages, *self.captioners):
             self._open(stage)
         if {self.of(stage).part for stage in self.stages} <= {"face"} and not self.captioners:
@@ -126,12 +125,6 @@ class Bundle:
         if stage.folder not in self._generators:
             self._generators[stage.folder] = self.stage_cache.generator(stage)
         return self._generators[stage.folder]
-
-    def encoder(self, stage: CompletedStage) -> PromptEncoder:
-        """The encoder of prompts for a stage."""
-        if stage.folder not in self._encoders:
-            self._encoders[stage.folder] = PromptEncoder(self.of(stage).prepared, self.stage_cache.device)
-        return self._encoders[stage.folder]
 
     @cached_property
     def main(self) -> CompletedStage:
@@ -188,6 +181,12 @@ class Bundle:
         frames = self.generator.max_frames
         return math.inf if frames is None else frames / self.layout.fps
 
+    def require_used(self, face_captions: Iterable[str] | None, sampling: SamplingConfig) -> None:
+        """Refuse settings that were given, and that no generator in use takes notice of."""
+        stage, faces = self.choose_face(sampling.face_model), {m: self.of(s) for m, s in self.faces.items()}
+        face = None if stage is None else self.of(stage)
+        require_used(self.generator, faces, face, face_captions, sampling)
+
     def drawing(self, sampling: SamplingConfig | None = None) -> SamplingConfig:
         """How to draw: the fields that are set, else those that the model recommends."""
         return self.recommended if sampling is None else sampling.over(self.recommended)
@@ -233,7 +232,7 @@ class Bundle:
         faces = None if face is None else caption_list(face, "face")
         if strict:
             require_words(faces or [], "face")
-            require_used(self, faces, sampling or SamplingConfig())
+            self.require_used(faces, sampling or SamplingConfig())
         sampling = self.drawing(sampling)
         prompts = prompts_of(texts, faces, sounds, conditions)
         require_driven(self.generator, prompts)
@@ -325,8 +324,7 @@ class Bundle:
 
     def encode(self, stage: CompletedStage, prompts: Sequence[Prompt], words: Sequence[str]) -> Conditions:
         """The conditions of a stage's generator, one row a prompt; `words` are about its part of the body."""
-        modalities, fps = self.of(stage).modalities, self.layout.fps
-        return self.encoder(stage).encode(prompts, words, modalities, fps)
+        return encode_prompts(self.of(stage), prompts, words, self.layout.fps, self.device)
 
     def _faces(
         self,

@@ -14,7 +14,6 @@ from motionloom.pipeline.contract.lookup import FORMAT, BundleFile
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.requests import require_used
 from motionloom.pipeline.store.artifact import Artifact, InputStage, require_unchanged
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
@@ -31,7 +30,7 @@ def write_bundle(run: Path, out: Path, *, half: bool = False, sampling: Sampling
     """
     bundle, sampling = Bundle.from_run(run), sampling or SamplingConfig()
     if bundle.stages:
-        require_used(bundle, None, sampling)
+        bundle.require_used(None, sampling)
     for stage in bundle.stages:
         bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
     for stage in bundle.captioners:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -101,26 +101,24 @@ def require_driven(generator: MotionGenerator, prompts: Iterable[Prompt]) -> Non
             raise UserError(f"prompt {row} has {name}, and this model is conditioned on {known} only")
 
 
-class _Chooses(Protocol):
-    @property
-    def faces(self) -> Mapping[str, CompletedStage]: ...
-    @property
-    def generator(self) -> MotionGenerator: ...
-    def choose_face(self, wanted: str | None) -> CompletedStage | None: ...
-    def of(self, stage: CompletedStage) -> MotionGenerator: ...
+def require_used(
+    body: MotionGenerator,
+    faces: Mapping[str, MotionGenerator],
+    face: MotionGenerator | None,
+    face_captions: Iterable[str] | None,
+    sampling: SamplingConfig,
+) -> None:
+    """Refuse settings that were given, and that neither the body's generator nor `face` takes notice of.
 
-
-def require_used(model: _Chooses, face_captions: Iterable[str] | None, sampling: SamplingConfig) -> None:
-    """Refuse settings that were given, and that no generator in use takes notice of."""
-    face = model.choose_face(sampling.face_model)
+    `faces` are all of the model's by method, for the fix.
+    """
     if face is None and face_captions is not None:
         raise UserError("this model makes no face: leave the face captions out")
-    body, expression = model.generator, None if face is None else model.of(face)
-    used = body.settings | (frozenset() if expression is None else expression.settings)
+    used = body.settings | (frozenset() if face is None else face.settings)
     given = {name for name in sampling.model_fields_set if getattr(sampling, name) not in (None, {})}
     unused = [name for name in _OPTIONS if name in given - used]
     if unused:
-        takers = [m for m, s in model.faces.items() if set(unused) <= model.of(s).settings]
+        takers = [method for method, one in faces.items() if set(unused) <= one.settings]
         fix = f"set face_model to {takers[0]}, or leave it out" if takers else "leave it out"
         raise UserError(f"{' and '.join(unused)}: no generator that is used here takes it; {fix}")
     for name in sampling.guidance:
@@ -208,31 +206,29 @@ def seeds_of(
     return own * count if len(own) == 1 else own
 
 
-class PromptEncoder:
-    """Encodes prompts for one generator, by what it was trained with (`MotionGenerator.prepared`)."""
+def encode_prompts(
+    generator: MotionGenerator,
+    prompts: Sequence[Prompt],
+    words: Sequence[str],
+    fps: float,
+    device: torch.device,
+) -> Conditions:
+    """The conditions of a generator, by what it was trained with; those that no prompt has are left out.
 
-    def __init__(self, prepared: Mapping[str, object], device: torch.device) -> None:
-        self._prepared, self._device = prepared, device
-
-    def encode(
-        self, prompts: Sequence[Prompt], words: Sequence[str], modalities: frozenset[str], fps: float
-    ) -> Conditions:
-        """The conditions of `modalities`, those that no prompt has left out.
-
-        `words` are the prompts' texts, about the body or the face; an empty one is no text.
-        """
-        source = self._prepared.get("text")
-        if isinstance(source, TextSource):
-            words = [source.spelled(text) for text in words]
-        rows = [prompt.with_words(text).given for prompt, text in zip(prompts, words, strict=True)]
-        out: dict[str, Condition] = {}
-        for name, record in MODALITIES.items():
-            given = [row.get(name) for row in rows]
-            if name in modalities and any(value is not None for value in given):
-                features, mask, pooled = record.encode(self._prepared.get(name), given, fps)
-                pooled = None if pooled is None else pooled.to(self._device)
-                out[name] = Condition(features.to(self._device), mask.to(self._device), pooled)
-        return out
+    `words` are the prompts' texts, about the body or the face; an empty one is no text.
+    """
+    source = generator.prepared.get("text")
+    if isinstance(source, TextSource):
+        words = [source.spelled(text) for text in words]
+    rows = [prompt.with_words(text).given for prompt, text in zip(prompts, words, strict=True)]
+    out: dict[str, Condition] = {}
+    for name, record in MODALITIES.items():
+        given = [row.get(name) for row in rows]
+        if name in generator.modalities and any(value is not None for value in given):
+            features, mask, pooled = record.encode(generator.prepared.get(name), given, fps)
+            pooled = None if pooled is None else pooled.to(device)
+            out[name] = Condition(features.to(device), mask.to(device), pooled)
+    return out
 
 
 def ticks_of(prompt: Prompt, conditions: Conditions, row: int, fps: float) -> tuple[float, ...]:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from motionloom.datasets.motion.features.joints import JointFlow
 from motionloom.datasets.schema import UserError
@@ -29,13 +30,7 @@ from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.idle_pose import IdleBlend
 from motionloom.pipeline.inference.motion import MotionChunk
-from motionloom.pipeline.inference.requests import (
-    require_driven,
-    require_seed,
-    require_used,
-    split_columns,
-    weight_bytes,
-)
+from motionloom.pipeline.inference.requests import require_driven, require_seed, split_columns, weight_bytes
 from motionloom.pipeline.inference.script import DrivenSegment, Script, segment_frames
 from motionloom.pipeline.launch.hardware import threads_for
 from motionloom.pipeline.store.known_captions import Unknown
@@ -76,7 +71,7 @@ class MotionStream(Iterator[MotionChunk]):
         notice: Callable[[Unknown | str], object] | None = None,
     ) -> None:
         require_seed(seed)
-        require_used(bundle, None, sampling)
+        bundle.require_used(None, sampling)
         if sampling.candidates > 1:
             raise UserError(
                 "a stream shows its motion as it is drawn, so there is none to choose: leave candidates out"
@@ -223,7 +218,7 @@ class _Maker:
         self._stream, self._per_group = next(iter(streaming.group_tokens.items()))
         self._bundle, self._stage = bundle, stage
         self._flow = streaming.tokens(seed, sampling, config)
-        self._decoder = streaming.frames(seed, sampling, config)
+        self._decoder, self._units = streaming.frames(seed, sampling, config)
         self._frames: NDArray[np.float32] = np.zeros(
             (0, len(generator.layout.part(generator.part))), np.float32
         )
@@ -241,21 +236,18 @@ class _Maker:
     def draw(self, left: int | None) -> None:
         codes = self._flow.draw(left)
         self.groups += codes[self._stream].shape[1] // self._per_group
-        made = self._decoder.push(codes)
-        if made is not None:
-            self._add(made)
+        self._add(self._decoder.push(codes))
 
     def finish(self) -> None:
-        made = self._decoder.finish()
-        if made is not None:
-            self._add(made)
+        self._add(self._decoder.finish())
 
     def take(self, count: int) -> NDArray[np.float32]:
         out, self._frames = self._frames[:count], self._frames[count:].copy()
         return out
 
-    def _add(self, frames: NDArray[np.float32]) -> None:
-        self._frames = np.concatenate([self._frames, frames])
+    def _add(self, made: Tensor | None) -> None:
+        if made is not None:
+            self._frames = np.concatenate([self._frames, np.asarray(self._units(made), np.float32)])
 
 
 def _streaming_face(bundle: Bundle, sampling: SamplingConfig) -> CompletedStage | None:

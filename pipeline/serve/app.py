@@ -26,7 +26,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import MAX_HEIGHT, MAX_SPEED
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
-from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, change, received, why_not
+from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, why_not
 from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
@@ -132,7 +132,7 @@ class Site:
     async def edit(self, http: Request) -> Response:
         """A clip of which a part is made anew."""
         request, sound = await self._read_request(http, ChangeRequest)
-        return await self._respond(http, request, lambda: change(self.clips, request, sound))
+        return await self._respond(http, request, lambda: self.clips.change(request, sound))
 
     async def _respond(
         self, http: Request, request: MotionRequest | ChangeRequest, call: Callable[[], Answer]
@@ -208,7 +208,7 @@ class Site:
             raise HTTPException(400, why)
         async with self._uploads:
             data = await read_body(http, CLIP, _bytes(self.config.max_clip_mb), self.config.patience)
-        return JSONResponse(await asyncio.to_thread(lambda: received(*self.clips.add(data))))
+        return JSONResponse(await asyncio.to_thread(self.clips.add, data))
 
     async def _read_request(self, http: Request, kind: type[RequestT]) -> tuple[RequestT, Sound | None]:
         media = http.headers.get("content-type", "").split(";")[0].strip().lower()
@@ -228,9 +228,9 @@ class Site:
         http.state.name = _plain(fields.get("request") or "")
         request = kind.parse(fields, "request")
         request.require_within(self.config, self.model)
-        sound = None if request.sound is None else self.sounds.get(request.sound)
+        sound = None if request.sound is None else self.sounds.kept.get(request.sound)
         if isinstance(request, ChangeRequest) and isinstance(request.clip, str):
-            self.clips.get(request.clip)
+            self.clips.kept.get(request.clip)
         http.state.name = http.state.name or uuid.uuid4().hex
         return request.model_copy(update={"request": http.state.name}), sound
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import tempfile
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -21,19 +19,17 @@ from motionloom.pipeline.inference.model import MotionModel, original_of
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of
 from motionloom.pipeline.inference.shipped_models import shipped_models
-from motionloom.pipeline.inference.writers import WRITERS, cell_of
+from motionloom.pipeline.inference.writers import cell_of
 from motionloom.pipeline.render.viewer import viewer_data
 from motionloom.pipeline.serve.requests import (
     Answer,
     MotionRequest,
     Recent,
     ServeConfig,
-    facts_of,
-    file_answer,
-    json_answer,
+    answer,
     known_answer,
     motion_of,
-    numbers_of,
+    name_of,
 )
 
 CLIP = "the clip"
@@ -92,10 +88,11 @@ class Clips:
 
     def __init__(self, model: MotionModel, config: ServeConfig) -> None:
         self._model, self._config = model, config
-        self._kept = Recent[GeneratedMotion](config.clips, CLIP)
+        self.kept = Recent[GeneratedMotion](config.clips, CLIP)
 
-    def add(self, data: bytes) -> tuple[str, GeneratedMotion, list[str]]:
-        """Read a file's bytes and keep the clip: its name, itself at the model's frame rate, and remarks.
+    def add(self, data: bytes) -> dict[str, object]:
+        """Read a file's bytes and keep the clip at the model's frame rate; the answer about it.
+
         `UserError` for what is no clip of a person, or too long.
         """
         if not data:
@@ -113,70 +110,35 @@ class Clips:
                 f"{CLIP} lasts {clip.seconds:.0f} s; this server takes at most {self._config.max_seconds:g} s"
             )
         frames = edit_frames(EditTask(), clip, self._model.bundle.layout)
-        motion = original_of(frames, clip.caption)
-        return self._kept.keep(_name(data), motion), motion, list(frames.remarks)
+        motion = self.kept.made(name_of(data), lambda: original_of(frames, clip.caption))
+        return {
+            "clip": name_of(data),
+            "caption": motion.caption,
+            "fps": motion.fps,
+            "frames": len(motion.joints),
+            "seconds": motion.seconds,
+            "notes": list(frames.remarks),
+            "viewer": viewer_data([cell_of(clip_of(motion), CLIP)]),
+        }
 
-    def get(self, name: str) -> GeneratedMotion:
-        """The clip of a name; `UserError` where it is not here any more."""
-        return self._kept.get(name)
-
-    def change(self, asked: ChangeRequest, sound: Sound | None) -> tuple[str, EditedMotion]:
-        """The result and its name. The same request is answered with the same result, made once."""
+    def change(self, asked: ChangeRequest, sound: Sound | None) -> Answer:
+        """The result that is asked for. The same request is answered with the same result, made once."""
         given = asked.clip
         if isinstance(given, str):
-            clip, motion = given, self.get(given)
+            clip, motion = given, self.kept.get(given)
         else:
-            own = given.model_dump(mode="json", exclude={"format", "request"}, exclude_unset=True)
-            clip, motion = self._made(own, lambda: motion_of(self._model, given, sound, self._config))
-        facts = {"clip": clip, "task": asked.task.dump(), "seed": asked.seed}
-        name, made = self._made(facts, lambda: self._model.edit(motion, asked.task, seed=asked.seed)[0])
+            clip = _name_of(given.model_dump(mode="json", exclude={"format", "request"}, exclude_unset=True))
+            motion = self.kept.made(clip, lambda: motion_of(self._model, given, sound, self._config))
+        name = _name_of({"clip": clip, "task": asked.task.dump(), "seed": asked.seed})
+        made = self.kept.made(name, lambda: self._model.edit(motion, asked.task, seed=asked.seed)[0])
         assert isinstance(made, EditedMotion)
-        return name, made
-
-    def _made(
-        self, facts: dict[str, object], make: Callable[[], GeneratedMotion]
-    ) -> tuple[str, GeneratedMotion]:
-        name = _name_of(facts)
-        found = self._kept.find(name)
-        if found is None:
-            found = make()
-            self._kept.keep(name, found)
-        return name, found
-
-
-def _name(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()[:24]
+        # JSON knows no NaN, which stands for what a task does not ask.
+        report = {key: None if value != value else value for key, value in asdict(made.report).items()}
+        facts = {"request": asked.request, "clip": name, "seed": asked.seed, "notes": list(made.remarks)}
+        cells = {"before": made.original, "after": made}
+        note = "\n".join(made.report.lines())
+        return answer(made, asked.format, {**facts, "report": report}, note, cells)
 
 
 def _name_of(facts: dict[str, object]) -> str:
-    return _name(json.dumps(facts, sort_keys=True).encode())
-
-
-def received(name: str, motion: GeneratedMotion, remarks: list[str]) -> dict[str, object]:
-    """The answer about a clip that a client sent."""
-    return {
-        "clip": name,
-        "caption": motion.caption,
-        "fps": motion.fps,
-        "frames": len(motion.joints),
-        "seconds": motion.seconds,
-        "notes": remarks,
-        "viewer": viewer_data([cell_of(clip_of(motion), "the clip")]),
-    }
-
-
-def change(clips: Clips, asked: ChangeRequest, sound: Sound | None) -> Answer:
-    """The result that is asked for, in its format."""
-    name, made = clips.change(asked, sound)
-    if asked.format in WRITERS:
-        return file_answer(made, asked.format, asked.seed, "\n".join(made.report.lines()))
-    facts = {**facts_of(made, asked.request, asked.seed), "clip": name, "notes": list(made.remarks)}
-    # JSON knows no NaN, which stands for what a task does not ask.
-    report = asdict(made.report).items()
-    facts["report"] = {key: None if value != value else value for key, value in report}
-    if asked.format == "viewer":
-        cells = [cell_of(clip_of(made.original), "before"), cell_of(clip_of(made), "after")]
-        facts["viewer"] = viewer_data(cells)
-    else:
-        facts |= numbers_of(made)
-    return json_answer(facts)
+    return name_of(json.dumps(facts, sort_keys=True).encode())

@@ -7,7 +7,7 @@ import json
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Generic, TypeVar
@@ -154,22 +154,9 @@ def notes_of(
 def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:
     """The motion that is asked for, in its format."""
     motion = motion_of(model, asked, sound, limits)
-    if asked.format in WRITERS:
-        note = ""
-        if asked.format == "html":
-            seen = model.bundle.find_mismatches([motion])
-            note = "\n".join(map(str, [*model.unknown(asked.captions, asked.faces), *seen]))
-        return file_answer(motion, asked.format, asked.seed, note)
-    facts = {
-        **facts_of(motion, asked.request, asked.seed),
-        "face": asked.face,
-        **notes_of(model, asked, sound, motion),
-    }
-    if asked.format == "viewer":
-        facts["viewer"] = viewer_data([cell_of(clip_of(motion))])
-    else:
-        facts |= numbers_of(motion)
-    return json_answer(facts)
+    notes = notes_of(model, asked, sound, motion)
+    facts = {"request": asked.request, "seed": asked.seed, "face": asked.face, **notes}
+    return answer(motion, asked.format, facts, "\n".join(notes["notes"]), {"generated": motion})
 
 
 def motion_of(
@@ -196,64 +183,63 @@ def motion_of(
     )[0]
 
 
-def stream(
-    model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
-) -> MotionStream:
-    """The stream that is asked for, at most as long as the server allows."""
-    seconds = asked.seconds or (
-        limits.max_seconds if sound is None else min(sound.seconds, limits.max_seconds)
-    )
-    caption = asked.caption if asked.caption.strip() else None
-    segments = segments_of(model.bundle, caption, face=asked.face, sound=sound, seconds=seconds)
-    return MotionStream(model.bundle, segments, seed=asked.seed, sampling=asked.sampling)
-
-
 def lines(
     model: MotionModel, name: str, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
 ) -> Iterator[str]:
-    """JSON lines of a stream of the model of this name; the first names the request and has its notes."""
-    made, notes = stream(model, asked, sound, limits), notes_of(model, asked, sound)
+    """JSON lines of a stream of the model of this name, at most as long as the server allows; the first names
+    the request and has its notes.
+    """
+    longest = limits.max_seconds if sound is None else min(sound.seconds, limits.max_seconds)
+    caption = asked.caption if asked.caption.strip() else None
+    segments = segments_of(
+        model.bundle, caption, face=asked.face, sound=sound, seconds=asked.seconds or longest
+    )
+    made = MotionStream(model.bundle, segments, seed=asked.seed, sampling=asked.sampling)
     facts = json.loads(heading(made.layout, asked.seed, name))
-    yield json.dumps({"request": asked.request, **facts, **notes}) + "\n"
+    yield json.dumps({"request": asked.request, **facts, **notes_of(model, asked, sound)}) + "\n"
     for chunk in made:
         yield "".join(frame_lines(chunk))
 
 
-def facts_of(motion: GeneratedMotion, request: str, seed: int) -> dict[str, object]:
-    """A motion as JSON, and the request that it answers."""
-    return {
-        "request": request,
+def answer(
+    motion: GeneratedMotion,
+    form: str,
+    facts: Mapping[str, object],
+    note: str,
+    cells: Mapping[str, GeneratedMotion],
+) -> Answer:
+    """A motion as a file of one of `WRITERS`, with the note on its page; else as JSON with `facts`: its
+    numbers, or the viewer's data of `cells`, each under its label.
+    """
+    if form in WRITERS:
+        writer = WRITERS[form]
+        with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
+            path = Path(folder) / f"motion{writer.suffix}"
+            save(path, motion, note)
+            name = f"{file_stem(motion.seed or 0, motion.caption)}{writer.suffix}"
+            return Answer(path.read_bytes(), writer.mime, name)
+    whole = {
         "caption": motion.caption,
-        "seed": seed,
         "fps": motion.fps,
         "frames": len(motion.joints),
         "seconds": motion.seconds,
+        **facts,
     }
+    if form == "viewer":
+        whole["viewer"] = viewer_data([cell_of(clip_of(one), label) for label, one in cells.items()])
+    else:
+        whole |= {
+            "joint_names": list(motion.joint_names),
+            "parents": [int(parent) for parent in motion.layout.skeleton.parents],
+            "joints": rounded(motion.joints),
+            "face_values": None if motion.face is None else rounded(motion.face),
+        }
+    return Answer(json.dumps(whole, separators=(",", ":"), allow_nan=False).encode(), "application/json")
 
 
-def numbers_of(motion: GeneratedMotion) -> dict[str, object]:
-    """A motion as plain numbers."""
-    return {
-        "joint_names": list(motion.joint_names),
-        "parents": [int(parent) for parent in motion.layout.skeleton.parents],
-        "joints": rounded(motion.joints),
-        "face_values": None if motion.face is None else rounded(motion.face),
-    }
-
-
-def json_answer(facts: Mapping[str, object]) -> Answer:
-    """Facts as JSON."""
-    return Answer(json.dumps(facts, separators=(",", ":"), allow_nan=False).encode(), "application/json")
-
-
-def file_answer(motion: GeneratedMotion, form: str, seed: int, note: str) -> Answer:
-    """A motion as a file of one of `WRITERS`; `note` is a page's."""
-    writer, name = WRITERS[form], file_stem(seed, motion.caption)
-    with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
-        path = Path(folder) / f"motion{writer.suffix}"
-        save(path, motion, note)
-        body = path.read_bytes()
-    return Answer(body, writer.mime, f"{name}{writer.suffix}")
+def name_of(data: bytes) -> str:
+    """The name under which a client finds what it sent, or what was made of it, again."""
+    return hashlib.sha256(data).hexdigest()[:24]
 
 
 T = TypeVar("T")
@@ -267,14 +253,16 @@ class Recent(Generic[T]):
         self._kept: OrderedDict[str, T] = OrderedDict()
         self._lock = threading.Lock()
 
-    def keep(self, name: str, value: T) -> str:
-        """Keep a value; what was used longest ago makes room. Returns the name."""
-        with self._lock:
-            self._kept[name] = value
-            self._kept.move_to_end(name)
-            while len(self._kept) > self._most:
-                self._kept.popitem(last=False)
-        return name
+    def made(self, name: str, make: Callable[[], T]) -> T:
+        """The value of a name, made where it is not here; what was used longest ago makes room."""
+        found = self.find(name)
+        if found is None:
+            found = make()
+            with self._lock:
+                self._kept[name] = found
+                while len(self._kept) > self._most:
+                    self._kept.popitem(last=False)
+        return found
 
     def find(self, name: str) -> T | None:
         """The value, used now; None where it is not here."""
@@ -296,24 +284,15 @@ class Sounds:
 
     def __init__(self, config: ServeConfig) -> None:
         self._config = config
-        self._kept = Recent[Sound](config.sounds, _SOUND)
+        self.kept = Recent[Sound](config.sounds, _SOUND)
         self._decoding = threading.Lock()
 
     def add(self, data: bytes) -> tuple[str, Sound]:
         """Decode a file's bytes and keep them; `UserError` for what is no sound or too long."""
         if not data:
             raise UserError(f"{_SOUND}: empty (0 bytes)")
-        name = hashlib.sha256(data).hexdigest()[:24]
         with self._decoding:  # one at a time: a sound takes several times its file's memory
-            sound = self._kept.find(name)
-            if sound is None:
-                sound = self._decode(data)
-                self._kept.keep(name, sound)
-        return name, sound
-
-    def get(self, name: str) -> Sound:
-        """`UserError` where it is not here any more."""
-        return self._kept.get(name)
+            return name_of(data), self.kept.made(name_of(data), lambda: self._decode(data))
 
     def _decode(self, data: bytes) -> Sound:
         longest = self._config.max_sound_seconds

@@ -1,4 +1,4 @@
-"""Motion of text by a diffusion model of whole motions."""
+"""Motion of text by a diffusion model of whole motions, and clips whose free parts it fills in."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.datasets.conditions import Conditions
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.editing import CaptionSpan, Filling, KnownMotion, Pins
 from motionloom.models.diffusion.network import TextDenoiser
+from motionloom.models.diffusion.observed import Places, Recovery, known_columns
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.edits.frames import EditFrames
-from motionloom.pipeline.inference.generators.filling import fill_in
 from motionloom.pipeline.inference.generators.whole import WholeMotion
 from motionloom.pipeline.store.networks import device_of
 
@@ -80,11 +84,49 @@ class DiffusionMotion(DenoisedMotion):
         sampling: SamplingConfig,
     ) -> list[NDArray[np.float32]]:
         """Fill in what an edit leaves free (`Editor`)."""
-        sampler, steps = self.denoising(sampling)
-        return fill_in(
-            self.net, self.given["stats"], self.part, frames, words, seeds, window=self.window,
-            sampler=sampler, steps=steps, guidance=self._guidance(sampling),
-        )  # fmt: skip
+        stats: FeatureStats = self.given["stats"]
+        layout, columns, device = self.layout, self.layout.part(self.part), device_of(self.net)
+        guidance = self._guidance(sampling)
+        if guidance != 1 and self.net.config.condition_dropout == 0:
+            raise UserError(
+                "guidance needs a diffusion model trained with condition_dropout > 0; set cfg_scale to 1"
+            )
+        features = torch.from_numpy(frames.features[:, columns])
+        known = known_columns(torch.from_numpy(frames.pieces)[None], layout, columns)[0]
+        if known.all():
+            return [features.numpy().copy() for _ in seeds]
+        recovery = places = pins = None
+        if Recovery.possible(layout, columns):
+            recovery = Recovery(layout, columns, stats.mean, stats.std)
+            row = frames.places
+            known_places = (row.anchor, row.heading, row.place, row.heading_known, row.place_known)
+            places = Places(*(values.to(device) for values in known_places))
+            if frames.pins:
+                at, joints = torch.tensor(list(frames.pins), device=device).T
+                pins = Pins(at, joints, torch.tensor(frames.model_pins, device=device))
+        filling = Filling(
+            self.net,
+            KnownMotion(stats.normalize(features, columns).to(device), known.to(device), places, pins),
+            [self._caption_span(*pair) for pair in words],
+            recovery,
+            window=self.window,
+            overlap=self.window // 4,
+            guidance=guidance,
+            strength=frames.task.strength,
+            likeness=frames.task.likeness,
+        )
+        made = filling(seeds, *self.denoising(sampling)).cpu()
+        # What is kept is taken from where it came from: normalising there and back rounds.
+        own = torch.where(known, features, stats.denormalize(made, columns))
+        return [np.asarray(one, dtype=np.float32) for one in own.numpy()]
+
+    def _caption_span(self, conditions: Conditions, share: NDArray[np.float64]) -> CaptionSpan:
+        """The sentence embedding of encoded words, zeros without any, and its share of every frame [T]."""
+        text, device = conditions.get("text"), device_of(self.net)
+        shares = torch.from_numpy(share).float().to(device)
+        if text is None or text.pooled is None:
+            return CaptionSpan(torch.zeros(self.net.text_dim, device=device), False, shares)
+        return CaptionSpan(text.pooled[0].float().to(device), True, shares)
 
     def _guidance(self, sampling: SamplingConfig) -> float:
         return sampling.face_guidance if self.part == "face" else sampling.cfg_scale

@@ -19,13 +19,12 @@ from motionloom.models.gpt.streaming import TokenStream
 from motionloom.models.gpt.tokens import as_codes
 from motionloom.pipeline.contract.generation import (
     Capabilities,
-    FrameFlow,
+    Decoding,
     GenerationRequest,
     Streaming,
     TokenFlow,
 )
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
-from motionloom.pipeline.inference.generators.frames import Frames
 from motionloom.pipeline.inference.generators.of_tokens import OfTokens
 from motionloom.pipeline.store.networks import (
     LoadedGpt,
@@ -141,10 +140,10 @@ class GptGenerator(OfTokens):
         )
         return GptFlow(tokens, lambda conditions: self.prior(GenerationRequest(conditions, None, [seed])))
 
-    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
+    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> Decoding:
         if streaming.decoder == "diffusion":
             raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
-        return Frames.of_tokenizer(self.tokenizer, streaming)
+        return self.token_frames(streaming)
 
 
 class GptFlow:

@@ -21,7 +21,7 @@ from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.pipeline.contract.generation import (
     Capabilities,
-    FrameFlow,
+    Decoding,
     GenerationRequest,
     Streaming,
     Stretch,
@@ -29,7 +29,6 @@ from motionloom.pipeline.contract.generation import (
 )
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import StageConfig
-from motionloom.pipeline.inference.generators.frames import Frames
 from motionloom.pipeline.inference.generators.of_tokens import OfTokens
 from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
 from motionloom.pipeline.store.networks import LoadedDmd, LoadedUtt, TrainedTokenizer
@@ -140,12 +139,12 @@ class UdeGenerator(OfTokens):
         """Tokens as they come, those of `drive` where the lengths of all stretches are known."""
         return TimelineFlow(self.timeline, seed, sampling, hop=max(1, streaming.hop_frames // GROUP_FRAMES))
 
-    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> FrameFlow:
+    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> Decoding:
         """The tokenizer's own decoder, or windows of the diffusion decoder."""
         if self.dmd is None and streaming.decoder == "diffusion":
             raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
         if self.dmd is None or streaming.decoder == "tokenizer":
-            return Frames.of_tokenizer(self.tokenizer, streaming)
+            return self.token_frames(streaming)
         sampler, steps = self.denoising(sampling)
         decoder = DmdStream(
             self.dmd.net,
@@ -156,7 +155,7 @@ class UdeGenerator(OfTokens):
             window=self.dmd.window,
             overlap=self.config.overlap_frames,
         )
-        return Frames(decoder, self.tokenizer.of_coordinates)
+        return decoder, self.tokenizer.of_coordinates
 
     def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
         return (

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -13,11 +16,12 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.dances import DanceConfig
 from motionloom.datasets.synth.music.performance import render_song
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.inference.requests import PromptEncoder, prompts_of
+from motionloom.pipeline.inference.requests import encode_prompts, prompts_of
 
 pytestmark = pytest.mark.slow  # librosa compiles what it runs first
 
 FPS, RATE = 20.0, 16_000
+DANCER: Any = SimpleNamespace(modalities=frozenset({"audio"}), prepared={})
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +31,8 @@ def song() -> Sound:
 
 
 def heard(sounds: list[Sound]) -> list[np.ndarray]:
-    encoder = PromptEncoder({}, torch.device("cpu"))
     prompts = [Prompt(sound=sound) for sound in sounds]
-    found = encoder.encode(prompts, [""] * len(sounds), frozenset({"audio"}), FPS)["audio"]
+    found = encode_prompts(DANCER, prompts, [""] * len(sounds), FPS, torch.device("cpu"))["audio"]
     return [f[m].numpy() for f, m in zip(found.features, found.mask, strict=True)]
 
 
@@ -73,7 +76,7 @@ def test_pieces_are_heard_once(song: Sound, monkeypatch: pytest.MonkeyPatch) -> 
 def test_known_features_are_taken_as_they_are(song: Sound) -> None:
     rows = np.random.default_rng(0).normal(size=(30, 438)).astype(np.float32)
     prompts = prompts_of(None, None, [song, song], {"audio": [rows, None]})
-    found = PromptEncoder({}, torch.device("cpu")).encode(prompts, ["", ""], frozenset({"audio"}), FPS)
+    found = encode_prompts(DANCER, prompts, ["", ""], FPS, torch.device("cpu"))
     assert found["audio"].mask.sum(1).tolist() == [30, round(song.seconds * FPS)]
     assert np.array_equal(found["audio"].features[0, :30].numpy(), rows)
     with pytest.raises(UserError, match="2 sounds but 1 audio"):

@@ -38,7 +38,6 @@ from motionloom.pipeline.inference.generators.gpt import (
 from motionloom.pipeline.inference.generators.ude import UdeGenerator
 from motionloom.pipeline.inference.generators.vae import VaeMotion
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.inference.requests import require_used
 from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.resolve import shipped_recipes
@@ -214,7 +213,7 @@ def test_a_face_by_a_vae_takes_no_guidance() -> None:
     both = bundle(faces=("vae", "gpt"))
     assert list(both.faces) == ["gpt", "vae"]
     with pytest.raises(UserError, match=r"face_cfg_scale: .*face_model to gpt"):
-        require_used(both, CAPTIONS, SamplingConfig(face_cfg_scale=2.0, face_model="vae"))
+        both.require_used(CAPTIONS, SamplingConfig(face_cfg_scale=2.0, face_model="vae"))
 
 
 def test_a_face_is_chosen_by_its_method_or_its_stage() -> None:
@@ -325,12 +324,10 @@ def test_kept_is_one_of_the_single_draws(model: MotionModel) -> None:
     """Whatever the batch is, and at asked lengths too."""
     bundle, count = model.bundle, 3
     prompts = [Prompt(f"a person {does}") for does in ("kicks with the left leg", "claps twice", "squats")]
-    texts = [prompt.text for prompt in prompts]
 
     def made(rows: list[int], frames: int | None, seeds: list[int], candidates: int) -> list[Any]:
-        conditions = bundle.encoder(bundle.main).encode(
-            [prompts[row] for row in rows], [texts[row] for row in rows], frozenset({"text"}), model.fps
-        )
+        some = [prompts[row] for row in rows]
+        conditions = bundle.encode(bundle.main, some, [prompt.text for prompt in some])
         lengths = None if frames is None else [frames] * len(rows)
         sampling = SamplingConfig(top_p=0.8, candidates=candidates)
         return bundle.generator.generate(GenerationRequest(conditions, lengths, seeds, sampling))
@@ -352,7 +349,7 @@ def same(one: np.ndarray, other: np.ndarray) -> bool:
 
 def test_a_model_without_such_a_tma_refuses(model: MotionModel, tmp_path: Path) -> None:
     sampling = SamplingConfig(candidates=2)
-    require_used(model.bundle, None, sampling)
+    model.bundle.require_used(None, sampling)
     faces = next(iter(model.bundle.faces.values()))
     assert "candidates" not in model.bundle.of(faces).settings, "TMA reads no faces"
     sentence = replace(model.bundle.generator, gpt=replace(model.bundle.generator.gpt, prior="sentence"))  # type: ignore[type-var,attr-defined]
