@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, ROWS, Figure, Protocol, say_difference
 from motionloom.pipeline.results.paper.evaluations import Evaluation, evaluations_of
 from motionloom.pipeline.results.paper.filled import (
-    Cell,
     FilledRow,
     FilledTable,
     data_set_of,
     differences,
     notes_of,
 )
-from motionloom.pipeline.results.paper.schema import Column, PaperTable, Row, config_fits, may_fill, value_at
+from motionloom.pipeline.results.paper.schema import (
+    Column,
+    PaperTable,
+    Printed,
+    Row,
+    config_fits,
+    may_fill,
+    value_at,
+)
 from motionloom.pipeline.store.run_state import StageRecord
 
 _MISSING, _NO_MODEL = "missing in these runs", "missing: no model of ours"
@@ -41,7 +47,6 @@ class _Filling:
         self.labels = {
             run: str(run) if names.count(short) > 1 else short for run, short in zip(runs, names, strict=True)
         }
-        self.folders = {label: run for run, label in self.labels.items()}
         self.decimals = [self._decimals(at) for at in range(len(table.columns))]
         self.used: dict[tuple[Path, str], Evaluation] = {}
         self.compared: set[tuple[Path, str]] = set()
@@ -97,28 +102,19 @@ class _Filling:
 
     def _paper(self, row: Row) -> FilledRow:
         printed = iter(row.printed())
-        cells = [next(printed) if column.printed else None for column in self.table.columns]
-        shown = tuple(None if cell is None else Cell(cell.text, cell.mean, cell.spread) for cell in cells)
-        return FilledRow("paper", row.method, row.method, shown)
+        cells = tuple(next(printed) if column.printed else None for column in self.table.columns)
+        return FilledRow("paper", row.method, row.method, cells)
 
     def _models(self, row: Row) -> list[FilledRow]:
         """Our rows of one of the paper's; one that says so where there are none."""
         if row.recorded or not self.evaluations:
             return []
-        ours = [
-            one
-            for run in self.evaluations
-            for one in named_apart(without_repetitions(self._of_run(run, row)))
-        ]
-        for one in ours:
-            for evaluation in self.evaluations[self.folders[one.run]]:
-                if evaluation.name in one.evaluations:
-                    self.used[evaluation.run, evaluation.name] = evaluation
+        ours = [one for run in self.evaluations for one in self._of_run(run, row)]
         label = _NO_MODEL if row.ours is None else _MISSING
         return ours or [FilledRow("missing", row.method, label, (None,) * len(self.table.columns))]
 
     def _of_run(self, run: Path, row: Row) -> list[FilledRow]:
-        """One row for each model of a run, or for each set of models where the columns are settings."""
+        """One row for each model of a run, or for its set of models where the columns are settings."""
         if row.ours is None:
             return []
         role, conditions = row.ours.role, row.ours.conditions()
@@ -128,58 +124,46 @@ class _Filling:
             if role in evaluation.about
             and all(may_fill(match, evaluation.about.get(name)) for name, match in conditions.items())
         ]
-        # Columns that are settings of a model make one row of several models.
-        by_setting = any(column.where for column in self.table.columns)
-        names = [""] if by_setting else list(dict.fromkeys(model.name for _, model in fitting))
-        out = []
-        for name in names:
-            lists = [
-                [
-                    (evaluation, model)
-                    for evaluation, model in fitting
-                    if column.figure is not None
-                    and evaluation.measure == column.of
-                    and (by_setting or model.name == name)
-                    and config_fits(column.where, model.config)
-                    and self._about(column, evaluation)
-                ]
-                for column in self.table.columns
-            ]
-            # A model that was evaluated several times has a row for each, until equal ones are dropped.
-            for turn in range(max(map(len, lists), default=0)):
-                chosen = [choices[turn] if turn < len(choices) else None for choices in lists]
-                out.append(self._ours(run, row, chosen))
-            if (
-                not any(lists) and fitting and not by_setting
-            ):  # a model whose figures this table has no column for
-                out.append(self._ours(run, row, [None] * len(lists), name))
-        return out
-
-    def _about(self, column: Column, evaluation: Evaluation) -> bool:
-        """Whether an evaluation is of the column's data set."""
-        return not column.data or data_set_of(evaluation, self.table.data) == column.data
+        if any(column.where for column in self.table.columns):
+            made = self._ours(run, row, fitting)
+            return [made] if made.stages else []
+        names = dict.fromkeys(model.name for _, model in fitting)
+        return [self._ours(run, row, [pair for pair in fitting if pair[1].name == n], n) for n in names]
 
     def _ours(
-        self, run: Path, row: Row, chosen: Sequence[tuple[Evaluation, StageRecord] | None], name: str = ""
+        self, run: Path, row: Row, fitting: Sequence[tuple[Evaluation, StageRecord]], name: str = ""
     ) -> FilledRow:
+        """A row of our models: in each column the figure of the first evaluation that has measured it."""
         assert row.ours is not None
-        cells: list[Cell | None] = []
+        cells: list[Printed | None] = []
         models, evaluations = dict.fromkeys([name] if name else []), dict[str, None]()
-        for at, pair in enumerate(chosen):
-            column = self.table.columns[at]
-            if pair is None or column.figure is None:
-                cells.append(None)
-                continue
-            evaluation, model = pair
-            models[model.name] = None
-            evaluations[evaluation.name] = None
-            figure = evaluation.figure(column.figure.format(**row.values))
-            cells.append(None if figure is None else self._cell(evaluation, figure, at))
-            self._settings(run, model, {**row.ours.setting, **column.setting})
+        for at, column in enumerate(self.table.columns):
+            cell = None
+            for evaluation, model in fitting:
+                figure = self._figure(column, evaluation, row.values)
+                if figure is not None and config_fits(column.where, model.config):
+                    models[model.name] = evaluations[evaluation.name] = None
+                    self.used[run, evaluation.name] = evaluation
+                    self._settings(run, model, {**row.ours.setting, **column.setting})
+                    cell = self._cell(evaluation, figure, at)
+                    break
+            cells.append(cell)
         label = " ".join([self.labels[run], ", ".join(models)])
         return FilledRow(
             "ours", row.method, label, tuple(cells), self.labels[run], tuple(models), tuple(evaluations)
         )
+
+    def _figure(
+        self, column: Column, evaluation: Evaluation, values: Mapping[str, str], row: str = MODEL
+    ) -> Figure | None:
+        """The figure of a column in an evaluation; None where it measures another thing or other data."""
+        if column.figure is None or evaluation.measure != column.of or not self._about(column, evaluation):
+            return None
+        return evaluation.figure(column.figure.format(**values), row)
+
+    def _about(self, column: Column, evaluation: Evaluation) -> bool:
+        """Whether an evaluation is of the column's data set."""
+        return not column.data or data_set_of(evaluation, self.table.data) == column.data
 
     def _settings(self, run: Path, model: StageRecord, paper: Mapping[str, object]) -> None:
         """Note where a model of ours has another setting than the paper's."""
@@ -191,7 +175,7 @@ class _Filling:
         if wrong:
             self.settings[f"{self.labels[run]} {model.name}: {', '.join(wrong)}"] = None
 
-    def _cell(self, evaluation: Evaluation, figure: Figure, at: int) -> Cell:
+    def _cell(self, evaluation: Evaluation, figure: Figure, at: int) -> Printed:
         column, digits = self.table.columns[at], self.decimals[at]
         self.shown.setdefault((evaluation.run, evaluation.name), []).append((column, figure))
         if figure.note:
@@ -199,7 +183,7 @@ class _Filling:
         mean = figure.value * column.scale
         spread = None if figure.interval is None else figure.interval * column.scale
         text = f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
-        return Cell(text, mean, spread, figure.protocol_key)
+        return Printed(text=text, mean=mean, spread=spread, alike=figure.protocol_key)
 
     def _references(self, values: Mapping[str, str], titles: Iterable[str]) -> list[FilledRow]:
         """Reference baselines of the evaluations whose models stand in the table, or of all where no
@@ -222,12 +206,8 @@ class _Filling:
     def _reference(
         self, run: Path, evaluation: Evaluation, title: str, values: Mapping[str, str]
     ) -> FilledRow:
-        cells = []
-        for at, column in enumerate(self.table.columns):
-            fits = evaluation.measure == column.of and self._about(column, evaluation)
-            name = column.figure.format(**values) if fits and column.figure is not None else ""
-            figure = evaluation.figure(name, title)
-            cells.append(None if figure is None else self._cell(evaluation, figure, at))
+        figures = [self._figure(column, evaluation, values, title) for column in self.table.columns]
+        cells = [f if f is None else self._cell(evaluation, f, at) for at, f in enumerate(figures)]
         label = f"{title} ({self.labels[run]} {evaluation.name})"
         return FilledRow("reference", "", label, tuple(cells), self.labels[run], (), (evaluation.name,))
 
@@ -254,30 +234,3 @@ def mark_best(rows: Sequence[FilledRow], columns: Sequence[Column]) -> tuple[Fil
                 if value == wanted and len(set(values.values())) > 1:
                     best[number].add(at)
     return tuple(row.marked(best[number]) for number, row in enumerate(rows))
-
-
-def without_repetitions(rows: Sequence[FilledRow]) -> list[FilledRow]:
-    """Rows of one run, without those that say no more of their model than another one does."""
-    out: list[FilledRow] = []
-    for row in rows:
-        if any(_covers(other, row) for other in out):
-            continue
-        out = [other for other in out if not _covers(row, other)]
-        out.append(row)
-    return out
-
-
-def _covers(one: FilledRow, other: FilledRow) -> bool:
-    """Whether every figure of `other` stands in `one`, of the same models."""
-    same = one.run == other.run and set(other.stages) <= set(one.stages)
-    pairs = zip(one.cells, other.cells, strict=True)
-    return same and all(b is None or (a is not None and a.text == b.text) for a, b in pairs)
-
-
-def named_apart(rows: Sequence[FilledRow]) -> list[FilledRow]:
-    """Rows whose labels are equal, with the evaluation's name behind."""
-    often = Counter(row.label for row in rows)
-    return [
-        replace(row, label=f"{row.label} ({', '.join(row.evaluations)})") if often[row.label] > 1 else row
-        for row in rows
-    ]

@@ -18,7 +18,7 @@ from rich.table import Table
 
 from motionloom.pipeline.evaluation.figures import Figure, decodings_of
 from motionloom.pipeline.results.paper.evaluations import Evaluation
-from motionloom.pipeline.results.paper.schema import Column, DataSet, PaperTable
+from motionloom.pipeline.results.paper.schema import Column, DataSet, PaperTable, Printed
 from motionloom.pipeline.store.run_state import StageRecord
 
 T = TypeVar("T")
@@ -34,18 +34,6 @@ _LONG = 40
 
 
 @dataclass(frozen=True)
-class Cell:
-    """A number of the paper or of ours as it is printed."""
-
-    text: str
-    mean: float
-    spread: float | None = None
-    alike: str = ""
-    """Key of the protocol of a figure of ours: figures with equal keys were measured alike."""
-    best: bool = False
-
-
-@dataclass(frozen=True)
 class FilledRow:
     """A row of the paper, of a model of ours, or of a reference baseline."""
 
@@ -54,7 +42,7 @@ class FilledRow:
     """The paper's row that it belongs to; empty for a baseline that belongs to all."""
     label: str
     """The paper's method, the stage of a run, or a reference baseline."""
-    cells: tuple[Cell | None, ...]
+    cells: tuple[Printed | None, ...]
     run: str = ""
     stages: tuple[str, ...] = ()
     """Stages of a model: one, or one for each setting."""
@@ -62,7 +50,7 @@ class FilledRow:
 
     def marked(self, best: set[int]) -> FilledRow:
         """With the cells of these columns marked as the best."""
-        cells = [cell and replace(cell, best=at in best) for at, cell in enumerate(self.cells)]
+        cells = [cell and cell.model_copy(update={"best": at in best}) for at, cell in enumerate(self.cells)]
         return replace(self, cells=tuple(cells))
 
 
@@ -145,7 +133,7 @@ def _heading(column: Column, between: str = " ", *, arrow: bool = True) -> str:
     return f"{group}{column.name}{unit}{_ARROWS[column.better] if arrow else ''}"
 
 
-def _marked(cell: Cell | None, before: str, behind: str) -> str:
+def _marked(cell: Printed | None, before: str, behind: str) -> str:
     if cell is None:
         return ""
     return f"{before}{cell.text}{behind}" if cell.best else cell.text

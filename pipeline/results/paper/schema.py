@@ -126,11 +126,14 @@ _PRINTED = re.compile(rf"({_NUMBER})(?: ± ({_NUMBER}))?")
 
 
 class Printed(Config):
-    """A number as the paper prints it, trailing zeros included."""
+    """A number as it is printed, the paper's with its trailing zeros, or ours."""
 
     text: str
     mean: float
     spread: float | None = None
+    alike: str = ""
+    """Key of the protocol of a figure of ours: figures with equal keys were measured alike."""
+    best: bool = False
 
     @staticmethod
     def of(text: str) -> Printed | None:

@@ -214,20 +214,6 @@ def test_dances_and_texts_of_one_model_share_a_row(tmp_path: Path, records: Modu
     assert not ours(with_dmd)  # its UTT is a GRU
 
 
-def test_one_model_twice_is_named_by_its_evaluations(baselines: Make, records: ModuleType) -> None:
-    run = baselines()
-    recipe = run / "recipe.yaml"
-    recipe.write_text(recipe.read_text() + "  again: {kind: evaluate}\n  same: {kind: evaluate}\n")
-    for name, mpjpe in (("again", 91.0), ("same", 90.0)):
-        source, folder = run / "stages" / "evaluate", run / "stages" / name
-        folder.mkdir()
-        record = json.loads((source / "artifact.json").read_text()) | {"stage": name}
-        (folder / "artifact.json").write_text(json.dumps(record))
-        records.reconstruction(mpjpe).write(folder / "metrics.json")
-    labels = [label for label in ours(filled("humantomato/7", run)) if "tokenizer" in label]
-    assert labels == ["bl tokenizer (evaluate)", "bl tokenizer (again)"]  # `same` says the same
-
-
 def test_runs_of_one_name_are_told_apart_by_their_paths(baselines: Make) -> None:
     one, other = baselines("x/run"), baselines("y/run")
     labels = ours(filled("humantomato/7", one, other, one))

@@ -13,8 +13,8 @@ from rich.console import Console
 from motionloom.pipeline import compare_with_paper
 from motionloom.pipeline.results.paper.compare import paper_table, shipped_tables
 from motionloom.pipeline.results.paper.fill import fill
-from motionloom.pipeline.results.paper.filled import Cell, Difference, FilledRow, FilledTable
-from motionloom.pipeline.results.paper.schema import PaperTable
+from motionloom.pipeline.results.paper.filled import Difference, FilledRow, FilledTable
+from motionloom.pipeline.results.paper.schema import PaperTable, Printed
 
 PAPER = PaperTable.parse(
     {
@@ -30,13 +30,20 @@ PAPER = PaperTable.parse(
     },
     "p.yaml",
 )
+
+
+def number(text: str, best: bool = False) -> Printed:
+    """A cell."""
+    return Printed(text=text, mean=float(text.split(" ")[0]), best=best)
+
+
 TABLE = FilledTable(
     "p/1",
     PAPER,
     (
-        FilledRow("paper", "m_1", "m_1", (Cell("1.50 ± .20", 1.5, 0.2), None, None)),
-        FilledRow("ours", "m_1", "[red]r a|b", (Cell("2.0", 2.0, best=True), Cell("0.1", 0.1), None)),
-        FilledRow("reference", "", "chance", (None, Cell("0.5", 0.5), None)),
+        FilledRow("paper", "m_1", "m_1", (number("1.50 ± .20"), None, None)),
+        FilledRow("ours", "m_1", "[red]r a|b", (number("2.0", True), number("0.1"), None)),
+        FilledRow("reference", "", "chance", (None, number("0.5"), None)),
     ),
     differences=(Difference("r", "e", "data", "S", "D"), Difference("r", "e", "clips", "3", None)),
     notes=("A note [n].",),
