@@ -1,9 +1,8 @@
 """Batches for training: map-style datasets whose item `k` is one rank's whole share of global step `k`.
 
-Use with `DataLoader(batches, batch_size=None, sampler=range(first_step, last_step))`: a run resumes by
-starting the range elsewhere. What a batch holds depends on the data, its order and (seed, k) alone; the
-ranks' shares one after the other are the global batch whatever their number. `batch_size` is always the
-*global* one.
+`Steps` goes through them for a loader; a run resumes by starting elsewhere. What a batch holds depends on
+the data, its order and (seed, k) alone; the ranks' shares one after the other are the global batch whatever
+their number. `batch_size` is always the *global* one.
 """
 
 from __future__ import annotations
@@ -22,9 +21,6 @@ from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
-
-ENDLESS = 2**62
-"""`len` of training batches: they go on for as many epochs as the sampler asks for."""
 
 _WINDOW = 1
 """Keeps the draws apart from those for other purposes (`condition_batches.py`)."""
@@ -77,9 +73,6 @@ class WindowBatches(Dataset[MotionBatch]):
         sources = dataset.sources(self.clips)
         self.plan = BatchPlan(len(self.clips), batch_size // windows_per_clip, seed, sources=sources)
         self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
-
-    def __len__(self) -> int:
-        return ENDLESS
 
     def _windows(self, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Clips [n], first frames [n, windows_per_clip] and lengths [n] of batch `k`."""

@@ -20,7 +20,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.conditions import Condition
-from motionloom.datasets.loading.batches import ENDLESS, MotionBatch
+from motionloom.datasets.loading.batches import MotionBatch
 from motionloom.datasets.loading.crops import CaptionSpan, Crops, caption_spans
 from motionloom.datasets.loading.kinds import KindPlan, drop_some
 from motionloom.datasets.loading.statistics import FeatureStats
@@ -197,9 +197,6 @@ class ConditionBatches(Dataset[ConditionBatch]):
         present, names = self.source.present[clips], self.source.names
         self.plan = KindPlan(dataset, clips, present, names, batch_size, seed, balance, homogeneous)
         self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
-
-    def __len__(self) -> int:
-        return ENDLESS
 
     def __getitem__(self, k: int) -> ConditionBatch:
         turns, clips = self.plan.local(k, self.rank, self.world)

@@ -12,17 +12,22 @@ every backward pass, and a group's pass reaches its own alone.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple, cast
 
 import torch
+from lightning.fabric import Fabric
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
+from torch.amp import GradScaler
 from torch.optim import Optimizer
 
 from motionloom.models.training.distributed import mean_gradients
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.training.stage_module import Batch, Execution, StageModule
+from motionloom.models.training.stage_module import Batch, StageModule, StepSchedule
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,20 @@ class OptimizerGroup:
     def params(self) -> list[nn.Parameter]:
         return [p for net in self.nets for p in net.parameters() if p.requires_grad]
 
+    def factor(self, step: int, *, max_steps: int) -> float:
+        """Return the factor of the learning rate in a step of a training of `max_steps`."""
+        end = max_steps if self.end_step is None else self.end_step
+        return self.optim.factor(max(0, step - self.start_step), end - self.start_step)
+
+
+class _Turn(NamedTuple):
+    """A group with what trains it."""
+
+    group: OptimizerGroup
+    params: list[nn.Parameter]
+    optimizer: Optimizer
+    schedule: StepSchedule
+
 
 class AlternatingModule(StageModule):
     """Trains networks of several groups. Subclasses implement `optimizer_groups()` and `losses_of(...)`.
@@ -57,7 +76,10 @@ class AlternatingModule(StageModule):
 
     def __init__(self, net: nn.Module, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self._trained: list[list[nn.Parameter]] = []
+        self.automatic_optimization = False
+        self._turns: list[_Turn] = []
+        self._parts: list[Batch] = []
+        """Parts of the step that is being collected."""
 
     @abstractmethod
     def optimizer_groups(self) -> Sequence[OptimizerGroup]:
@@ -87,78 +109,102 @@ class AlternatingModule(StageModule):
         torch.compiler.reset()
         self.losses_of = torch.compile(self.losses_of, fullgraph=True)  # type: ignore[method-assign]
 
-    def configure_optimizers(self) -> list[Optimizer]:
-        """One optimizer a group; learning rates are set in every turn, as a function of the step."""
+    def configure_optimizers(self) -> list[OptimizerLRSchedulerConfig]:
+        """Return an optimizer and a schedule for each group; a turn sets its rate from the step's number."""
         groups = self.optimizer_groups()
-        self._trained = [group.params() for group in groups]
-        every = [id(param) for params in self._trained for param in params]
+        trained = [group.params() for group in groups]
+        every = [id(param) for params in trained for param in params]
         if len(every) != len(set(every)):
             raise ValueError("a parameter belongs to two groups")
+        self._turns = []
+        for group, params in zip(groups, trained, strict=True):
+            optimizer = group.optim.build(params, fused=self.fused)
+            schedule = StepSchedule(optimizer, partial(group.factor, max_steps=self.max_steps))
+            self._turns.append(_Turn(group, params, optimizer, schedule))
         return [
-            group.optim.build(params, fused=self.fused)
-            for group, params in zip(groups, self._trained, strict=True)
+            {"optimizer": turn.optimizer, "lr_scheduler": {"scheduler": turn.schedule, "interval": "step"}}
+            for turn in self._turns
         ]
 
-    def take_step(self, parts: Iterable[Batch], optimizers: list[Optimizer], how: Execution) -> Tensor:
-        """One step: every group that has a turn takes it. The first one's loss on the first part."""
-        batches = list(parts)
-        shared: list[dict[str, Tensor]] = [{} for _ in batches]
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor | None:
+        """Once all parts of a step are together, every group that has a turn takes it.
+
+        Return the first one's loss on the first part, without a gradient; None before.
+        """
+        self._parts.append(batch)
+        if len(self._parts) < self.accumulate:
+            return None
+        parts, self._parts = self._parts, []
+        # The mean over ranks is taken in every turn; a Trainer's DDP must not wait for gradients as well.
+        strategy = None if self._trainer is None else self._trainer.strategy
+        with getattr(strategy, "block_backward_sync", nullcontext)():
+            loss = self._take_turns(parts)
+        if self._trainer is not None:  # which otherwise counts the steps of all optimizers
+            steps = self._trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress
+            steps.increment_ready()
+            steps.increment_completed()
+        return loss
+
+    def _take_turns(self, parts: list[Batch]) -> Tensor:
+        shared: list[dict[str, Tensor]] = [{} for _ in parts]
+        scaler = self._scaler()
         self.gauges, first, stepped = {}, None, False
-        for turn, (group, optimizer) in enumerate(zip(self.optimizer_groups(), optimizers, strict=True)):
-            if not group.steps_at(self.step):
+        for number, turn in enumerate(self._turns):
+            if not turn.group.steps_at(self.step):
                 continue
             with self._alone_trains(turn):
-                optimizer.zero_grad()
-                for number, part in enumerate(batches):
-                    loss = self._backward(group, turn, number, part, shared, how)
+                turn.optimizer.zero_grad()
+                for place, part in enumerate(parts):
+                    self.seed_draws(place, number)
+                    loss = self._backward(turn.group, part, shared[place], first=number == 0)
                     first = loss if first is None else first
-                stepped |= self._step(group, turn, optimizer, how)
-        if how.scaler is not None and stepped:
-            how.scaler.update()
-        self.step += 1
+                # Outside of autocast, as the steps of one optimizer are.
+                with torch.autocast(self.device.type, enabled=False):
+                    stepped |= self._step_of(turn, scaler)
+        if scaler is not None and stepped:
+            scaler.update()
         return torch.zeros(()) if first is None else first
 
     def _backward(
-        self,
-        group: OptimizerGroup,
-        turn: int,
-        number: int,
-        part: Batch,
-        shared: list[dict[str, Tensor]],
-        how: Execution,
+        self, group: OptimizerGroup, part: Batch, shared: dict[str, Tensor], *, first: bool
     ) -> Tensor:
-        self.seed_draws(number, turn)
-        with how.autocast():
-            values = self.losses_of(group.name, part, shared[number])
-        shared[number] = {name: value.detach() for name, value in shared[number].items()}
+        """Add the gradients of a group's loss on a part; returns the loss."""
+        values = self.losses_of(group.name, part, shared)
+        shared.update({name: value.detach() for name, value in shared.items()})
         named = _named(group, values)
-        self.average({"loss": values["loss"], **named} if turn == 0 else named)
-        how.fabric.backward(values["loss"] / self.accumulate)
+        self.record({"loss": values["loss"], **named} if first else named, part)
+        with torch.autocast(self.device.type, enabled=False):
+            self.manual_backward(values["loss"] / self.accumulate)
         return values["loss"].detach()
 
-    def _step(self, group: OptimizerGroup, turn: int, optimizer: Optimizer, how: Execution) -> bool:
+    def _step_of(self, turn: _Turn, scaler: GradScaler | None) -> bool:
         """A group's step with the gradients that it has; False if it has none."""
-        params = self._trained[turn]
-        mean_gradients(params)
-        if all(param.grad is None for param in params):
+        group, optimizer = turn.group, turn.optimizer
+        mean_gradients(turn.params)
+        if all(param.grad is None for param in turn.params):
             return False
-        step = self.step - group.start_step
-        end = self.max_steps if group.end_step is None else group.end_step
-        rate = group.optim.lr * group.optim.factor(step, end - group.start_step)
-        for settings in optimizer.param_groups:
-            settings["lr"] = rate
-        if how.scaler is not None:
-            how.scaler.unscale_(optimizer)
-        norm = self.clip(params, group.optim.grad_clip)
+        rate = turn.schedule.set_step(self.step)
+        if scaler is not None:
+            scaler.unscale_(optimizer)
+        norm = self.clip(turn.params, group.optim.grad_clip)
         if norm is not None:
             self.gauges |= {f"lr/{group.name}": rate, f"grad_norm/{group.name}": norm}
-        how.step(optimizer)
+        if scaler is None:
+            optimizer.step()
+        else:
+            scaler.step(optimizer)
         return True
 
+    def _scaler(self) -> GradScaler | None:
+        """The loss scaler of float16, which alone needs one."""
+        if self._trainer is not None:
+            return getattr(self._trainer.precision_plugin, "scaler", None)
+        return getattr(cast(Fabric, self.fabric).strategy.precision, "scaler", None)
+
     @contextmanager
-    def _alone_trains(self, turn: int) -> Iterator[None]:
+    def _alone_trains(self, turn: _Turn) -> Iterator[None]:
         """Inside, no other group's parameters get gradients; those of none of them are left as they are."""
-        others = [p for other, params in enumerate(self._trained) if other != turn for p in params]
+        others = [param for other in self._turns if other is not turn for param in other.params]
         for param in others:
             param.requires_grad_(False)
         try:

@@ -1,5 +1,8 @@
 """Base of the stages' LightningModules: a network, its losses, and one training step.
 
+`lightning.Trainer` and the pipeline's own loop (`pipeline/training/execution.py`) call the same methods and
+train to the same weights.
+
 Every random draw of a training step (dropout, latents, Gumbel noise) comes from a generator state that is a
 pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for
 bit.
@@ -9,19 +12,17 @@ Codebooks draw by themselves, the same on every rank (`quantize/base.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NamedTuple, TypedDict
 
 import lightning as L
 import torch
-from lightning.fabric import Fabric
+from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
-from torch.amp import GradScaler
 from torch.distributed.tensor import DTensor
-from torch.nn.parallel import DistributedDataParallel
 from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from motionloom.models.training.distributed import alone, rank
 from motionloom.models.training.optim import OptimConfig as OptimConfig
@@ -51,39 +52,20 @@ class StepFigures(NamedTuple):
     """float32 [len(names)]."""
 
 
-@dataclass(frozen=True)
-class Execution:
-    """How this process computes a step: devices, precision and processes are Fabric's."""
+class StepSchedule(LambdaLR):
+    """The learning rate of a step as a factor of the first one, which depends on the step alone."""
 
-    fabric: Fabric
-    model: nn.Module
-    """The module, or DDP around it; its `forward` is `StageModule.forward`."""
-    half: torch.dtype | None = None
-    """Type of mixed precision; None computes in the type of the weights."""
-    scaler: GradScaler | None = None
-    """The loss scaler of float16, which alone needs one."""
+    def __init__(self, optimizer: Optimizer, factor: Callable[[int], float]) -> None:
+        super().__init__(optimizer, factor)
+        self.factor = factor
 
-    def autocast(self) -> AbstractContextManager[object]:
-        """Mixed precision of a forward pass; every use of a weight has a cast of its own, so that its
-        gradients add up in float32.
-        """
-        device = self.fabric.device.type
-        enabled = self.half is not None
-        return torch.autocast(device, dtype=self.half, enabled=enabled, cache_enabled=False)
-
-    def without_sync(self, skip: bool) -> AbstractContextManager[object]:
-        """Inside, DDP does not average gradients if `skip`: more parts of the step follow."""
-        if skip and isinstance(self.model, DistributedDataParallel):
-            no_sync: AbstractContextManager[object] = self.model.no_sync()
-            return no_sync
-        return nullcontext()
-
-    def step(self, optimizer: Optimizer) -> None:
-        """Let an optimizer step; float16 passes over steps whose gradients overflow."""
-        if self.scaler is None:
-            optimizer.step()
-        else:
-            self.scaler.step(optimizer)
+    def set_step(self, step: int) -> float:
+        """Set and return the rate of a step, whichever step came before."""
+        self.last_epoch, factor = step, self.factor(step)
+        for group, first in zip(self.optimizer.param_groups, self.base_lrs, strict=True):
+            group["lr"] = first * factor
+        self._last_lr = [group["lr"] for group in self.optimizer.param_groups]
+        return float(self._last_lr[0])
 
 
 class StageModule(L.LightningModule, ABC):
@@ -95,8 +77,7 @@ class StageModule(L.LightningModule, ABC):
         self.optim_config = optim
         self.seed = seed
         self.max_steps = max_steps
-        self.step = 0
-        """Steps that are done."""
+        self._step = 0
         self.accumulate = 1
         """Parts that the batch of a step is cut into."""
         self.fused = True
@@ -109,6 +90,21 @@ class StageModule(L.LightningModule, ABC):
         self.norms: list[tuple[int, Tensor]] = []
         """(step, norm of the gradients) likewise, where a norm was computed."""
         self._sums: dict[tuple[str, ...], tuple[Tensor, int]] = {}
+
+    @property
+    def step(self) -> int:
+        """Steps that are done, counted by the Trainer where one trains."""
+        return self._step if self._trainer is None else self._trainer.global_step
+
+    @step.setter
+    def step(self, step: int) -> None:
+        self._step = step
+
+    def setup(self, stage: str) -> None:
+        """Take over what a Trainer decides: parts of a step, and no fused optimizer for "16-mixed"."""
+        if self.automatic_optimization:
+            self.accumulate = self.trainer.accumulate_grad_batches
+        self.fused = self.trainer.precision != "16-mixed"
 
     @abstractmethod
     def losses(self, batch: Batch) -> dict[str, Tensor]:
@@ -123,40 +119,35 @@ class StageModule(L.LightningModule, ABC):
         torch.compiler.reset()
         self.losses = torch.compile(self.losses, fullgraph=True)  # type: ignore[method-assign]
 
-    def configure_optimizers(self) -> list[Optimizer]:
-        """The optimizer of the trainable parameters; `take_step` sets its learning rate."""
+    def configure_optimizers(self) -> list[OptimizerLRSchedulerConfig]:
+        """Return the optimizer of the trainable parameters with its schedule, as Lightning takes them."""
         trained = [param for param in self.net.parameters() if param.requires_grad]
-        return [self.optim_config.build(trained, fused=self.fused)]
+        optimizer = self.optim_config.build(trained, fused=self.fused)
+        self.schedule = StepSchedule(optimizer, partial(self.optim_config.factor, max_steps=self.max_steps))
+        return [{"optimizer": optimizer, "lr_scheduler": {"scheduler": self.schedule, "interval": "step"}}]
 
-    def take_step(self, parts: Iterable[Batch], optimizers: list[Optimizer], how: Execution) -> Tensor:
-        """One training step on the parts of its batch; the loss of the last part."""
-        (optimizer,) = optimizers
-        config, loss = self.optim_config, torch.zeros(())
-        for group in optimizer.param_groups:
-            group["lr"] = config.lr * config.factor(self.step, self.max_steps)
-        optimizer.zero_grad()
-        for number, batch in enumerate(parts):
-            with how.without_sync(number < self.accumulate - 1):
-                with how.autocast():
-                    loss = how.model(batch, number)
-                how.fabric.backward(loss / self.accumulate)
-        if how.scaler is not None:
-            how.scaler.unscale_(optimizer)
-        self.gauges = {}
-        norm = self.clip(list(self.net.parameters()), config.grad_clip)
-        if norm is not None:
-            self.gauges = {"lr": optimizer.param_groups[0]["lr"], "grad_norm": norm}
-        how.step(optimizer)
-        if how.scaler is not None:
-            how.scaler.update()
-        self.step += 1
-        return loss.detach()
+    def configure_gradient_clipping(
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip as `optim.grad_clip` says, unless the Trainer has a value of its own."""
+        if gradient_clip_val is not None:
+            super().configure_gradient_clipping(optimizer, gradient_clip_val, gradient_clip_algorithm)
+            return
+        norm = self.clip(list(self.net.parameters()), self.optim_config.grad_clip)
+        self.gauges = {} if norm is None else {"lr": optimizer.param_groups[0]["lr"], "grad_norm": norm}
 
-    def forward(self, batch: Batch, part: int) -> Tensor:
-        """Loss of one part of a step; seeds torch from (seed, step, part, rank) first."""
-        self.seed_draws(part)
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor | None:
+        """Loss of one part of a step; seeds torch from (seed, step, part, rank) first.
+
+        `batch_idx` counts the parts of all steps. A module of one optimizer returns the loss, whose gradient
+        the loop takes; `AlternatingModule` takes its whole step itself.
+        """
+        self.seed_draws(batch_idx % self.accumulate)
         values = self.losses(batch)
-        self.average(values)
+        self.record(values, batch)
         return values["loss"]
 
     def seed_draws(self, part: int, turn: int = 0) -> None:
@@ -168,6 +159,13 @@ class StageModule(L.LightningModule, ABC):
     def ends_row(self) -> bool:
         """Whether a row of the log ends with the step that is being taken."""
         return (self.step + 1) % LOG_EVERY == 0
+
+    def record(self, values: dict[str, Tensor], batch: Batch) -> None:
+        """Log figures of a part of a step: to the Trainer, or to the means of the next row."""
+        if self._trainer is None:
+            self.average(values)
+        else:
+            self.log_dict({f"train/{k}": v for k, v in values.items()}, batch_size=len(batch["length"]))
 
     def average(self, values: dict[str, Tensor]) -> None:
         """Add figures of a step, or of a part of one, to the means of the next row."""
@@ -202,7 +200,11 @@ class StageModule(L.LightningModule, ABC):
         """
         torch.manual_seed((self.seed * 1_000_003 + batch_idx) % 2**63)
         with alone():
-            return self.losses(batch)
+            values = self.losses(batch)
+        if self._trainer is not None:
+            figures = {f"val/{k}": v for k, v in values.items()}
+            self.log_dict(figures, batch_size=len(batch["length"]), sync_dist=True)
+        return values
 
     def clip(self, params: list[nn.Parameter], largest: float) -> Tensor | None:
         """Clip by the norm of all gradients (0 = not at all); the norm before, if a row of the log ends."""
@@ -210,7 +212,8 @@ class StageModule(L.LightningModule, ABC):
             return None
         norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
         whole = norm.full_tensor() if isinstance(norm, DTensor) else norm
-        self.norms.append((self.step + 1, whole))
+        if self._trainer is None:
+            self.norms.append((self.step + 1, whole))
         if largest:
             torch.nn.utils.clip_grads_with_norm_(params, largest, norm)
         return whole if self.ends_row else None

@@ -12,11 +12,8 @@ Notable choices [ours]:
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import torch
 from torch import Tensor
-from torch.optim import Optimizer
 
 from motionloom.models.condition.mate import Encoded, drop_conditions
 from motionloom.models.discriminator.patch import (
@@ -31,7 +28,7 @@ from motionloom.models.gpt.tokens import TokenSequence, interleave
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.training.stage_module import Batch, Execution
+from motionloom.models.training.stage_module import Batch
 from motionloom.models.utt.network import ConditionedUtt
 
 
@@ -71,9 +68,9 @@ class UttModule(AlternatingModule):
         self.judged = weight > 0
         self.pull.fill_(weight)
 
-    def take_step(self, parts: Iterable[Batch], optimizers: list[Optimizer], how: Execution) -> Tensor:
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor | None:
         self._weigh()
-        return super().take_step(parts, optimizers, how)
+        return super().training_step(batch, batch_idx)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         self._weigh()

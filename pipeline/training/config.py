@@ -5,23 +5,28 @@ It is apart from `trainer.py` because a recipe is read and planned without Light
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sized
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 from pydantic import BaseModel, Field
-from torch.utils.data import Dataset
 
+from motionloom.datasets.loading.steps import Numbered
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import RUNTIME, StageConfig
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers
 
-BatchSource = Callable[[int, int, int], Dataset[object]]
-"""(items per global micro-batch, rank, world) -> dataset; item k is this rank's batch of micro-step k."""
+BatchSource = Callable[[int, int, int], Numbered[Any]]
+"""(items per global micro-batch, rank, world) -> batches; item k is this rank's batch of micro-step k."""
 
-EvalSource = Callable[[], Dataset[object]]
-"""Sized dataset of all validation batches: every process reads the same, so the figures depend on no rank."""
+
+class SizedBatches(Numbered[Any], Sized, Protocol):
+    """Batches by number, and how many there are."""
+
+
+EvalSource = Callable[[], SizedBatches]
+"""All validation batches: every process reads the same, so the figures depend on no rank."""
 
 
 class TrainConfig(Config):

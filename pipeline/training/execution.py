@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sized
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from functools import partial
 from multiprocessing import resource_tracker
-from typing import cast
+from typing import Any, cast
 
 import torch
 from lightning.fabric import Fabric
+from lightning.fabric.plugins.precision import MixedPrecision as FabricMixedPrecision
+from lightning.fabric.plugins.precision import Precision
 from lightning.fabric.strategies.ddp import DDPStrategy
 from lightning.fabric.strategies.model_parallel import ModelParallelStrategy
 from lightning.fabric.strategies.strategy import Strategy
-from torch import nn
+from torch import Tensor, nn
+from torch.amp import GradScaler
 from torch.distributed.device_mesh import DeviceMesh
-from torch.utils.data import DataLoader, Dataset
+from torch.optim import Optimizer
+from torch.utils.data import DataLoader
 
+from motionloom.datasets.loading.steps import Steps
 from motionloom.models.layers.transformer import Transformer
-from motionloom.models.training.alternating import AlternatingModule
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.sharding import sharded
-from motionloom.models.training.stage_module import Batch, Execution, StageModule
+from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import end_with_parent
 from motionloom.pipeline.launch.team import environment
@@ -52,6 +57,21 @@ def set_threads(module: nn.Module, hardware: Hardware) -> None:
         torch.set_num_threads(threads)
 
 
+class MixedPrecision(FabricMixedPrecision):
+    """As `lightning.Trainer` has it: batches stay as they are, and every use of a weight has a cast of its
+    own, so that its gradients add up in float32.
+    """
+
+    def forward_context(self) -> AbstractContextManager[object]:
+        return torch.autocast(self.device, dtype=self._desired_input_dtype, cache_enabled=False)
+
+    def convert_input(self, data: object) -> object:
+        return data
+
+    def convert_output(self, data: object) -> object:
+        return data
+
+
 def launch(hardware: Hardware, config: TrainConfig) -> Fabric:
     """Devices, processes and precision."""
     launcher = environment()
@@ -60,11 +80,18 @@ def launch(hardware: Hardware, config: TrainConfig) -> Fabric:
         devices=hardware.resolved_devices(),
         num_nodes=hardware.nodes,
         strategy=_strategy(hardware, config),
-        precision=config.precision,
-        plugins=[launcher] if launcher else None,
+        plugins=[*([launcher] if launcher else []), precision_of(config.precision, hardware)],
     )
     fabric.launch()
     return fabric
+
+
+def precision_of(precision: str, hardware: Hardware) -> Precision:
+    """The arithmetic of a training."""
+    if precision == "32-true":
+        return Precision()
+    device = "cuda" if hardware.resolved_accelerator() == "gpu" else "cpu"
+    return MixedPrecision(cast(Any, precision), device)
 
 
 def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
@@ -90,18 +117,54 @@ def _shard(module: nn.Module, mesh: DeviceMesh) -> nn.Module:
     return module
 
 
-def execution(fabric: Fabric, module: StageModule, config: TrainConfig) -> Execution:
-    """The module on its device, cut or wrapped as the strategy says; groups average gradients themselves."""
-    model: nn.Module = module
-    if isinstance(fabric.strategy, ModelParallelStrategy):
-        model = fabric.strategy.setup_module(module)
-    module.to(fabric.device)
-    if isinstance(fabric.strategy, DDPStrategy) and not isinstance(module, AlternatingModule):
-        model = fabric.strategy.setup_module(module)
-    # bfloat16 has the range of float32, so only float16 comes with a scaler.
-    scaler = getattr(fabric.strategy.precision, "scaler", None)
-    half = None if config.precision == "32-true" else torch.bfloat16 if scaler is None else torch.float16
-    return Execution(fabric, model, half, scaler)
+class Execution:
+    """A module on this process's device, cut or wrapped as the strategy says, with its optimizers.
+
+    `take_step` calls the methods of the module that `lightning.Trainer` calls, in its order.
+    """
+
+    def __init__(self, fabric: Fabric, module: StageModule, config: TrainConfig) -> None:
+        prepare_module(module, config)
+        if config.compile:
+            module.compile_losses()
+        self.fabric, self.module = fabric, module
+        cut = isinstance(fabric.strategy, ModelParallelStrategy)
+        self.model = fabric.setup_module(module, move_to_device=not cut)  # whole, it may not fit there
+        module.to(fabric.device)
+        self.optimizers = [one["optimizer"] for one in module.configure_optimizers()]
+        self.scaler: GradScaler | None = getattr(fabric.strategy.precision, "scaler", None)
+        """The loss scaler of float16, which alone needs one."""
+
+    def take_step(self, parts: Iterable[Batch]) -> Tensor:
+        """One training step on the parts of its batch; the loss of the last part."""
+        module, fabric = self.module, self.fabric
+        automatic, parted = module.automatic_optimization, isinstance(fabric.strategy, DDPStrategy)
+        if automatic:
+            module.schedule.set_step(module.step)
+            self.optimizers[0].zero_grad()
+        loss: Tensor | None = None
+        for number, batch in enumerate(parts):
+            # DDP averages gradients with the last part; groups that take turns average them themselves.
+            more = number < module.accumulate - 1 or not automatic
+            with fabric.no_backward_sync(self.model, enabled=parted and more):
+                with fabric.autocast():
+                    loss = self.model.training_step(batch, number)
+                if automatic and loss is not None:
+                    fabric.backward(loss / module.accumulate)
+        if automatic:
+            self._step(self.optimizers[0])
+        module.step += 1
+        return torch.zeros(()) if loss is None else loss.detach()
+
+    def _step(self, optimizer: Optimizer) -> None:
+        if self.scaler is None:
+            self.module.configure_gradient_clipping(optimizer)
+            optimizer.step()
+            return
+        self.scaler.unscale_(optimizer)
+        self.module.configure_gradient_clipping(optimizer)
+        self.scaler.step(optimizer)  # passes over a step whose gradients overflow
+        self.scaler.update()
 
 
 class TrainingData:
@@ -111,23 +174,28 @@ class TrainingData:
         self, train: BatchSource, validation: EvalSource | None, config: TrainConfig, hardware: Hardware
     ) -> None:
         self.config, self.hardware = config, hardware
-        source = train(config.batch_size // config.accumulate, rank(), world_size())
-        self.train = cast(Dataset[Batch], source)
+        self.train = train(config.batch_size // config.accumulate, rank(), world_size())
         self.validation = validation
         self._held_out: DataLoader[Batch] | None = None
 
     def batches(self, step: int) -> Iterator[Batch]:
         """All micro-batches from those of step `step` (from 0) to the end of the training."""
         parts = self.config.accumulate
-        return iter(_loader(self.train, range(step * parts, self.config.steps * parts), self.hardware))
+        steps = Steps(lambda _, __: self.train, self.config.steps * parts, step * parts)
+        return iter(loader(steps, self.hardware))
 
     def held_out(self) -> DataLoader[Batch]:
         """All validation batches; workers stay from one validation to the next."""
         if self._held_out is None:
             assert self.validation is not None
-            dataset = cast(Dataset[Batch], self.validation())
-            self._held_out = _loader(dataset, range(len(cast(Sized, dataset))), self.hardware)
+            self._held_out = loader(every_batch(self.validation), self.hardware)
         return self._held_out
+
+
+def every_batch(validation: EvalSource) -> Steps[Batch]:
+    """All validation batches, in every process."""
+    batches = validation()
+    return Steps(lambda _, __: batches, len(batches))
 
 
 class _Loader(DataLoader[Batch]):
@@ -139,12 +207,12 @@ class _Loader(DataLoader[Batch]):
             return super().__iter__()
 
 
-def _loader(dataset: Dataset[Batch], numbers: range, hardware: Hardware) -> DataLoader[Batch]:
+def loader(steps: Steps[Batch], hardware: Hardware) -> DataLoader[Batch]:
+    """A loader of batches that are whole already."""
     workers = hardware.workers
     return _Loader(
-        dataset,
+        steps,
         batch_size=None,
-        sampler=numbers,
         num_workers=workers,
         pin_memory=hardware.resolved_accelerator() == "gpu",
         persistent_workers=workers > 0,  # from validation to validation; their start takes seconds

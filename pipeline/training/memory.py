@@ -25,7 +25,7 @@ from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import execution, prepare_module, set_threads
+from motionloom.pipeline.training.execution import Execution, precision_of, prepare_module, set_threads
 
 _BYTES_A_PARAMETER = 16
 """Weight, gradient and two moments in float32."""
@@ -77,15 +77,15 @@ def seconds_a_step(
         return None
     with torch.random.fork_rng():
         module, example, _ = make()
-        prepare_module(module, train)
         set_threads(module, hardware)
-        fabric = Fabric(accelerator=hardware.lightning_accelerator(), devices=1, precision=train.precision)
-        how, batch = execution(fabric, module, train), fabric.to_device(_random(example))
-        optimizers, begin = module.configure_optimizers(), time.perf_counter()
+        precision = precision_of(train.precision, hardware)
+        fabric = Fabric(accelerator=hardware.lightning_accelerator(), devices=1, plugins=[precision])
+        execution, batch = Execution(fabric, module, train), fabric.to_device(_random(example))
+        begin = time.perf_counter()
         times: list[float] = []
         while len(times) < 4 and time.perf_counter() - begin < _TRIED_SECONDS:
             before = time.perf_counter()
-            float(module.take_step([batch] * train.accumulate, optimizers, how))
+            float(execution.take_step([batch] * train.accumulate))
             times.append(time.perf_counter() - before)
     return min(times)
 

@@ -47,13 +47,7 @@ from motionloom.pipeline.training.checkpointing import (
     weights_of,
 )
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.training.execution import (
-    TrainingData,
-    execution,
-    launch,
-    prepare_module,
-    set_threads,
-)
+from motionloom.pipeline.training.execution import Execution, TrainingData, launch, set_threads
 from motionloom.pipeline.training.failures import FailureGuard, StallTimer
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
@@ -124,11 +118,7 @@ class Training:
         # Validations fall on checkpoints, so that a resumed training makes the same ones.
         checkpoints = -(-config.validate_every // self.every)
         self.validate_every = checkpoints * self.every if data.validation is not None else 0
-        prepare_module(module, config)
-        if config.compile:
-            module.compile_losses()
-        self.how = execution(fabric, module, config)
-        self.optimizers = module.configure_optimizers()
+        self.execution = Execution(fabric, module, config)
         self.average = AveragedWeights(module.net, config.ema) if config.ema else None
         title = f"{context.recipe}/{name}"
         self.log = MetricLog(context.folder, hardware.loggers, context.recipe, title)
@@ -198,7 +188,7 @@ class Training:
 
     def _step(self, batches: Iterator[Batch]) -> None:
         self.telemetry.begin_step()
-        loss = self.module.take_step(self._parts(batches), self.optimizers, self.how)
+        loss = self.execution.take_step(self._parts(batches))
         step = self.module.step
         if self.average is not None:
             self.average.update(self.module.net)
@@ -206,7 +196,7 @@ class Training:
         if self.profiler is not None:
             self.profiler.step()
         if self.failures.due(step):
-            self.failures.check(scaled=self.how.scaler is not None)
+            self.failures.check(scaled=self.execution.scaler is not None)
         if step % LOG_EVERY == 0:
             self._log_row()
         self.progress.show(step, loss)
@@ -237,7 +227,7 @@ class Training:
         """Losses on all held-out batches, their means weighted by rows; a signal ends it after a batch."""
         module, loader = self.module, self.data.held_out()
         # Weights that are not finite would make the validation a figure that nobody can read.
-        self.failures.check(scaled=self.how.scaler is not None)
+        self.failures.check(scaled=self.execution.scaler is not None)
         # Frozen parts stay in evaluation: modes are restored part by part.
         modes = [(part, part.training) for part in module.modules()]
         module.eval()
@@ -247,7 +237,7 @@ class Training:
         with self.average.swapped(module.net) if self.average else nullcontext(), torch.no_grad():
             for number, batch in enumerate(loader):
                 batch = self.fabric.to_device(batch)
-                with self.how.autocast():
+                with self.fabric.autocast():
                     values = module.validation_step(batch, number)
                 size = len(batch["length"])
                 rows += size
@@ -279,7 +269,7 @@ class Training:
         step = self.module.step
         if step == self._saved and not again:
             return
-        self.failures.check(scaled=self.how.scaler is not None)  # no checkpoint of a lost network
+        self.failures.check(scaled=self.execution.scaler is not None)  # no checkpoint of a lost network
         with self.telemetry.waits.waiting_for("checkpoints"):
             self._finish_writing()  # at most one copy of the state is in memory
             state = self._state()
@@ -297,13 +287,15 @@ class Training:
             self.log.saved(self._saved)
 
     def _state(self) -> Checkpoint:
-        module = self.module
+        module, execution = self.module, self.execution
         return {
             "global_step": module.step,
             "steps": self.config.steps,
             "state_dict": weights_of(module),
-            "optimizer_states": [optimizer_state(module, optimizer) for optimizer in self.optimizers],
-            "scaler": {} if self.how.scaler is None else self.how.scaler.state_dict(),
+            "optimizer_states": [
+                optimizer_state(module, optimizer) for optimizer in self.execution.optimizers
+            ],
+            "scaler": {} if execution.scaler is None else execution.scaler.state_dict(),
             "average": None if self.average is None else self.average.state_dict(),
             "log": self.log.state_dict(),
             "row": rows_of_ranks(module),
@@ -315,10 +307,10 @@ class Training:
         # Data and random draws need no state: both are functions of the seed and the step.
         module.step = state["global_step"]
         load_weights(module, state["state_dict"])
-        for optimizer, one in zip(self.optimizers, state["optimizer_states"], strict=True):
+        for optimizer, one in zip(self.execution.optimizers, state["optimizer_states"], strict=True):
             load_optimizer(module, optimizer, one)
-        if self.how.scaler is not None and state["scaler"]:
-            self.how.scaler.load_state_dict(state["scaler"])
+        if self.execution.scaler is not None and state["scaler"]:
+            self.execution.scaler.load_state_dict(state["scaler"])
         if self.average is not None and state["average"] is not None:
             self.average.load_state_dict(state["average"])
         self.log.load_state_dict(state["log"])

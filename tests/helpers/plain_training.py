@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
-import torch
-from lightning.fabric import Fabric
+from motionloom.models.training.stage_module import Batch, StageModule
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.execution import Execution, launch
 
-from motionloom.models.training.stage_module import Batch, Execution, StageModule
+Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
 
 
-def take_steps(module: StageModule, batches: Sequence[Batch], half: torch.dtype | None = None) -> None:
+def take_steps(module: StageModule, batches: Sequence[Batch], precision: Precision = "32-true") -> None:
     """One step for every `module.accumulate` batches."""
-    how = Execution(Fabric(accelerator="cpu", devices=1), module, half)
-    optimizers = module.configure_optimizers()
+    config = TrainConfig(accumulate=module.accumulate, precision=precision)
+    execution = Execution(launch(Hardware(accelerator="cpu"), config), module, config)
     for first in range(0, len(batches), module.accumulate):
-        module.take_step(batches[first : first + module.accumulate], optimizers, how)
+        execution.take_step(batches[first : first + module.accumulate])

@@ -23,9 +23,9 @@ PAUSE = "KILL_MATRIX_PAUSE"
 
 def watch_steps() -> None:
     """Have every training step of this process and its forks leave a line in the folder of RECORDS."""
-    from motionloom.models.training.alternating import AlternatingModule
     from motionloom.models.training.distributed import rank
     from motionloom.models.training.stage_module import StageModule
+    from motionloom.pipeline.training.execution import Execution
 
     average = StageModule.average
     figures: dict[str, str] = {}
@@ -35,11 +35,11 @@ def watch_steps() -> None:
         average(self, values)
 
     def wrapped(step: Any) -> Any:
-        def take_step(self: Any, parts: Any, *rest: Any) -> Any:
+        def take_step(self: Any, parts: Any) -> Any:
             figures.clear()
             batches = list(parts)
-            taken, digest = self.step, _digest(batches[0] if len(batches) == 1 else batches)
-            out = step(self, batches, *rest)
+            taken, digest = self.module.step, _digest(batches[0] if len(batches) == 1 else batches)
+            out = step(self, batches)
             time.sleep(float(os.environ.get(PAUSE, 0)))
             start = int(os.environ.get("SLURM_RESTART_COUNT", 0))
             row = {"step": taken, "start": start, "batch": digest}
@@ -49,8 +49,7 @@ def watch_steps() -> None:
         return take_step
 
     StageModule.average = averaged  # type: ignore[method-assign]
-    for module in (StageModule, AlternatingModule):
-        module.take_step = wrapped(module.take_step)  # type: ignore[method-assign]
+    Execution.take_step = wrapped(Execution.take_step)  # type: ignore[method-assign]
 
 
 def _digest(batch: Any) -> str:

@@ -18,13 +18,11 @@ Legend: B batch, T frames, D motion features, C channels.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.optim import Optimizer
 
 from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, cross_entropy, group_counts, predicted
@@ -35,7 +33,7 @@ from motionloom.models.tokenizer.module import tokenizer_losses
 from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.distributed import masked_mean, sum_over_ranks, sum_over_ranks_with_grad
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.training.stage_module import Batch, Execution, StageModule
+from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.baselines.tm2t.network import (
     PAD,
     Captioner,
@@ -237,9 +235,9 @@ class AdversarialTokenizerModule(AlternatingModule):
         self.judged = critic.start == 0
         """Whether the critic plays; no number, by which every step would be compiled anew."""
 
-    def take_step(self, parts: Iterable[Batch], optimizers: list[Optimizer], how: Execution) -> Tensor:
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor | None:
         self.judged = self.step >= self.critic_config.start
-        return super().take_step(parts, optimizers, how)
+        return super().training_step(batch, batch_idx)
 
     def optimizer_groups(self) -> list[OptimizerGroup]:
         """The tokenizer, then the critic of what it has made."""

@@ -18,6 +18,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.training.config import SizedBatches
 from motionloom.pipeline.training.trained_stage import Batches
 
 if TYPE_CHECKING:
@@ -56,7 +57,7 @@ def clip_batches(
         at: dict[str, Any] = {"batch_size": batch, "rank": rank, "world": world}
         return ConditionBatches(dataset, of(dataset), readers, seed=seed, **at, **clips, **draws)
 
-    def validation() -> Dataset[object]:
+    def validation() -> SizedBatches:
         held_out = data.held_out()
         return EvalBatches(held_out, of(held_out), readers, batch_size=32, **clips)
 

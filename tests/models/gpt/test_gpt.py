@@ -210,7 +210,7 @@ def test_frozen_neighbours_cannot_change() -> None:
     assert not tokenizer.training and not tma.training
     assert not any(p.requires_grad for p in [*tokenizer.parameters(), *tma.parameters()])
     assert set(module.state_dict()) == {f"net.{k}" for k in module.net.state_dict()}
-    optimizer = module.configure_optimizers()[0]
+    optimizer = module.configure_optimizers()[0]["optimizer"]
     tuned = {id(p) for group in optimizer.param_groups for p in group["params"]}
     assert tuned == {id(p) for p in module.net.parameters()}
     for _ in range(2):

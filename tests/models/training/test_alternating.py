@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from motionloom.models.training.alternating import OptimizerGroup
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.training import execution
-from motionloom.pipeline.training import trainer as training
 
 STEPS = 24
 
@@ -139,7 +138,7 @@ def test_with_a_gradient_scaler(parts: int, tmp_path: Path, monkeypatch: pytest.
         return build(**{**arguments, "precision": None, "plugins": [scaling]})
 
     monkeypatch.setattr(execution, "Fabric", fabric)
-    monkeypatch.setattr(training, "prepare_module", without_fused)
+    monkeypatch.setattr(execution, "prepare_module", without_fused)
     other = train(tmp_path / "scaled", accumulate=parts)
     assert scaling.scaler.updates == STEPS and scaling.scaler.get_scale() > 1024
     for name, value in plain.state_dict().items():

@@ -53,7 +53,7 @@ def train(case: str) -> dict[str, Any]:
     torch.manual_seed(0)
     module, batches = CASES[case]()
     module.net.double()
-    optimizer = module.configure_optimizers()[0]
+    optimizer = module.configure_optimizers()[0]["optimizer"]
     if case.endswith("compiled"):
         torch.compiler.reset()  # graphs of other tests in this process count too
         module.losses = torch.compile(module.losses, fullgraph=True, backend="eager")  # type: ignore[method-assign]

@@ -46,7 +46,7 @@ def train(case: str, half: torch.dtype | None) -> tuple[StageModule, list[dict[s
     """
     module, batch = build(case)
     module.fused = half != torch.float16
-    optimizer = module.configure_optimizers()[0]
+    optimizer = module.configure_optimizers()[0]["optimizer"]
     scale = 1024.0 if half == torch.float16 else 1.0
     found = []
     for step in range(STEPS):

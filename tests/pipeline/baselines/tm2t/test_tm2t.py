@@ -139,7 +139,7 @@ def test_it_learns_to_say_what_the_tokens_are() -> None:
     module = CaptionerModule(
         net, OptimConfig(lr=1e-2, grad_clip=0.5), seed=0, max_steps=120, loss=CaptionLossConfig()
     )
-    (optimizer,) = module.configure_optimizers()
+    optimizer = module.configure_optimizers()[0]["optimizer"]
 
     def drawn(count: int) -> tuple[dict[str, Tensor], Tensor]:
         hand = torch.randint(5, (count, 1)).expand(-1, 3)
@@ -235,7 +235,7 @@ def test_words_to_tokens_are_learnt() -> None:
     net = Seq2Seq(GRU, STREAMS, PATTERN, 5)
     loss = Seq2SeqLossConfig(inverse_weight=0, forced=(0.9, 0.1))
     module = Seq2SeqModule(net, OptimConfig(lr=2e-2), seed=0, max_steps=100, loss=loss)
-    (optimizer,) = module.configure_optimizers()
+    optimizer = module.configure_optimizers()[0]["optimizer"]
     for _ in range(100):
         hand = torch.randint(5, (32, 1))
         codes = {"body": torch.full((32, 4), 2), "hand": hand.expand(-1, 2)}
