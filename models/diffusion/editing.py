@@ -28,7 +28,7 @@ from motionloom.models.diffusion.network import InBetweener, TextDenoiser
 from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, turned_back
 from motionloom.models.diffusion.sampling import blend_weights, window_starts
 from motionloom.models.diffusion.schedule import Sampler
-from motionloom.models.gpt.frozen import evaluating
+from motionloom.models.layers.frozen import evaluating
 
 HEADING_METRES = 0.5
 """Metres that a radian of heading counts as: how far it moves a hand [ours]."""

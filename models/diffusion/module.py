@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.diffusion.network import InBetweener, TextDenoiser
 from motionloom.models.diffusion.observed import Observations
-from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.layers.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.distributed import masked_mean, mean_of_rows

@@ -22,8 +22,8 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.schedule import Sampler, by_length
-from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.tokens import Codes
+from motionloom.models.layers.frozen import evaluating
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import GptLossConfig, accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample
+from motionloom.models.layers.frozen import Frozen
 from motionloom.models.tma.losses import info_nce
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer

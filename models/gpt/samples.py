@@ -17,11 +17,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.losses import predicted
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
 from motionloom.models.gpt.tokens import PAD, Codes, TokenSequence, interleave
+from motionloom.models.layers.frozen import evaluating
 from motionloom.models.tma.losses import false_negatives
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import Tokenizer

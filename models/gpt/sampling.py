@@ -21,9 +21,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
+from motionloom.models.layers.frozen import evaluating
 
 
 @dataclass(frozen=True)

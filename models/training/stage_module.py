@@ -12,9 +12,11 @@ Codebooks draw by themselves, the same on every rank (`quantize/base.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import partial
-from typing import Any, NamedTuple, TypedDict
+from importlib import import_module
+from pathlib import Path
+from typing import IO, Any, NamedTuple, Self, TypedDict
 
 import lightning as L
 import torch
@@ -24,6 +26,7 @@ from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from motionloom.models.layers.frozen import Frozen
 from motionloom.models.training.distributed import alone, rank
 from motionloom.models.training.optim import OptimConfig as OptimConfig
 
@@ -55,13 +58,9 @@ class StepFigures(NamedTuple):
 class StepSchedule(LambdaLR):
     """The learning rate of a step as a factor of the first one, which depends on the step alone."""
 
-    def __init__(self, optimizer: Optimizer, factor: Callable[[int], float]) -> None:
-        super().__init__(optimizer, factor)
-        self.factor = factor
-
     def set_step(self, step: int) -> float:
         """Set and return the rate of a step, whichever step came before."""
-        self.last_epoch, factor = step, self.factor(step)
+        self.last_epoch, factor = step, self.lr_lambdas[0](step)
         for group, first in zip(self.optimizer.param_groups, self.base_lrs, strict=True):
             group["lr"] = first * factor
         self._last_lr = [group["lr"] for group in self.optimizer.param_groups]
@@ -105,6 +104,44 @@ class StageModule(L.LightningModule, ABC):
         if self.automatic_optimization:
             self.accumulate = self.trainer.accumulate_grad_batches
         self.fused = self.trainer.precision != "16-mixed"
+
+    def on_fit_start(self) -> None:
+        """Have frozen networks follow this one to the Trainer's device."""
+        for value in vars(self).values():
+            if isinstance(value, Frozen):
+                value.module.to(self.device)
+
+    @classmethod
+    def load_from_checkpoint(
+        cls,
+        checkpoint_path: str | Path | IO[bytes],
+        map_location: Any = None,
+        hparams_file: str | Path | None = None,
+        strict: bool | None = None,
+        weights_only: bool | None = None,
+        **arguments: Any,
+    ) -> Self:
+        """Return a module with a checkpoint's weights, of a run's own training or of a Trainer's.
+
+        Its hyper-parameters name the kind of stage, the config and the folders of the stages that fed it.
+        Those may lie elsewhere by now: `inputs={"data": "runs/other/stages/data"}`. With `net` and `optim`
+        among the arguments the module is built from these alone, as a module built by hand must be.
+
+        Raises:
+            UserError: An input is not there, or the checkpoint has no hyper-parameters.
+        """
+        if "net" in arguments:
+            return super().load_from_checkpoint(
+                checkpoint_path, map_location, hparams_file, strict, weights_only, **arguments
+            )
+        # Kinds of stages stand on the floor above, which only this needs.
+        rebuild = import_module("motionloom.pipeline.training.lightning_data").rebuild
+        content = torch.load(checkpoint_path, map_location or "cpu", weights_only=True)
+        module = rebuild(content, checkpoint_path, arguments.get("inputs", {}))
+        if not isinstance(module, cls):
+            raise TypeError(f"{checkpoint_path} is of a {type(module).__name__}, no {cls.__name__}")
+        module.load_state_dict(content["state_dict"], strict=strict is not False)
+        return module
 
     @abstractmethod
     def losses(self, batch: Batch) -> dict[str, Tensor]:
@@ -165,7 +202,7 @@ class StageModule(L.LightningModule, ABC):
         if self._trainer is None:
             self.average(values)
         else:
-            self.log_dict({f"train/{k}": v for k, v in values.items()}, batch_size=len(batch["length"]))
+            self.log_dict({f"train/{k}": v for k, v in values.items()}, batch_size=_rows(batch))
 
     def average(self, values: dict[str, Tensor]) -> None:
         """Add figures of a step, or of a part of one, to the means of the next row."""
@@ -203,7 +240,7 @@ class StageModule(L.LightningModule, ABC):
             values = self.losses(batch)
         if self._trainer is not None:
             figures = {f"val/{k}": v for k, v in values.items()}
-            self.log_dict(figures, batch_size=len(batch["length"]), sync_dist=True)
+            self.log_dict(figures, batch_size=_rows(batch), sync_dist=True)
         return values
 
     def clip(self, params: list[nn.Parameter], largest: float) -> Tensor | None:
@@ -217,3 +254,7 @@ class StageModule(L.LightningModule, ABC):
         if largest:
             torch.nn.utils.clip_grads_with_norm_(params, largest, norm)
         return whole if self.ends_row else None
+
+
+def _rows(batch: Batch) -> int:
+    return next(len(value) for value in batch.values() if isinstance(value, Tensor))

@@ -22,9 +22,9 @@ from motionloom.models.discriminator.patch import (
     discriminator_loss,
     generator_loss,
 )
-from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.tokens import TokenSequence, interleave
+from motionloom.models.layers.frozen import Frozen
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.optim import OptimConfig

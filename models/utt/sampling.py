@@ -22,9 +22,9 @@ from torch.nn.functional import pad
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.sampling import Drawing, decode, requested_groups, seeds_of, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, as_codes
+from motionloom.models.layers.frozen import evaluating
 from motionloom.models.utt.backbone import State
 from motionloom.models.utt.network import Utt
 

@@ -45,7 +45,11 @@ OptimizerState = dict[str, Any]
 """As `Optimizer.state_dict` gives it."""
 
 
-class Checkpoint(TypedDict):
+_Lightning = TypedDict("_Lightning", {"pytorch-lightning_version": str, "epoch": int})
+"""Keys by which Lightning takes the file for one of its own."""
+
+
+class Checkpoint(_Lightning):
     """Everything a training needs to continue after a step."""
 
     global_step: int
@@ -58,6 +62,8 @@ class Checkpoint(TypedDict):
     log: LogState
     row: list[list[Means]]
     """Means of the log's next row so far, of each rank."""
+    hyper_parameters: dict[str, Any]
+    """What rebuilds the module (`trained_stage.hyper_parameters`), for `StageModule.load_from_checkpoint`."""
     validate: bool
     """Whether a signal cut the validation of this step short: the resumed training begins with it."""
 

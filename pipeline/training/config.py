@@ -69,6 +69,10 @@ class TrainConfig(Config):
     validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
     """Steps between validations, rounded up to checkpoints; 0 turns them off."""
 
+    def seed_of(self, recipe: int) -> int:
+        """Return the seed of the training in a recipe of seed `recipe`."""
+        return recipe if self.seed is None else self.seed
+
     def local_batch(self, world: int) -> int:
         """Items a process reads at once; the global batch must divide evenly."""
         parts = world * self.accumulate

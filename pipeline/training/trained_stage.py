@@ -7,8 +7,9 @@ made, a dry run with previews of it, and loading with the facts that were writte
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from os.path import relpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
 
@@ -140,15 +141,20 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
             return config
         return config.model_copy(update={"published": Path(config.published.name)})
 
+    def build(self, config: C, inputs: I, seed: int) -> tuple[N, ModelFacts]:
+        """Return the untrained network, with what it takes over from other stages, and its facts."""
+        facts = self.facts(config, inputs)
+        torch.manual_seed(seed)
+        net = self.network(facts, inputs)
+        self.prepare(config, net, inputs)
+        return net, facts
+
     def run(self, context: StageContext) -> None:
         from motionloom.pipeline.training.trainer import fit
 
         config, inputs = context.config, self.inputs.of(context.given)
-        facts = self.facts(config, inputs)
-        seed = context.seed if config.train.seed is None else config.train.seed
-        torch.manual_seed(seed)
-        net = self.network(facts, inputs)
-        self.prepare(config, net, inputs)
+        seed = config.train.seed_of(context.seed)
+        net, facts = self.build(config, inputs, seed)
         log = _printer(context)
         if config.published is not None:
             if rank() == 0:
@@ -157,6 +163,8 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
                 save_model(context.folder, net, facts)
             return
         module = self.module(config, net, inputs, seed)
+        folders = {role: relpath(stage.folder, context.folder) for role, stage in context.inputs.items()}
+        module.save_hyperparameters(hyper_parameters(self.name, config, seed, folders))
         batches = self.batches(config, net, inputs, seed, log)
         part, whole = trained_share(net)
         if part < whole:
@@ -212,6 +220,13 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         inputs = self.inputs.of(given)
         net = self.network(self.facts(config, inputs), inputs)
         return self.dry_module(config, net, inputs), *self.example(config, net, inputs, size)
+
+
+def hyper_parameters(
+    kind: str, config: TrainedStageConfig, seed: int, inputs: Mapping[str, str]
+) -> dict[str, object]:
+    """Return what rebuilds a stage's module, as plain values; `inputs` are the folders of stages by role."""
+    return {"kind": kind, "config": config.dump(), "seed": seed, "inputs": dict(inputs)}
 
 
 def _frozen(net: N) -> N:

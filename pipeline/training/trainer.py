@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import lightning as L
 import torch
 import torch.distributed as dist
 from lightning.fabric import Fabric
@@ -299,7 +300,10 @@ class Training:
             "average": None if self.average is None else self.average.state_dict(),
             "log": self.log.state_dict(),
             "row": rows_of_ranks(module),
+            "hyper_parameters": dict(module.hparams),
             "validate": self.validation_is_due,
+            "pytorch-lightning_version": L.__version__,
+            "epoch": 0,
         }
 
     def _load(self, state: Checkpoint, *, longer: bool) -> None:

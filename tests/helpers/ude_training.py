@@ -25,7 +25,7 @@ from motionloom.models.condition.mate import MateConfig
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import DmdModule
 from motionloom.models.discriminator.patch import UttLossConfig
-from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.layers.frozen import Frozen
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.tokenizer.single import MqConfig
 from motionloom.models.training.distributed import rank, world_size

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from motionloom.models.gpt.frozen import Frozen, evaluating
+from motionloom.models.layers.frozen import Frozen, evaluating
 from motionloom.models.metrics.dance_beats import motion_beats
 from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.distributed import masked_mean
@@ -199,7 +199,7 @@ class ActorCriticModule(AlternatingModule):
 
     def rewards(self, codes: Tensor, beats: Tensor) -> Tensor:
         """[B, L] of codes [B, L, 2] and frames with a beat of the music [B, T]."""
-        joints = self.vq.module.decode(codes).cpu().numpy()
+        joints = self.vq.module.decode(codes).float().cpu().numpy()
         rows = [
             beat_rewards(one, heard, self.fps, self.vq.module.config.code_frames, self.config.scale)
             for one, heard in zip(joints, beats.cpu().numpy(), strict=True)

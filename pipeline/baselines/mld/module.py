@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from motionloom.models.diffusion.module import DenoiserModule
-from motionloom.models.gpt.frozen import Frozen
+from motionloom.models.layers.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tma.losses import kl_divergence, reconstruction_loss
 from motionloom.models.training.joints_module import JointsModule

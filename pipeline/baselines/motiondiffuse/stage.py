@@ -11,7 +11,7 @@ from torch import Tensor
 
 from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig, by_length
-from motionloom.models.gpt.frozen import evaluating
+from motionloom.models.layers.frozen import evaluating
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.motiondiffuse.network import MotionDiffuse, MotionDiffuseConfig
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator

@@ -24,8 +24,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.gpt.frozen import Frozen
 from motionloom.models.gpt.losses import accuracy, cross_entropy, group_counts, predicted
+from motionloom.models.layers.frozen import Frozen
 from motionloom.models.layers.strided import SLOPE
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import Tokenizer

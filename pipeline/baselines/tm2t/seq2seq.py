@@ -18,9 +18,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.models.gpt.frozen import evaluating
 from motionloom.models.gpt.sampling import Drawing, decode, requested_groups, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes, closing_length
+from motionloom.models.layers.frozen import evaluating
 from motionloom.models.tokenizer.base import Stream
 
 

@@ -24,7 +24,7 @@ from motionloom.pipeline.stages.networks.clips import clip_batches, motion_examp
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import ModelFacts, load_facts
-from motionloom.pipeline.training.config import SizedBatches, TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 

@@ -32,7 +32,7 @@ from motionloom.pipeline.store.run_folder import is_place
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import GptClips, gpt_clips
 from motionloom.pipeline.store.weights import ModelFacts
-from motionloom.pipeline.training.config import SizedBatches, TrainConfig, TrainedStageConfig
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 from motionloom.pipeline.training.warm_start import START, require_start_layout, same_encoder, starts_from
 

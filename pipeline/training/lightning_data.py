@@ -1,0 +1,86 @@
+"""A stage's module and batches for `lightning.Trainer`, and modules from the checkpoints of either loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+from torch.utils.data import DataLoader
+
+from motionloom.datasets.loading.steps import Steps
+from motionloom.datasets.schema import UserError
+from motionloom.models.training.stage_module import Batch, StageModule
+from motionloom.pipeline.contract.lookup import outside_stage
+from motionloom.pipeline.contract.stage import CompletedStage, StageCache, stage_kind
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.execution import every_batch, loader, prepare_module
+from motionloom.pipeline.training.trained_stage import Batches, TrainedStage, hyper_parameters
+
+
+class StageData(L.LightningDataModule):
+    """The batches of a stage's training, each rank's own, and those of its validation.
+
+    Step k reads the same global batch as in the pipeline's own loop, on any number of processes; a Trainer
+    that resumes goes on behind the last step. `train.batch_size` is the global batch.
+    """
+
+    def __init__(self, batches: Batches, train: TrainConfig, hardware: Hardware | None = None) -> None:
+        super().__init__()
+        self.batches, self.config, self.hardware = batches, train, hardware or Hardware()
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        trainer = self.trainer
+        module, done = (None, 0) if trainer is None else (trainer.lightning_module, trainer.global_step)
+        parts = module.accumulate if isinstance(module, StageModule) else self.config.accumulate
+        steps = self.config.steps if trainer is None or trainer.max_steps < 0 else trainer.max_steps
+        size = self.config.batch_size // parts
+        batches = self.batches.train
+        return loader(
+            Steps(lambda rank, world: batches(size, rank, world), steps * parts, done * parts), self.hardware
+        )
+
+    def val_dataloader(self) -> DataLoader[Batch] | list[DataLoader[Batch]]:
+        validation = self.batches.validation
+        return [] if validation is None else loader(every_batch(validation), self.hardware)
+
+
+def open_training(
+    kind: TrainedStage[Any, Any, Any],
+    config: Any,
+    given: Mapping[str, CompletedStage],
+    seed: int,
+    hardware: Hardware | None = None,
+) -> tuple[StageModule, StageData]:
+    """Return the module and the batches of a stage's training, untrained; `given` are its inputs by role."""
+    inputs = kind.inputs.of(StageCache().given(given))
+    net, _ = kind.build(config, inputs, seed)
+    module = kind.module(config, net, inputs, seed)
+    prepare_module(module, config.train)
+    folders = {role: str(stage.folder.resolve()) for role, stage in given.items()}
+    module.save_hyperparameters(hyper_parameters(kind.name, config, seed, folders))
+    return module, StageData(kind.batches(config, net, inputs, seed, lambda _: None), config.train, hardware)
+
+
+def rebuild(content: object, path: object, inputs: Mapping[str, str | Path]) -> StageModule:
+    """Return the module that a checkpoint's hyper-parameters describe, with its first weights."""
+    hyper = content.get("hyper_parameters") if isinstance(content, dict) else None
+    if not isinstance(hyper, dict) or not {"kind", "config", "seed", "inputs"} <= hyper.keys():
+        raise UserError(f"{path}: no hyper-parameters of a stage; build the module and give net= and optim=")
+    kind = stage_kind(str(hyper["kind"]), str(path))
+    if not isinstance(kind, TrainedStage):
+        raise UserError(f"{path}: stages of kind {kind.name} train no network")
+    config = kind.config.parse(dict(hyper["config"]), f"{path}: config")
+    # Of a run's own checkpoint, RUN/stages/NAME/checkpoints/FILE, folders are given as seen from the stage.
+    stage = Path(str(path)).absolute().parent.parent
+    given: dict[str, CompletedStage] = {}
+    for role, place in {**hyper["inputs"], **inputs}.items():
+        found = outside_stage(stage / str(place))
+        if found is None:
+            raise UserError(
+                f'{path}: input {place} is no finished stage; give inputs={{"{role}": its folder}}'
+            )
+        given[role] = found
+    return open_training(kind, config, given, int(hyper["seed"]))[0]

@@ -1,0 +1,152 @@
+"""`lightning.Trainer` and the pipeline's own loop train every kind of module to the same bits."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import pytest
+import torch
+import ude_training
+from lightning.pytorch.callbacks import LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.plugins import MixedPrecision
+from plain_training import take_steps
+from rank_cases import CASES
+from tiny_adversaries import Duel, Vectors
+from torch.utils.data import DataLoader, Dataset
+from two_ranks import run_two_ranks
+
+from motionloom.models.training.stage_module import StageModule
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.lightning_data import StageData
+from motionloom.pipeline.training.trained_stage import Batches
+
+STEPS = 6
+Opened = tuple[StageModule, Callable[[int], dict[str, Any]]]
+
+
+class Numbered(Dataset[Any]):
+    """Batches by number, of one process."""
+
+    def __init__(self, batch: Callable[[int], dict[str, Any]], count: int) -> None:
+        self.batch, self.count = batch, count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, k: int) -> dict[str, Any]:
+        return self.batch(k)
+
+
+def opened(name: str) -> Opened:
+    """A module on small networks with made-up batches."""
+    torch.manual_seed(0)
+    if name in CASES and name not in ude_training.NAMES:
+        module, batches = CASES[name]()
+        module.net.double()
+        return module, batches
+    if name == "duel":
+        return Duel(seed=3, max_steps=STEPS), Vectors(8).__getitem__
+    clips = ude_training.Clips(8, dtype=torch.float32, dies_at=None)
+    return ude_training.module_of(name, STEPS, dropout=0.1), clips.__getitem__
+
+
+def trainer(folder: Path, **settings: Any) -> L.Trainer:
+    """One that prints and logs nothing."""
+    quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    given = {"max_steps": STEPS, "accelerator": "cpu", "default_root_dir": folder, **quiet, **settings}
+    return L.Trainer(**{"enable_checkpointing": False, **given})
+
+
+def assert_equal(module: StageModule, other: StageModule) -> None:
+    """The same bits in every weight, statistic and codebook, also of networks that are not saved."""
+    ours, theirs = module.state_dict(), other.state_dict()
+    assert ours.keys() == theirs.keys()
+    for name, value in ours.items():
+        assert torch.equal(value, theirs[name]), name
+
+
+NAMES = dict.fromkeys((*CASES, *ude_training.NAMES, "duel"))
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize("name", NAMES)
+def test_a_trainer_equals_the_own_loop(name: str, parts: int, tmp_path: Path) -> None:
+    (own, batch), (module, same) = opened(name), opened(name)
+    own.accumulate = module.accumulate = parts
+    take_steps(own, [batch(k) for k in range(STEPS * parts)])
+    data = DataLoader(Numbered(same, STEPS * parts), batch_size=None)
+    settings = {"accumulate_grad_batches": parts} if module.automatic_optimization else {}
+    trainer(tmp_path, **settings).fit(module, data)
+    assert own.step == module.step == STEPS
+    assert_equal(own, module)
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])
+@pytest.mark.parametrize("name", ["mq", "utt", "actor_critic", "duel"])
+def test_in_half_precision(
+    name: str, precision: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (own, batch), (module, same) = opened(name), opened(name)
+    take_steps(own, [batch(k) for k in range(STEPS)], precision)
+    # A Trainer takes bfloat16 for "16-mixed" on a CPU, unless it is given the arithmetic.
+    scaler = torch.amp.GradScaler("cpu") if precision == "16-mixed" else None
+    mixed = MixedPrecision(precision, "cpu", scaler)
+    trainer(tmp_path, plugins=[mixed]).fit(module, DataLoader(Numbered(same, STEPS), batch_size=None))
+    assert_equal(own, module)
+
+
+def stage_data(name: str, parts: int = 1) -> StageData:
+    """As a stage gives it."""
+    clips: Any = Vectors if name == "duel" else ude_training.Clips
+    batches = Batches(
+        lambda batch, rank, world: clips(batch, rank, world, dtype=torch.float32, dies_at=None),
+        lambda: clips(8, size=2, dtype=torch.float32, dies_at=None),
+    )
+    return StageData(batches, TrainConfig(steps=STEPS, batch_size=8, accumulate=parts))
+
+
+@pytest.mark.parametrize("name", ["mq", "utt", "actor_critic", "duel"])
+def test_resumes_from_its_checkpoint_and_monitors(name: str, tmp_path: Path) -> None:
+    whole, module, resumed = (opened(name)[0] for _ in range(3))
+    trainer(tmp_path).fit(whole, stage_data(name))
+    keep = ModelCheckpoint(tmp_path, filename="best", monitor="val/loss", every_n_train_steps=3)
+    watch = {
+        "callbacks": [keep, LearningRateMonitor()],
+        "logger": CSVLogger(tmp_path),
+        "log_every_n_steps": 1,
+    }
+    first = trainer(tmp_path, max_steps=3, enable_checkpointing=True, val_check_interval=3, **watch)
+    first.fit(module, stage_data(name))
+    assert keep.best_model_path == str(tmp_path / "best.ckpt")
+    assert first.callback_metrics["val/loss"].isfinite() and first.callback_metrics["train/loss"].isfinite()
+    rates = (tmp_path / "lightning_logs/version_0/metrics.csv").read_text().splitlines()[0].split(",")
+    assert any(name.startswith("lr-") for name in rates)
+    trainer(tmp_path).fit(resumed, stage_data(name), ckpt_path=keep.best_model_path)
+    assert_equal(whole, resumed)
+
+
+def worker(name: str, folder: Path) -> None:
+    torch.set_num_threads(1)
+    own = ude_training.train(name, folder / "own", devices=2, dropout=0.1, steps=STEPS, validate_every=0)
+    module = ude_training.module_of(name, STEPS, dropout=0.1)
+    trainer(folder, devices=2, strategy="ddp", use_distributed_sampler=True).fit(module, stage_data(name))
+    assert_equal(own, module)
+    (folder / f"{name}{os.environ['RANK']}").touch()
+    os._exit(0)  # without destructors: those of DDP and gloo can wait for each other
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ude_training.NAMES)
+def test_two_processes_equal_the_own_loop_on_two(name: str, tmp_path: Path) -> None:
+    run_two_ranks(__file__, name, tmp_path)
+    assert {path.name for path in tmp_path.glob(f"{name}?")} == {f"{name}0", f"{name}1"}
+
+
+if __name__ == "__main__":
+    worker(sys.argv[1], Path(sys.argv[2]))
