@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.loading.statistics import FeatureStats
@@ -32,6 +31,7 @@ from motionloom.pipeline.contract.stage import (
 from motionloom.pipeline.contract.units import Arrays
 from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore
+from motionloom.pipeline.training.config import SizedBatches
 from motionloom.pipeline.training.trained_stage import Batches
 
 
@@ -184,7 +184,7 @@ def token_batches(
     held_out: str,
     seed: int,
     tables: Callable[[GptClips], dict[str, Any]],
-    wrap: Callable[[GptClips, TokenBatches], Dataset[Any]] = lambda _, batches: batches,
+    wrap: Callable[[GptClips, TokenBatches], SizedBatches] = lambda _, batches: batches,
 ) -> Batches:
     """Batches of the tokens of captioned clips.
 
@@ -195,7 +195,7 @@ def token_batches(
         wrap: Makes other batches of these.
     """
 
-    def batches(split: str, training: bool, batch: int, rank: int = 0, world: int = 1) -> Dataset[Any]:
+    def batches(split: str, training: bool, batch: int, rank: int = 0, world: int = 1) -> SizedBatches:
         clips = clips_of(split)
         found = TokenBatches(
             clips.store, clips.captions, pattern=net.pattern, ends=net.num_codes, max_groups=net.max_groups,
