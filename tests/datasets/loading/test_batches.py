@@ -17,6 +17,7 @@ from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import frame_span
 from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.datasets.loading.steps import Steps
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.reader import ShardDataset
@@ -93,7 +94,9 @@ def test_loader_workers_change_nothing_and_a_run_resumes_anywhere(
     batches = WindowBatches(train, stats, window=16, batch_size=8, seed=1)
     want = [batches[k]["motion"] for k in range(6)]
     for workers, start in ((0, 0), (0, 3), (2, 2)):
-        loader = DataLoader(batches, batch_size=None, sampler=range(start, 6), num_workers=workers)
+        steps = Steps(lambda rank, world: batches, 6, start)
+        context = "spawn" if workers else None
+        loader = DataLoader(steps, batch_size=None, num_workers=workers, multiprocessing_context=context)
         got = [batch["motion"] for batch in loader]
         assert len(got) == 6 - start
         for one, other in zip(got, want[start:], strict=True):
