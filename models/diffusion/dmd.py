@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from motionloom.models.diffusion.network import step_waves
 from motionloom.models.diffusion.schedule import ScheduleConfig
-from motionloom.models.gpt.tokens import stream_names
+from motionloom.models.gpt.tokens import slot_codes, stream_names
 from motionloom.models.layers.transformer import StackConfig, Transformer, length_mask, sinusoid
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
 
@@ -106,15 +106,12 @@ class Dmd(nn.Module):
             groups: int64 [B], groups that count; the others are padding.
             hidden: Bool [B, G], groups whose tokens are read as zero.
         """
-        slots = []
-        for index, name in enumerate(self.pattern):
-            per = self.pattern.count(name)
-            here = codes[name].reshape(len(groups), codes[name].shape[1] // per, per)
-            vectors = self.embeddings[name](here[:, :, self.pattern[:index].count(name)])
-            if hidden is not None:
-                vectors = vectors.masked_fill(hidden[..., None], 0.0)
-            slots.append(vectors)
-        x = torch.stack(slots, dim=2) + self.slot
+        by_slot = slot_codes(codes, self.pattern).unbind(2)
+        vectors = [self.embeddings[name](one) for name, one in zip(self.pattern, by_slot, strict=True)]
+        x = torch.stack(vectors, dim=2)
+        if hidden is not None:
+            x = x.masked_fill(hidden[..., None, None], 0.0)
+        x = x + self.slot
         x = x + sinusoid(x.shape[1], x.shape[3], x.device)[:, None].to(x.dtype)
         mask = length_mask(groups, x.shape[1]).repeat_interleave(len(self.pattern), dim=1)
         batch, count = x.shape[:2]

@@ -26,7 +26,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.tokens import TokenNetwork, closing_length
+from motionloom.models.gpt.tokens import TokenNetwork
 from motionloom.models.layers.transformer import KVCache, StackConfig, Transformer
 from motionloom.models.tokenizer.base import Stream
 
@@ -64,12 +64,8 @@ class InterleavedGPT(TokenNetwork):
         super().__init__(streams, pattern)
         self.config = config
         self.text_dim = text_dim
-        needed = 1 + len(self.pattern) + len(self.names)
-        if config.block_size < needed:
-            raise UserError(
-                f"block_size {config.block_size} holds no motion: the text, {len(self.pattern)} tokens and "
-                f"{len(self.names)} End tokens take {needed}"
-            )
+        self.max_groups = self._groups_within(config.block_size - 1, "block_size")
+        """Longest sequence in groups; its End tokens and the text fit in beside it."""
         self.text_in = nn.Linear(text_dim, config.dim)
         self.null_text = nn.Parameter(torch.randn(config.dim) * 0.02)
         self.positions = nn.Parameter(torch.randn(config.block_size, config.dim) * 0.02)
@@ -78,11 +74,6 @@ class InterleavedGPT(TokenNetwork):
         self.stack = Transformer(config, config.layers, attention_dropout=config.attention_dropout)
         self.heads = self._outputs(config.dim)
         self._start_tables()
-
-    @property
-    def max_groups(self) -> int:
-        """Longest sequence in groups, its End tokens included."""
-        return (self.config.block_size - 1 - closing_length(self.pattern)) // len(self.pattern)
 
     def forward(
         self,

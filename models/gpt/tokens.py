@@ -71,6 +71,27 @@ def closing_length(pattern: Sequence[str]) -> int:
     return len(stream_names(pattern))
 
 
+def slot_codes(codes: Mapping[str, Tensor], pattern: Sequence[str]) -> Tensor:
+    """Return the codes of every slot, int64 [B, G, P], of streams [B, G * per_group].
+
+    Raises:
+        ValueError: Streams disagree about the number of groups.
+    """
+    # A stream with two tokens in a group fills two slots of the pattern, in turn.
+    per_group = {name: list(pattern).count(name) for name in pattern}
+    count = codes[pattern[0]].shape[1] // per_group[pattern[0]]
+    groups: dict[str, Tensor] = {}
+    for name, per in per_group.items():
+        if codes[name].shape[1] != count * per:
+            raise ValueError(
+                f"stream '{name}' holds {codes[name].shape[1]} codes, "
+                f"not {count * per}: {count} groups of {per}"
+            )
+        groups[name] = codes[name].reshape(len(codes[name]), count, per)
+    nth = [list(pattern[:slot]).count(name) for slot, name in enumerate(pattern)]
+    return torch.stack([groups[name][:, :, k] for name, k in zip(pattern, nth, strict=True)], dim=2)
+
+
 def interleave(
     codes: Mapping[str, Tensor],
     pattern: Sequence[str],
@@ -88,30 +109,12 @@ def interleave(
             cropped.
         groups: Valid groups per clip, [B] (default: all G). Codes after them are ignored.
         closed: Bool [B], rows that get their End tokens (default: all); the others are clips that go on.
-
-    Raises:
-        ValueError: Streams disagree about the number of groups.
     """
-    names = stream_names(pattern)
-    # A stream with two tokens in a group fills two slots of the pattern, in turn.
-    kinds_row = kind_of_slot(pattern)
-    count = codes[names[0]].shape[1] // kinds_row.count(0)
-    slots: list[Tensor] = []
-    seen = dict.fromkeys(names, 0)
-    for name in pattern:
-        per_group = list(pattern).count(name)
-        if codes[name].shape[1] != count * per_group:
-            raise ValueError(
-                f"stream '{name}' holds {codes[name].shape[1]} codes; {count} groups of {per_group} are "
-                f"{count * per_group}"
-            )
-        slots.append(codes[name].view(-1, count, per_group)[:, :, seen[name]])
-        seen[name] += 1
-    body = torch.stack(slots, dim=2).flatten(1)
-    device, batch = body.device, body.shape[0]
+    names, slots = stream_names(pattern), slot_codes(codes, pattern)
+    (batch, count), device, body = slots.shape[:2], slots.device, slots.flatten(1)
     if groups is None:
         groups = torch.full((batch,), count, dtype=torch.int64, device=device)
-    kinds = torch.tensor(kinds_row, device=device).repeat(count).expand(batch, -1)
+    kinds = torch.tensor(kind_of_slot(pattern), device=device).repeat(count).expand(batch, -1)
     length = groups * len(pattern)
     # Padding lies behind each row's own tokens, not at the end of each stream.
     valid = torch.arange(body.shape[1], device=device)[None] < length[:, None]
@@ -181,6 +184,17 @@ class TokenNetwork(nn.Module):
         self.vocabulary = max(self.num_codes.values()) + 1
         self.register_buffer("slots", torch.tensor(kind_of_slot(pattern)), persistent=False)
         self.register_buffer("ends", torch.tensor(list(self.num_codes.values())), persistent=False)
+
+    def _groups_within(self, size: int, setting: str) -> int:
+        """Return the groups of the longest closed sequence of `size` tokens; `UserError` if none."""
+        groups = (size - closing_length(self.pattern)) // len(self.pattern)
+        if groups < 1:
+            needed = len(self.pattern) + closing_length(self.pattern)
+            raise UserError(
+                f"net.{setting} holds no motion: a group and its End tokens are {needed} tokens, "
+                f"and there is room for {size}; raise it"
+            )
+        return groups
 
     def _tables(self, dim: int) -> nn.ModuleList:
         """One embedding of codes and End a stream."""

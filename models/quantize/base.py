@@ -8,14 +8,17 @@ same rows as many that see its parts.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
+from torch.nn import functional
 
 from motionloom.datasets.schema import Config
-from motionloom.models.training.distributed import gather_rows, rank, sum_over_ranks
+from motionloom.models.training.distributed import gather_rows, rank, sum_over_ranks, world_size
 
 _LAST = 2**62
 """Key of a row that must not be drawn; greater than every real key (at most 56 bits)."""
@@ -65,7 +68,7 @@ class Codebook(Protocol):
 
 
 class LearntCodebook(nn.Module):
-    """Base of codebooks learnt from data: buffers, first codes drawn from a batch, freezing.
+    """Base of codebooks learnt from data: buffers, first codes drawn from a batch, nearest codes, freezing.
 
     A vector that is not finite counts as padding: a float16 overflow costs the optimizer one step, which the
     gradient scaler leaves out, and must not stay in the codebook for good.
@@ -80,6 +83,8 @@ class LearntCodebook(nn.Module):
     ema_count: Tensor
     initialised: Tensor
     draws: Tensor
+    usage_eps: ClassVar[float] = 1e-7
+    """Of `usage_metrics`."""
 
     def __init__(self, config: QuantizerConfig, codebook: Tensor, *, initialised: bool, salt: int) -> None:
         super().__init__()
@@ -100,18 +105,66 @@ class LearntCodebook(nn.Module):
         self.frozen = True
         self.codebook.requires_grad_(False)
 
-    def _rows(self, full: Tensor, mask: Tensor | None, update: bool) -> tuple[Tensor, Tensor]:
-        """Vectors [n, d] of latents [B, L, d], 0 where they are not real, and which are, bool [n]; the codes
-        start from the first ones.
+    def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
+        """Quantize z [B, L, d] by the nearest codes, straight-through, in float32 under autocast too.
+
+        Args:
+            z: Latents of any float type; the output has the same.
+            mask: [B, L], False = padding: neither counted nor learnt from, and outside the penalty.
+            update: False keeps the codebook as it is. It also stays in eval mode and when frozen.
         """
-        rows = full.detach().reshape(-1, full.shape[-1])
-        real = rows.isfinite().all(1)
-        if mask is not None:
-            real = real & mask.reshape(-1)
-        rows = rows.masked_fill(~real[:, None], 0.0)
-        if update and not self._is_initialised:
-            self._initialise(rows, real)
-        return rows, real
+        update = update and self.training and not self.frozen
+        with torch.autocast(z.device.type, enabled=False):
+            full = z.to(self._wide(z.dtype))
+            rows = full.detach().reshape(-1, full.shape[-1])
+            real = rows.isfinite().all(1)
+            if mask is not None:
+                real = real & mask.reshape(-1)
+            rows = rows.masked_fill(~real[:, None], 0.0)
+            if update and not self._is_initialised:
+                self._initialise(rows, real)
+            codebook = self.codebook.to(full.dtype)
+            codes = nearest(rows, codebook.detach())
+            chosen = functional.embedding(codes, codebook).view_as(full)
+            counts = rows.new_zeros(self.config.num_codes, dtype=torch.float32)
+            counts = counts.index_add_(0, codes, real.float())
+            # Both sides are masked before they meet: a padded NaN would otherwise be in the gradient.
+            outside = ~real.view(z.shape[:-1])[..., None]
+            latents, near = full.masked_fill(outside, 0.0), chosen.masked_fill(outside, 0.0)
+            resets = counts.new_zeros(())
+            if update:
+                counts, resets = self._update(rows, real, codes, counts)
+            # The counts are global after an update: dividing by their mean per rank makes the mean over ranks
+            # the penalty of the whole batch, whatever each rank's number of real vectors is.
+            number = counts.sum() * full.shape[-1] / (world_size() if update else 1)
+
+            def mean_square(error: Tensor) -> Tensor:
+                return error.square().sum() / number.clamp(min=1)
+
+            penalty = self._penalty(latents, near, mean_square)
+            metrics = {
+                "penalty": penalty.detach().float(),
+                **usage_metrics(counts, eps=self.usage_eps),
+                "dead": (self.ema_count <= self.config.reset_below).sum().float(),
+                "resets": resets,
+            }
+            error = full - chosen
+            straight = full - error.detach()
+        return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
+
+    @abstractmethod
+    def _wide(self, dtype: torch.dtype) -> torch.dtype:
+        """Return the type that latents of a type are quantized in."""
+
+    @abstractmethod
+    def _update(self, rows: Tensor, mask: Tensor, codes: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+        """Learn from the real rows [n, d] of this rank; return the global counts [K] and how many codes were
+        reset.
+        """
+
+    @abstractmethod
+    def _penalty(self, latents: Tensor, near: Tensor, mean_square: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return the penalty of latents [B, L, d] and their codes, both 0 at padding."""
 
     @torch.no_grad()
     def _draw(self, rows: Tensor, mask: Tensor) -> Tensor:
@@ -127,10 +180,6 @@ class LearntCodebook(nn.Module):
         self.codebook.copy_(torch.where(some, drawn.to(self.codebook.dtype), self.codebook))
         self.initialised.fill_(True)
         self._is_initialised = True
-
-    @torch.no_grad()
-    def _ages(self, resets: Tensor) -> dict[str, Tensor]:
-        return {"dead": (self.ema_count <= self.config.reset_below).sum().float(), "resets": resets}
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)

@@ -23,14 +23,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.quantize.base import (
-    LearntCodebook,
-    QuantizerConfig,
-    QuantizerOutput,
-    nearest,
-    usage_metrics,
-)
-from motionloom.models.training.distributed import is_distributed, sum_over_ranks, world_size
+from motionloom.models.quantize.base import LearntCodebook, QuantizerConfig, QuantizerOutput
+from motionloom.models.training.distributed import is_distributed, sum_over_ranks
 
 
 def cluster_sums(z: Tensor, codes: Tensor, num_codes: int) -> Tensor:
@@ -59,33 +53,11 @@ class EmaQuantizer(LearntCodebook):
         super().__init__(config, codes, initialised=False, salt=salt)
         self.register_buffer("ema_sum", codes * config.reset_below)
 
-    def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
-        """Quantize z [B, L, d].
+    def _wide(self, dtype: torch.dtype) -> torch.dtype:
+        return torch.float32
 
-        Args:
-            z: Latents of any float type; the output has the same.
-            mask: [B, L], False = padding: neither counted nor learnt from, and outside the penalty.
-            update: False keeps the codebook as it is. It also stays in eval mode and when frozen.
-        """
-        update = update and self.training and not self.frozen
-        with torch.autocast(z.device.type, enabled=False):
-            full = z.float()
-            rows, real = self._rows(full, mask, update)
-            codes = nearest(rows, self.codebook)
-            chosen = functional.embedding(codes, self.codebook).view_as(full)
-            error = full - chosen
-            counts = rows.new_zeros(self.config.num_codes).index_add_(0, codes, real.float())
-            resets = rows.new_zeros(())
-            if update:
-                counts, resets = self._update(rows, real, codes, counts)
-            # The counts are global after an update: dividing by their mean per rank makes the mean over ranks
-            # the penalty of the whole batch, whatever each rank's number of real vectors is.
-            number = counts.sum() * error.shape[-1] / (world_size() if update else 1)
-            squares = error.square().masked_fill(~real.view(z.shape[:-1])[..., None], 0.0)
-            penalty = squares.sum() / number.clamp(min=1)
-            metrics = {"penalty": penalty.detach(), **usage_metrics(counts), **self._ages(resets)}
-            straight = full - error.detach()
-        return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
+    def _penalty(self, latents: Tensor, near: Tensor, mean_square: Callable[[Tensor], Tensor]) -> Tensor:
+        return mean_square(latents - near)
 
     def vectors(self, codes: Tensor) -> Tensor:
         return functional.embedding(codes, self.codebook)

@@ -13,6 +13,7 @@ Choices of ours:
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -20,14 +21,8 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.quantize.base import (
-    LearntCodebook,
-    QuantizerConfig,
-    QuantizerOutput,
-    nearest,
-    usage_metrics,
-)
-from motionloom.models.training.distributed import sum_over_ranks, world_size
+from motionloom.models.quantize.base import LearntCodebook, QuantizerConfig
+from motionloom.models.training.distributed import sum_over_ranks
 
 Start = Literal["uniform", "data"]
 
@@ -56,55 +51,21 @@ class GradientQuantizer(LearntCodebook):
     """
 
     config: GradientQuantizerConfig
+    usage_eps = 1e-10
 
     def __init__(self, config: GradientQuantizerConfig, *, salt: int = 0) -> None:
         bound = 1 / config.num_codes
         codes = nn.Parameter(torch.empty(config.num_codes, config.dim).uniform_(-bound, bound))
         super().__init__(config, codes, initialised=config.start == "uniform", salt=salt)
 
-    def forward(self, z: Tensor, mask: Tensor | None = None, *, update: bool = True) -> QuantizerOutput:
-        """Quantize z [B, L, d].
+    def _wide(self, dtype: torch.dtype) -> torch.dtype:
+        return torch.promote_types(dtype, torch.float32)
 
-        Args:
-            z: Latents of any float type; the output has the same.
-            mask: [B, L], False = padding: not counted, and outside the penalty.
-            update: False keeps the counts as they are. They also stay in eval mode and when frozen.
-
-        Returns:
-            `penalty` is the weighted sum of both terms.
-        """
-        update = update and self.training and not self.frozen
-        with torch.autocast(z.device.type, enabled=False):
-            full = z.to(torch.promote_types(z.dtype, torch.float32))
-            rows, real = self._rows(full, mask, update)
-            codebook = self.codebook.to(full.dtype)
-            codes = nearest(rows, codebook.detach())
-            chosen = functional.embedding(codes, codebook).view_as(full)
-            counts = real.new_zeros(self.config.num_codes, dtype=torch.float32).index_add_(
-                0, codes, real.float()
-            )
-            if update:
-                counts = sum_over_ranks(counts)
-                self._count(counts)
-            # Global counts over ranks: the mean over ranks is then the penalty of the whole batch.
-            number = counts.sum() * full.shape[-1] / (world_size() if update else 1)
-            # Both sides are masked before they meet: a padded NaN would otherwise be in the gradient.
-            outside = ~real.view(z.shape[:-1])[..., None]
-            latents, near = full.masked_fill(outside, 0.0), chosen.masked_fill(outside, 0.0)
-
-            def mean_square(error: Tensor) -> Tensor:
-                return error.square().sum() / number.clamp(min=1)
-
-            to_latents = mean_square(near - latents.detach())
-            to_codes = mean_square(latents - near.detach())
-            penalty = self.config.codebook_weight * to_latents + self.config.commitment_weight * to_codes
-            metrics = {
-                "penalty": penalty.detach().float(),
-                **usage_metrics(counts, eps=1e-10),
-                **self._ages(counts.new_zeros(())),
-            }
-            straight = full + (chosen - full).detach()
-        return QuantizerOutput(straight.to(z.dtype), codes.view(z.shape[:-1]), penalty, metrics)
+    def _penalty(self, latents: Tensor, near: Tensor, mean_square: Callable[[Tensor], Tensor]) -> Tensor:
+        """Return the weighted sum of both terms."""
+        to_latents = mean_square(near - latents.detach())
+        to_codes = mean_square(latents - near.detach())
+        return self.config.codebook_weight * to_latents + self.config.commitment_weight * to_codes
 
     def vectors(self, codes: Tensor) -> Tensor:
         """Code vectors, int64 [...] -> [..., d], float32 or the wider type of the codebook."""
@@ -112,7 +73,9 @@ class GradientQuantizer(LearntCodebook):
         return chosen.to(torch.promote_types(chosen.dtype, torch.float32))
 
     @torch.no_grad()
-    def _count(self, counts: Tensor) -> None:
+    def _update(self, rows: Tensor, mask: Tensor, codes: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+        counts = sum_over_ranks(counts)
         # A batch without vectors does not tell which codes are used.
         rate = torch.where(counts.sum() > 0, 1 - self.config.decay, 0.0).to(self.ema_count.dtype)
         self.ema_count.lerp_(counts.to(self.ema_count.dtype), rate)
+        return counts, counts.new_zeros(())

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded, Mate, MateConfig
-from motionloom.models.gpt.tokens import TokenNetwork, closing_length
+from motionloom.models.gpt.tokens import TokenNetwork
 from motionloom.models.layers.transformer import StackConfig, Transformer
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
 from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State
@@ -81,12 +81,8 @@ class Utt(TokenNetwork):
         super().__init__(streams, pattern)
         self.config = config
         self.glob_dim = glob_dim
-        needed = len(self.pattern) + closing_length(pattern)
-        if config.block_size < needed:
-            raise UserError(
-                f"block_size {config.block_size} holds no motion: a group of {len(self.pattern)} tokens and "
-                f"its End tokens take {needed}"
-            )
+        self.max_groups = self._groups_within(config.block_size, "block_size")
+        """Longest closed sequence that one block holds, in groups."""
         self.condition_in = nn.Linear(glob_dim, config.dim)
         self.z_in: nn.Module | None = None
         if config.z_dim:
@@ -110,11 +106,6 @@ class Utt(TokenNetwork):
             self.backbone = PrefixGru(config.layers, config.dim, dropout=config.dropout)
         self.heads = self._outputs(config.dim)
         self._start_tables()
-
-    @property
-    def max_groups(self) -> int:
-        """Longest closed sequence that one block holds, in groups."""
-        return (self.config.block_size - closing_length(self.pattern)) // len(self.pattern)
 
     def forward(
         self,

@@ -23,7 +23,7 @@ from torch.nn.functional import pad
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
 from motionloom.models.gpt.sampling import Drawing, decode, requested_groups, seeds_of, uniform_numbers
-from motionloom.models.gpt.tokens import Codes, as_codes
+from motionloom.models.gpt.tokens import Codes, as_codes, slot_codes
 from motionloom.models.layers.frozen import evaluating
 from motionloom.models.utt.backbone import State
 from motionloom.models.utt.network import Utt
@@ -63,13 +63,8 @@ def last_groups(codes: Codes, pattern: Sequence[str], count: int | None = None) 
     kept = groups if count is None else groups.clamp(max=count)
     most = int(kept.max()) if len(kept) else 0
     at = (groups - kept)[:, None] + torch.arange(most, device=groups.device)
-    slots = []
-    for slot, name in enumerate(pattern):
-        per = list(pattern).count(name)
-        groups_of = codes.codes[name].reshape(len(groups), codes.codes[name].shape[1] // per, per)
-        here = groups_of[:, :, list(pattern[:slot]).count(name)]
-        slots.append(here.gather(1, at.clamp(max=max(0, here.shape[1] - 1))))
-    rows = torch.stack(slots, dim=2)
+    slots = slot_codes(codes.codes, pattern)
+    rows = slots.gather(1, at.clamp(max=max(0, slots.shape[1] - 1))[..., None].expand(-1, -1, slots.shape[2]))
     valid = torch.arange(most, device=groups.device)[None] < kept[:, None]
     return torch.where(valid[..., None], rows, 0).flatten(1), kept
 

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config, UserError
-from motionloom.models.gpt.tokens import TokenNetwork, closing_length
+from motionloom.models.gpt.tokens import TokenNetwork
 from motionloom.models.layers.transformer import StackConfig, sinusoid
 from motionloom.models.metrics.captions import words_of
 from motionloom.models.tokenizer.base import Stream
@@ -189,11 +189,8 @@ class Captioner(TokenNetwork):
     ) -> None:
         super().__init__(streams, pattern)
         self.config, self.words = config, words
-        if self.max_groups < 1:
-            raise UserError(
-                f"net.block_size {config.block_size} holds no motion: Start, {len(self.pattern)} tokens and "
-                f"{len(self.names)} End tokens do not fit; raise it"
-            )
+        self.max_groups = self._groups_within(config.block_size - 1, "block_size")
+        """Longest clip in groups."""
         self.embeddings = self._tables(config.dim)
         self.heads = nn.ModuleList()
         self.start = nn.Parameter(torch.zeros(1, config.dim))
@@ -206,11 +203,6 @@ class Captioner(TokenNetwork):
             if parameter.dim() > 1:
                 nn.init.xavier_uniform_(parameter)
         nn.init.normal_(self.start, std=0.02)
-
-    @property
-    def max_groups(self) -> int:
-        """Longest clip in groups."""
-        return (self.config.block_size - 1 - closing_length(self.pattern)) // len(self.pattern)
 
     def forward(
         self, tokens: Tensor, kinds: Tensor, words: Tensor, visible: Tensor, known: Tensor | None = None

@@ -17,9 +17,9 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import Config
 from motionloom.models.gpt.sampling import Drawing, decode, requested_groups, uniform_numbers
-from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes, closing_length
+from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
 from motionloom.models.layers.frozen import evaluating
 from motionloom.models.tokenizer.base import Stream
 
@@ -76,11 +76,8 @@ class Seq2Seq(TokenNetwork):
     ) -> None:
         super().__init__(streams, pattern)
         self.config, self.text_dim = config, text_dim
-        if self.max_groups < 1:
-            raise UserError(
-                f"net.max_tokens {config.max_tokens} holds no motion: {len(self.pattern)} tokens and "
-                f"{len(self.names)} End tokens do not fit; raise it"
-            )
+        self.max_groups = self._groups_within(config.max_tokens, "max_tokens")
+        """Longest motion in groups."""
         hidden, dim = config.reader, config.dim
         self.text_in = nn.Linear(text_dim, hidden)
         self.reader, self.back = (nn.GRU(hidden, hidden, batch_first=True) for _ in range(2))
@@ -95,11 +92,6 @@ class Seq2Seq(TokenNetwork):
         self.heads = nn.ModuleList(_Tied(table) for table in self.embeddings)
         for table in self.embeddings.parameters():
             nn.init.normal_(table, std=dim**-0.5)
-
-    @property
-    def max_groups(self) -> int:
-        """Longest motion in groups."""
-        return (self.config.max_tokens - closing_length(self.pattern)) // len(self.pattern)
 
     def read(self, text: Tensor, mask: Tensor) -> tuple[EncodedWords, Tensor]:
         """Words [B, S, E], `mask` bool [B, S] of real ones, from the first on -> what the decoder sees, and

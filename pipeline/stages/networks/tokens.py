@@ -173,9 +173,7 @@ class OverTokens(Protocol):
     names: tuple[str, ...]
     pattern: tuple[str, ...]
     num_codes: dict[str, int]
-
-    @property
-    def max_groups(self) -> int: ...
+    max_groups: int
 
 
 def token_batches(
