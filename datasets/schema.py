@@ -14,7 +14,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 SCHEMA_VERSION = 2
 
@@ -193,19 +200,6 @@ class Dropped(Config):
     motion or of texts, that is damaged. `missing`: listed somewhere, but not in the source."""
 
 
-class AuditRow(Config):
-    """One number that the makers of a set state, and what was found and converted of it."""
-
-    what: str
-    stated: float
-    by: str
-    """Place where it is stated."""
-    found: float
-    taken: float
-    why: str = ""
-    """Reasons for which the others were left out."""
-
-
 class Manifest(Config):
     """`manifest.json` beside the shards; written last, so a folder without one is unfinished."""
 
@@ -226,10 +220,18 @@ class Manifest(Config):
     audio: dict[str, Any] | None = None
     """Settings the audio features were made with; a model trained on them keeps these."""
     notes: list[str] = []
-    audit: list[AuditRow] = []
-    """Numbers that the makers of the source state, for sources that have published ones."""
     excluded: dict[str, str] = {}
     """Ids of clips that readers skip, and why: what `motionloom data clean` was told to leave out."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_audit(cls, data: Any) -> Any:
+        """Older sets have a table of what is now a note."""
+        return (
+            {name: value for name, value in data.items() if name != "audit"}
+            if isinstance(data, dict)
+            else data
+        )
 
     @model_serializer(mode="wrap")
     def _without_no_excluded(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

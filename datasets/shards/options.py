@@ -9,7 +9,7 @@ from typing import Literal, Self
 from pydantic import Field, model_validator
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SCHEMA_VERSION, AuditRow, Config, Dropped, MotionType, UserError
+from motionloom.datasets.schema import SCHEMA_VERSION, Config, Dropped, MotionType, UserError
 from motionloom.datasets.shards.cache import CacheConfig
 
 SOURCE_CHECKSUM = "source_sha256"
@@ -53,7 +53,6 @@ class DatasetFacts:
     dropped: Sequence[Dropped] = ()
     """Clips that the plan has left out already."""
     notes: Sequence[str] = ()
-    audit: Sequence[AuditRow] = ()
 
     def made_from(self) -> dict[str, object]:
         """Return everything that the bytes of every clip depend on, beside its own source."""

@@ -204,7 +204,6 @@ class DatasetWriter(Generic[T]):
             licences=facts.licences,
             audio=facts.audio,
             notes=list(facts.notes),
-            audit=list(facts.audit),
             excluded=Decisions.of(self.out).left_out,
         )
         # The index is written before the manifest: whoever sees a manifest finds everything that it names.

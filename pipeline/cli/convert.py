@@ -233,8 +233,6 @@ def proposed(
 def _say_plan(plan: ConversionPlan[Any], console: Console) -> None:
     """Print the plan, and what a few clips showed."""
     console.print(plan.table())
-    if (audit := plan.audit_table()) is not None:
-        console.print(audit)
     if plan.look is None:
         return
     console.print(plan.look.table())

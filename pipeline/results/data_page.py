@@ -99,7 +99,6 @@ def write_data_report(root: Path, out: Path, *, clips: int = 12, progress: bool 
         page.add_viewer(to_watch(splits, clips), f"At most {WATCH_SECONDS:g} s of each clip.{raw}")
     total = sum(map(len, splits.values()))
     _captions(page, records, total)
-    _stated(page, manifest)
     _rejected(page, manifest, total)
     _source(page, manifest, records)
     page.write(out)
@@ -206,16 +205,6 @@ def _captions(page: Page, records: Records, clips: int) -> None:
         }
     )
     page.add_table(["split", "clip", "caption"], records.examples, "Examples")
-
-
-def _stated(page: Page, manifest: Manifest) -> None:
-    """Counts that the makers of the source state, beside what was found and converted."""
-    if not manifest.audit:
-        return
-    page.add_heading("What the makers state")
-    rows: Rows = [[row.what, row.stated, row.found, row.taken, row.why] for row in manifest.audit]
-    header = ["", "stated", "found", "converted", "left out"]
-    page.add_table(header, rows, f"Stated by: {manifest.audit[0].by}")
 
 
 def _rejected(page: Page, manifest: Manifest, clips: int) -> None:

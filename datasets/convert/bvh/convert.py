@@ -29,7 +29,6 @@ from motionloom.datasets.convert.bvh.plan import (
 )
 from motionloom.datasets.convert.bvh.settle import added_frames
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
-from motionloom.datasets.convert.common.facts import Audit
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.look import SourceJoints, named_unit
 from motionloom.datasets.convert.common.plan import ConversionPlan
@@ -65,7 +64,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         """Folder of the clips of archives, by the sha256 of their files."""
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
-        plan, self.maps = plan_bvh(self.config, self.own_maps, settings, Audit(self.stated()))
+        plan, self.maps = plan_bvh(self.config, self.own_maps, settings, self.published)
         return plan
 
     def depends_on(self, clip: BvhClip) -> list[object]:

@@ -21,7 +21,7 @@ from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
 from motionloom.datasets.convert.common.converter import PlanSettings
-from motionloom.datasets.convert.common.facts import Audit, Fact, Facts
+from motionloom.datasets.convert.common.facts import Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
@@ -278,14 +278,14 @@ class BvhClip:
 
 
 def plan_bvh(
-    config: BvhConfig, own_maps: Sequence[JointMap], settings: PlanSettings, audit: Audit
+    config: BvhConfig, own_maps: Sequence[JointMap], settings: PlanSettings, stated: str
 ) -> tuple[ConversionPlan[BvhClip], JointMaps]:
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
     batches = config.batches()
     scans = scan_batches(
         batches, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
-    draft = _decide(config, batches, scans, audit)
+    draft = _decide(config, batches, scans, stated)
     joints = {key: names for scan in scans for key, names in scan.joints.items()}
     maps = choose_maps(config, own_maps, draft, joints, settings.maps)
     draft.limit(lambda clip: clip.id)
@@ -320,7 +320,7 @@ def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
 
 
 def _decide(
-    config: BvhConfig, batches: list[Batch], scans: list[BatchScan], audit: Audit
+    config: BvhConfig, batches: list[Batch], scans: list[BatchScan], stated: str
 ) -> ConversionPlan[BvhClip]:
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
     refused = config.licence_problem(config.licence) if config.licence else ""
@@ -328,7 +328,7 @@ def _decide(
         [file.path for _, file in found], [file.path for _, file in found if not file.problem]
     )
     broken = [scan.problem for scan in scans if scan.problem is not None]
-    draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes, audit=audit)
+    draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes, stated=stated)
     contents: dict[str, str] = {}
     other_rate = 0
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
@@ -341,8 +341,8 @@ def _decide(
         except UserError as error:
             draft.fail(clip.label, error)
             continue
-        stated = listing.rows[clip.path].fps if clip.path in listing.rows else None
-        other_rate += stated is not None and abs(stated - clip.fps) > 0.01 * clip.fps
+        listed = listing.rows[clip.path].fps if clip.path in listing.rows else None
+        other_rate += listed is not None and abs(listed - clip.fps) > 0.01 * clip.fps
         frames = len(range(clip.frames)[config.cut(clip.label)])
         fps = config.source_fps or clip.fps
         same = contents.setdefault(clip.sha256, clip.label)

@@ -67,7 +67,6 @@ class Conversion(Generic[C]):
             audio=audio.dump() if audio else None,
             dropped=self.plan.left_out(),
             notes=self.plan.notes,
-            audit=self.plan.audit_rows(),
         )
 
     def look(self) -> Look | None:

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.register import Table
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import C, ConversionPlan, facts_of
 from motionloom.datasets.motion.layout import MotionLayout
@@ -56,8 +55,8 @@ class Converter(ABC, Generic[Cfg, C]):
     example: ClassVar[str]
     """Words behind `motionloom data convert NAME` in the example of the help."""
     config_class: ClassVar[type[ConvertConfig]]
-    published: ClassVar[Published | None] = None
-    """Numbers that the makers of a set state."""
+    published: ClassVar[str] = ""
+    """Numbers that the makers of a set state, and where; a note of the plan says what is found of them."""
     version: ClassVar[int] = 1
     """Raised when the same source gives other samples: finished shards are then made again."""
 
@@ -85,10 +84,6 @@ class Converter(ABC, Generic[Cfg, C]):
         """Return all that the sample of a clip is made from, as plain JSON: its id, sizes or checksums of its
         files, captions. When it changes, the clip is made again.
         """
-
-    def stated(self) -> Published | None:
-        """The numbers that the source at hand is compared with."""
-        return self.published
 
     def licence(self, plan: ConversionPlan[C]) -> str:
         """The licence of the whole data set."""

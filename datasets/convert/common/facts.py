@@ -1,24 +1,19 @@
-"""Facts known of clips: `--set where="category=dance and seconds<30"` chooses by them, an audit counts them.
+"""Facts known of clips: `--set where="category=dance and seconds<30"` chooses by them.
 
 Conditions are `NAME OPERATOR VALUE` with =, !=, <, <=, > or >=, joined by `and`; a value that holds `and` or
 an operator stands in quotes. Nothing is evaluated. Words are compared without regard to case, = holds for one
 of several values, and a clip of which the name is not known meets no condition.
-
-A set states its published numbers once (`Published`). Their names say how they are counted: `clips` and
-`hours` of all clips found; a condition (`subset=aist`), the clips that meet it; the name of a fact
-(`actor_uid`), its different values.
 """
 
 from __future__ import annotations
 
 import operator
 import re
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 
-from motionloom.datasets.schema import AuditRow, UserError
+from motionloom.datasets.schema import UserError
 
 Fact = str | float | tuple[str, ...]
 """Value of a fact of a clip: words, a number, or several words."""
@@ -95,59 +90,3 @@ def _same(known: Fact, value: str) -> bool:
     if left is not None and right is not None:
         return left == right
     return str(known).strip().lower() == value.lower()
-
-
-@dataclass(frozen=True)
-class Published:
-    """Numbers that the makers of a set state."""
-
-    by: str
-    """Document that states them, such as `card, 2026-03`."""
-    counts: Mapping[str, float]
-
-
-@dataclass
-class Audit:
-    """Counts the clips of a plan beside what is published. Without published numbers it stays empty."""
-
-    published: Published | None = None
-    _found: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-    _taken: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-    _values: set[tuple[str, bool, str]] = field(default_factory=set)
-    """Different values of facts: name, whether of clips that are taken, value."""
-
-    def add(self, facts: Facts, *, taken: bool) -> None:
-        """One clip that was found; `facts` has its length as `seconds`."""
-        for name in self.published.counts if self.published else ():
-            self._found[name] += self._worth(name, facts, False)
-            self._taken[name] += self._worth(name, facts, True) if taken else 0
-
-    def _worth(self, name: str, facts: Facts, taken: bool) -> float:
-        if name == "clips":
-            return 1.0
-        if name == "hours":
-            seconds = facts.get("seconds", 0.0)
-            return seconds / 3600 if isinstance(seconds, int | float) else 0.0
-        if not name.isidentifier():
-            return float(all(condition.holds(facts) for condition in parse_where(name)))
-        value = (name, taken, str(facts.get(name, "")))
-        new = name in facts and value not in self._values
-        self._values.add(value)
-        return float(new)
-
-    def rows(self, clips: int, why: str) -> list[AuditRow]:
-        """The table; `clips` is how many are left in the plan, and `why` says why others are not."""
-        if self.published is None:
-            return []
-        self._taken["clips"] = clips
-        return [
-            AuditRow(
-                what=name,
-                stated=count,
-                by=self.published.by,
-                found=round(self._found[name], 3),
-                taken=round(self._taken[name], 3),
-                why=why if name == "clips" else "",
-            )
-            for name, count in self.published.counts.items()
-        ]

@@ -18,9 +18,9 @@ from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.base.progress import duration
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.facts import Audit, Facts, parse_where, require_known
+from motionloom.datasets.convert.common.facts import Facts, parse_where, require_known
 from motionloom.datasets.convert.common.look import Look
-from motionloom.datasets.schema import SPLITS, AuditRow, Dropped, Split, UserError
+from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
 from motionloom.datasets.shards.left_out import drop, grouped, grouped_notes
 
 
@@ -81,8 +81,11 @@ class ConversionPlan(Generic[C]):
     """Decision that the user must take before it is carried out; empty when nothing is open."""
     look: Look | None = None
     """Measurements of a few clips; None when none was read."""
-    audit: Audit = field(default_factory=Audit)
-    """Clips found and taken, beside what the makers of the source state."""
+    stated: str = ""
+    """Numbers that the makers of the source state, and where."""
+    clips: int = 0
+    """Clips found, taken or not, and their hours."""
+    hours: float = 0.0
     ids: dict[str, str] = field(default_factory=dict)
     """Label of the first clip with each id."""
     known: set[str] = field(default_factory=set)
@@ -112,7 +115,8 @@ class ConversionPlan(Generic[C]):
         self.known.update(facts)
         if not reason and not all(one.holds(facts) for one in parse_where(self.config.where)):
             reason = f"not where {self.config.where.strip()}"
-        self.audit.add(facts, taken=not reason)
+        self.clips += 1
+        self.hours += float(str(facts.get("seconds", 0.0))) / 3600
         if reason:
             self.leave_out(clip.label(), reason)
         else:
@@ -147,6 +151,8 @@ class ConversionPlan(Generic[C]):
         """Itself, with its totals; `frames` (at the target rate) and `licence` are asked about every clip."""
         if self.known:
             require_known(self.config.where, self.known)
+        if self.stated:
+            self.notes.append(f"{self.stated}; found here: {self.clips:,} clips, {self.hours:,.1f} hours")
         self.found, self.notes = found, grouped_notes(self.notes)
         self.frames = dict.fromkeys(SPLITS, 0)
         for split, clip in self.items:
@@ -185,27 +191,6 @@ class ConversionPlan(Generic[C]):
             table.add_row("stops here", "", "", escape(self.stop))
         return table
 
-    def audit_table(self) -> Table | None:
-        """Counts stated, found and taken; numbers of which nothing was found share a row."""
-        rows = self.audit_rows()
-        if not rows:
-            return None
-        table = Table(
-            "count", "stated", "found", "converted", "left out", title=escape(f"stated by: {rows[0].by}")
-        )
-        here = [row for row in rows if row.found or row.what in ("clips", "hours")]
-        for row in here:
-            numbers = (f"{value:,.10g}" for value in (row.stated, row.found, row.taken))
-            table.add_row(escape(row.what), *numbers, escape(printable(row.why)))
-        if absent := [row.what for row in rows if row not in here]:
-            table.add_row(escape(_some(absent)), "", "0", "0", "not in this copy")
-        return table
-
-    def audit_rows(self) -> list[AuditRow]:
-        """Counts stated, found and taken, and the reasons for clips left out."""
-        why = "; ".join(str(group) for group in grouped(self.left_out())[:5])
-        return self.audit.rows(len(self.items), why)
-
     def dump(self) -> dict[str, object]:
         left: dict[str, list[dict[str, str]]] = {
             name: [{"source": drop.source, "reason": drop.reason} for drop in drops]
@@ -225,7 +210,6 @@ class ConversionPlan(Generic[C]):
             "licences": dict(self.licences),
             "bytes_needed": self.bytes_needed,
             "seconds_needed": self.seconds_needed,
-            "audit": [row.dump() for row in self.audit_rows()],
             "look": None if self.look is None else self.look.dump(),
         }
 

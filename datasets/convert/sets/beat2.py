@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from motionloom.datasets.convert.common.arrays import check_values
-from motionloom.datasets.convert.common.facts import Fact, Published
+from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.tables import captions_of, read_csv
@@ -56,7 +56,7 @@ class Beat2(BodyRelease[Beat2Config]):
     config_class = Beat2Config
     terms = "BEAT2-noncommercial"
     model = "SMPL-X"
-    published = Published("EMAGE paper, CVPR 2024", {"hours": 60, "speaker": 25})
+    published = "EMAGE paper, CVPR 2024: 60 hours, 25 speakers"
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         source = self.config.source

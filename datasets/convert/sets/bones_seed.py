@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.scan import ARCHIVES, Batch, list_batches
 from motionloom.datasets.convert.common.tables import captions_of, read_csv, read_json_lines
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state
@@ -117,7 +116,4 @@ class BonesSeed(Bvh):
     summary = "BONES-SEED: SOMA motion capture with descriptions and timelines to shards."
     example = "bones-seed shards"
     config_class = BonesSeedConfig
-    published = Published(
-        "card, 2026-03",
-        {"clips": 142220, "is_mirror=false": 71132, "is_mirror=true": 71088, "hours": 288, "actor_uid": 522},
-    )
+    published = "card, 2026-03: 142,220 clips (half of them mirrored), 288 hours, 522 actors"

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.facts import Fact, Published
+from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
@@ -60,7 +60,7 @@ class FineDance(BodyRelease[FineDanceConfig]):
     config_class = FineDanceConfig
     terms = "FineDance-noncommercial"
     model = "SMPL-X"
-    published = Published("README (the part to download)", {"clips": 211, "hours": 7.7})
+    published = "README (the part to download): 211 clips, 7.7 hours"
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         source = self.config.source

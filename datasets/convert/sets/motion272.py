@@ -24,7 +24,7 @@ from pydantic import Field
 
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.facts import Fact, Published
+from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.splits import original_of
@@ -65,11 +65,11 @@ class Motion272(Release[Motion272Config]):
     config_class = Motion272Config
     terms = "272-column set: non-commercial, AMASS's terms where its motions are from there"
     lists = ("split/version1/t2m_60_300", "split", "splits")
-    published = Published("MotionMillion paper", {"clips": 2_000_000, "hours": 2000})
+    published = "MotionMillion paper: 2,000,000 clips, 2000 hours"
 
-    def stated(self) -> Published | None:
+    def stated(self) -> str:
         """MotionMillion's numbers, for its layout alone."""
-        return self.published if (self.config.source / _MOTION[0]).is_dir() else None
+        return self.published if (self.config.source / _MOTION[0]).is_dir() else ""
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         source = self.config.source

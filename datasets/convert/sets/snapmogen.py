@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
@@ -56,7 +55,7 @@ class SnapMoGen(Release[SnapMoGenConfig]):
     config_class = SnapMoGenConfig
     terms = "SnapMoGen-noncommercial"
     lists = ("data_split_info", "data_split_info1", "data_split_info2")
-    published = Published("paper, NeurIPS 2025", {"clips": 20450, "hours": 43.7})
+    published = "paper, NeurIPS 2025: 20,450 clips, 43.7 hours"
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         source = self.config.source

@@ -11,7 +11,6 @@ from functools import lru_cache
 from pathlib import Path
 
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.common.facts import Published
 from motionloom.datasets.convert.common.tables import captions_of, read_csv
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state, stem
 from motionloom.datasets.schema import UserError
@@ -58,7 +57,7 @@ class Style100(Bvh):
     summary = "100STYLE: walks and runs in a hundred styles (BVH) to shards."
     example = "100STYLE shards"
     config_class = Style100Config
-    published = Published("paper, 2022, and the list of files", {"clips": 810, "style": 100, "hours": 18.5})
+    published = "paper, 2022, and the list of files: 810 clips, 100 styles, 18.5 hours"
 
 
 def _words(style: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from motionloom.datasets.convert.amass.plan import AmassConfig
-from motionloom.datasets.convert.common.facts import Audit, Published, parse_where, require_known
+from motionloom.datasets.convert.common.facts import parse_where, require_known
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.schema import UserError
 
@@ -54,20 +54,6 @@ def test_conditions(text: str, holds: bool) -> None:
 def test_what_cannot_be_read_is_quoted(text: str, said: str) -> None:
     with pytest.raises(UserError, match=said.replace("(", r"\(")):
         parse_where(text)
-
-
-def test_the_audit_counts_clips_hours_values_and_conditions() -> None:
-    audit = Audit(Published("card", {"clips": 9, "hours": 2, "actor": 3, "kind=walk": 4}))
-    for actor, kind, taken in (("a", "walk", False), ("a", "run", True), ("b", "walk", True)):
-        audit.add({"actor": actor, "kind": kind, "seconds": 1800.0}, taken=taken)
-    rows = {row.what: (row.stated, row.found, row.taken, row.why) for row in audit.rows(2, "one is short")}
-    assert rows == {
-        "clips": (9, 3, 2, "one is short"),
-        "hours": (2, 1.5, 1.0, ""),
-        "actor": (3, 2, 2, ""),
-        "kind=walk": (4, 2, 1, ""),
-    }
-    assert Audit().rows(0, "") == []
 
 
 def test_every_source_has_it_and_unknown_names_are_answered_with_those_there_are(

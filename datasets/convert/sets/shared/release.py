@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
-from motionloom.datasets.convert.common.facts import Audit, Fact
+from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.features import features_of, frames_after
 from motionloom.datasets.convert.common.files import inside, read_in_threads
 from motionloom.datasets.convert.common.look import SourceJoints
@@ -165,7 +165,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         config, self.settings = self.config, settings
         if not config.source.is_dir():
             raise UserError(f"{config.source}: no such folder")
-        draft = ConversionPlan[ReleaseClip](config, audit=Audit(self.stated()))
+        draft = ConversionPlan[ReleaseClip](config, stated=self.stated())
         self.listed = self.split_lists(draft)
         entries = list(self.entries(draft))
         if self.lists and self.listed is None and any(entry.split is None for entry in entries):
@@ -197,6 +197,10 @@ class Release(Converter[Cfg, ReleaseClip]):
             frames=self.frames,
             licence=lambda clip: clip.licence,
         )
+
+    def stated(self) -> str:
+        """The numbers that the source at hand is compared with."""
+        return self.published
 
     def path_of(self, file: str) -> Path:
         """Return the path of a motion file; `UserError` for one outside of the source."""
