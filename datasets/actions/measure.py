@@ -140,7 +140,11 @@ def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps:
 
     Of several requests, which a caption may mean, one has to be shown.
     """
-    shown = [request for request in requests if _shows_actions(request, joints, fps)]
+    shown = []
+    for request in requests:  # by their actions alone, whatever the attributes are
+        bare = {"action": request["action"], "parts": [{"action": act} for act in actions_of(request)]}
+        if agrees(bare, joints, None, fps)["action"]:
+            shown.append(request)
     if not shown:
         wanted = (" and then ".join(_NOUNS.get(act, act) for act in actions_of(one)) for one in requests)
         return f"the motion shows no {' nor '.join(wanted)}"
@@ -151,14 +155,6 @@ def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps:
         if name != "action" and seen.get(name) != wanted:
             return f"the {name} is {seen.get(name) or 'another'}, not {wanted}"
     return None
-
-
-def _shows_actions(request: Record, joints: NDArray[np.floating], fps: float) -> bool:
-    """Whether joints show the actions of a request, whatever its attributes are."""
-    bare = {"action": request["action"]}
-    if request.get("parts"):
-        bare["parts"] = [{"action": part["action"]} for part in request["parts"]]
-    return agrees(bare, joints, None, fps)["action"]
 
 
 def _face(truth: Mapping[str, Any], face: NDArray[np.floating] | None) -> dict[str, bool]:

@@ -99,7 +99,12 @@ def audio_features(
     """
     settings = settings or AudioSettings()
     samples = _prepared(samples, rate, settings)
-    octaves = _octaves(settings)
+    fitting = fitting_octaves(settings.rate)
+    octaves = settings.octaves or fitting
+    if octaves > fitting:
+        raise UserError(
+            f"octaves: {octaves} do not fit at {settings.fps:g} frames a second; at most {fitting}"
+        )
     librosa = load_librosa()
     with _no_remarks():
         spectra = separate(samples, settings.rate)
@@ -111,7 +116,7 @@ def audio_features(
             librosa.feature.delta(mfcc, width=3),
             librosa.feature.chroma_cqt(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
             onsets[None],
-            _flags(_beat_frames(onsets, settings), len(onsets))[None],
+            np.bincount(_beat_frames(onsets, settings), minlength=len(onsets))[None],
             tempogram(onsets, DIM - 54),
         ]
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
@@ -212,15 +217,6 @@ def _prepared(samples: NDArray[np.float32], rate: int, settings: AudioSettings) 
     return samples
 
 
-def _octaves(settings: AudioSettings) -> int:
-    fitting = fitting_octaves(settings.rate)
-    if settings.octaves is not None and settings.octaves > fitting:
-        raise UserError(
-            f"octaves: {settings.octaves} do not fit at {settings.fps:g} frames a second; at most {fitting}"
-        )
-    return settings.octaves or fitting
-
-
 def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArray[np.float32]:
     """Magnitudes [36 x octaves, T] from C1 up; frames of nothing but rounding are 0."""
     spectrum = load_librosa().cqt(
@@ -269,13 +265,6 @@ def track_beats(
             onset_envelope=onsets, sr=rate, hop_length=HOP, bpm=tempo, tightness=tightness
         )
     return np.asarray(frames)
-
-
-def _flags(frames: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-    """[count] of zeros, 1 at the frames."""
-    out = np.zeros(count, dtype=np.float32)
-    out[frames] = 1
-    return out
 
 
 def _tempograms(onsets: NDArray[np.float32], width: int) -> Iterator[NDArray[np.float64]]:

@@ -72,7 +72,11 @@ def _phases(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
     if len(beats.times) < 2:
         return np.zeros((len(at), 6))
     # A circle's cosine and sine have no jump at the beat, as a phase itself has.
-    number = _beat_numbers(beats.times, at)
+    times = beats.times
+    # Beats since the first; before it and after the last they go on as beside it.
+    before_first = np.minimum(at - times[0], 0.0) / (times[1] - times[0])
+    after_last = np.maximum(at - times[-1], 0.0) / (times[-1] - times[-2])
+    number = np.interp(at, times, np.arange(len(times))) + before_first + after_last
     before = np.clip(np.floor(number).astype(np.int64), 0, len(beats.times) - 1)
     in_bar = beats.bar_places[before] + number - before
     # Of three beats a bar, pairs go on across the bars.
@@ -80,14 +84,6 @@ def _phases(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
     in_pair = in_bar if beats.meter % 2 == 0 else number - first
     turns = np.stack([number, in_pair / 2, in_bar / beats.meter], axis=1) * 2 * np.pi
     return np.stack([np.cos(turns), np.sin(turns)], axis=2).reshape(len(at), 6)
-
-
-def _beat_numbers(times: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Beats since the first at seconds [F]; before the first and after the last they go on as beside it."""
-    inside = np.interp(at, times, np.arange(len(times)))
-    before = np.minimum(at - times[0], 0.0) / (times[1] - times[0])
-    after = np.maximum(at - times[-1], 0.0) / (times[-1] - times[-2])
-    return np.asarray(inside + before + after)
 
 
 def _tempo(beats: Beats, at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -111,7 +107,10 @@ def _dynamics(
     # Everything is relative to the piece's own range, so neither gain nor compression counts.
     wide = max(highest - lowest, _SMALLEST_RANGE)
     parts = [loudness] + [_decibels(part.sum(axis=1)) for part in np.split(power, (low, high), axis=1)]
-    columns = [_relative(part) for part in parts]
+    columns = []
+    for part in parts:  # against the median, in units of the piece's range
+        quiet, usual, loud = np.percentile(part, (5, 50, 95))
+        columns.append(np.clip((part - usual) / max(loud - quiet, _SMALLEST_RANGE), -2, 2))
     columns.append(_onsets(power))
     slow = _moving_mean(loudness, 2 * ROWS)
     columns.append(np.clip((slow - median) / wide, -2, 2))
@@ -119,7 +118,9 @@ def _dynamics(
     half = 2 * ROWS
     padded = np.pad(slow, half, mode="edge")
     columns.append(np.clip((padded[2 * half :] - padded[: -2 * half]) / wide, -2, 2))
-    rows = [_means_at(part, at, fps) for part in columns]
+    # Means over a frame, but of onsets the largest, so that none is missed.
+    means = [_moving_mean(part, max(1, round(ROWS / fps))) for part in columns]
+    rows = [np.interp(at * ROWS, np.arange(len(part)), part) for part in means]
     rows[4] = _peaks_at(columns[4], at, fps)
     return np.stack(rows, axis=1), float(min(wide / 20, 3.0))
 
@@ -143,12 +144,6 @@ def _decibels(power: NDArray[np.float32]) -> NDArray[np.float64]:
     return 10 * np.log10(_moving_mean(power / loudest, ROWS // 10) + _SILENCE)
 
 
-def _relative(decibels: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Against the median, in units of the range of the piece; -2..2."""
-    lowest, median, highest = np.percentile(decibels, (5, 50, 95))
-    return np.asarray(np.clip((decibels - median) / max(highest - lowest, _SMALLEST_RANGE), -2, 2))
-
-
 def _onsets(power: NDArray[np.float32]) -> NDArray[np.float64]:
     """Rises over the bands [T], 1 what one row in fifty exceeds."""
     loudest = float(power.max(initial=0.0))
@@ -167,12 +162,6 @@ def _moving_mean(values: NDArray[np.floating], width: int) -> NDArray[np.float64
     rows = np.arange(len(values))
     first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
     return np.asarray((sums[last] - sums[first]) / (last - first))
-
-
-def _means_at(values: NDArray[np.float64], at: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
-    """Rows [T] at seconds [F]: means over a frame."""
-    smooth = _moving_mean(values, max(1, round(ROWS / fps)))
-    return np.asarray(np.interp(at * ROWS, np.arange(len(smooth)), smooth))
 
 
 def _peaks_at(values: NDArray[np.floating], at: NDArray[np.float64], fps: float) -> NDArray[np.float64]:

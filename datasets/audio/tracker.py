@@ -77,7 +77,11 @@ def decode(probabilities: NDArray[np.float32]) -> Beats:
     beat, downbeat = probabilities[:, 0], probabilities[:, 1]
     rows = beat_rows(beat)
     places, meter = bar_places(_peak(downbeat, rows))
-    return Beats(_between_rows(beat, rows) / ROWS, places, meter, beat.copy(), _confidence(beat, rows))
+    confidence = 0.0
+    if len(rows) > 1:  # the mean at the beats, less the mean midway between two
+        middle = (rows[1:] + rows[:-1]) // 2
+        confidence = float(np.clip(_peak(beat, rows).mean() - _peak(beat, middle).mean(), 0.0, 1.0))
+    return Beats(_between_rows(beat, rows) / ROWS, places, meter, beat.copy(), confidence)
 
 
 def beat_rows(activation: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -169,12 +173,3 @@ def _between_rows(values: NDArray[np.float32], rows: NDArray[np.int64]) -> NDArr
     weight -= weight.min(axis=1, keepdims=True)
     shift = (weight * places).sum(axis=1) / np.maximum(weight.sum(axis=1), 1e-9)
     return np.asarray(np.maximum(rows + np.clip(shift, -1.0, 1.0), 0.0))
-
-
-def _confidence(activation: NDArray[np.float32], rows: NDArray[np.int64]) -> float:
-    """Return the mean at the beats, less the mean midway between two."""
-    if len(rows) < 2:
-        return 0.0
-    middle = (rows[1:] + rows[:-1]) // 2
-    contrast = _peak(activation, rows).mean() - _peak(activation, middle).mean()
-    return float(np.clip(contrast, 0.0, 1.0))

@@ -42,16 +42,16 @@ def pieces_of(parts: Iterable[FigurePart], but: Iterable[FigurePart] = ()) -> ND
 @lru_cache(maxsize=8)
 def piece_joints(layout: MotionLayout) -> NDArray[np.int64]:
     """Return the number of every joint's piece [N]."""
-    return np.array([PIECES.index(_piece_of(name, n)) for n, name in enumerate(layout.skeleton.joints)])
-
-
-def _piece_of(joint: str, number: int) -> str:
-    side, _, rest = joint.partition("_")
-    if number >= BODY_JOINTS:
-        return f"{side}_hand"
-    if rest in _ARM:
-        return f"{side}_arm"
-    return "lower" if (rest or joint) in _LEG else "trunk"
+    pieces = []
+    for number, joint in enumerate(layout.skeleton.joints):
+        side, _, rest = joint.partition("_")
+        own = "lower" if (rest or joint) in _LEG else "trunk"
+        if number >= BODY_JOINTS:
+            own = f"{side}_hand"
+        elif rest in _ARM:
+            own = f"{side}_arm"
+        pieces.append(PIECES.index(own))
+    return np.array(pieces)
 
 
 @lru_cache(maxsize=8)

@@ -43,7 +43,8 @@ def forward_kinematics(
             f"not {list(rotations.shape)} and {list(offsets.shape)}"
         )
     lead = np.broadcast_shapes(rotations.shape[:-3], root.shape[:-1])
-    local = _axes_first(np.broadcast_to(rotations, (*lead, count, 3, 3)))
+    local = np.moveaxis(np.broadcast_to(rotations, (*lead, count, 3, 3)), (-2, -1, -3), (0, 1, 2))
+    local = np.ascontiguousarray(local, dtype=np.float64)
     bones = np.asarray(offsets, dtype=np.float64).T.reshape(3, 1, count, *(1,) * len(lead))
     world = np.empty_like(local)
     world[:, :, 0] = local[:, :, 0]
@@ -132,11 +133,6 @@ def _fit(
     return np.moveaxis(left @ right, (-2, -1), (0, 1))
 
 
-def _axes_first(matrices: NDArray[np.floating]) -> NDArray[np.float64]:
-    """[..., N, 3, 3] -> contiguous [3, 3, N, ...]."""
-    return np.ascontiguousarray(np.moveaxis(matrices, (-2, -1, -3), (0, 1, 2)), dtype=np.float64)
-
-
 def _axes_last(matrices: NDArray[np.floating]) -> NDArray[np.float64]:
     """[3, 3, N, ...] -> contiguous [..., N, 3, 3]."""
     return np.ascontiguousarray(np.moveaxis(matrices, (0, 1, 2), (-2, -1, -3)), dtype=np.float64)
@@ -182,12 +178,7 @@ def swing(old: NDArray[np.float64], new: NDArray[np.float64]) -> NDArray[np.floa
         out[column, row] = product + rest
     if opposite.any():
         start = np.broadcast_to(old, (3, *cosine.shape))[:, opposite]
-        out[:, :, opposite] = _half_turn(start)
+        spare = np.cross(start, np.eye(3)[:, np.abs(start).argmin(axis=0)], axis=0)
+        spare /= np.linalg.norm(spare, axis=0)
+        out[:, :, opposite] = 2.0 * spare[:, None] * spare[None] - np.eye(3)[:, :, None]
     return out
-
-
-def _half_turn(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Half turns [3, 3, M] that reverse unit vectors [3, M]."""
-    spare = np.cross(vectors, np.eye(3)[:, np.abs(vectors).argmin(axis=0)], axis=0)
-    spare /= np.linalg.norm(spare, axis=0)
-    return np.asarray(2.0 * spare[:, None] * spare[None] - np.eye(3)[:, :, None], dtype=np.float64)

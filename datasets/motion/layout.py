@@ -162,11 +162,11 @@ class MotionLayout:
 
     def _hand_columns(self) -> NDArray[np.int64]:
         columns = np.arange(self.dim)
-        out = []
+        out = [columns[:0]]
         for field, per_joint, first in (("positions", 3, 1), ("rotations_6d", 6, 1), ("velocities", 3, 0)):
             if self.has(field):
                 out.append(columns[self.slice(field)][per_joint * (BODY_JOINTS - first) :])
-        return np.concatenate(out) if out else columns[:0]
+        return np.concatenate(out)
 
     def without_face(self) -> MotionLayout:
         """The layout of `part("bodyhand")`, which joints can be decoded from; itself where it has no face."""

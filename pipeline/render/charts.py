@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 WIDTH, HEIGHT = 640, 320
 LEFT, RIGHT, TOP, BOTTOM = 62, 24, 14, 46
@@ -52,7 +52,13 @@ def log_lines(
 
 def line_chart(lines: Sequence[Line], *, x_label: str = "step", y_label: str = "", title: str = "") -> str:
     """SVG of curves over one pair of axes, with a legend and the data for the page's hover script."""
-    curves = [_finite(line) for line in lines]
+    curves = []
+    for line in lines:
+        x, y = np.asarray(line.x, np.float64).ravel(), np.asarray(line.y, np.float64).ravel()
+        if len(x) != len(y):
+            raise ValueError(f"line '{line.name}': {len(x)} x values but {len(y)} y values")
+        good = np.isfinite(x) & np.isfinite(y)
+        curves.append((x[good], y[good]))
     filled = [(x, y) for x, y in curves if len(x)]
     if not filled:
         return _svg(title, [_text(WIDTH / 2, HEIGHT / 2, "no data yet", "middle")], None)
@@ -64,8 +70,12 @@ def line_chart(lines: Sequence[Line], *, x_label: str = "step", y_label: str = "
     parts = _axes(x_axis, y_axis, x_label, y_label)
     hover = []
     for index, (line, (x, y)) in enumerate(zip(lines, curves, strict=True)):
-        colour = _colour(line, index)
-        x, y = _thin(x, y)
+        colour = (index if line.colour is None else line.colour) % COLOURS
+        if len(x) > 2 * STRETCHES:
+            keep = {0, len(x) - 1}
+            for stretch in np.array_split(np.arange(len(x)), STRETCHES):
+                keep |= {int(stretch[np.argmin(y[stretch])]), int(stretch[np.argmax(y[stretch])])}
+            x, y = x[sorted(keep)], y[sorted(keep)]
         points = [
             (round(x_axis(a), 1), round(y_axis(b), 1)) for a, b in zip(x.tolist(), y.tolist(), strict=True)
         ]
@@ -146,24 +156,6 @@ class _Axis:
         return [k * self.step for k in range(first, last + 1)]
 
 
-def _finite(line: Line) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    x, y = np.asarray(line.x, np.float64).ravel(), np.asarray(line.y, np.float64).ravel()
-    if len(x) != len(y):
-        raise ValueError(f"line '{line.name}': {len(x)} x values but {len(y)} y values")
-    good = np.isfinite(x) & np.isfinite(y)
-    return x[good], y[good]
-
-
-def _thin(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    if len(x) <= 2 * STRETCHES:
-        return x, y
-    keep = {0, len(x) - 1}
-    for stretch in np.array_split(np.arange(len(x)), STRETCHES):
-        keep |= {int(stretch[np.argmin(y[stretch])]), int(stretch[np.argmax(y[stretch])])}
-    index = np.array(sorted(keep))
-    return x[index], y[index]
-
-
 def _axes(x: _Axis, y: _Axis, x_label: str, y_label: str) -> list[str]:
     parts = []
     for tick in y.ticks():
@@ -194,10 +186,6 @@ def _number(value: float) -> str:
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:g}"
 
 
-def _colour(line: Line, index: int) -> int:
-    return (index if line.colour is None else line.colour) % COLOURS
-
-
 def _text(x: float, y: float, text: str, anchor: str) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
@@ -206,7 +194,8 @@ def _legend(lines: Sequence[Line]) -> str:
     if len(lines) < 2:
         return ""
     marks = "".join(
-        f'<span><i class="key s{_colour(line, k)}{" dashed" if line.dashed else ""}"></i>'
+        f'<span><i class="key s{(k if line.colour is None else line.colour) % COLOURS}'
+        f'{" dashed" if line.dashed else ""}"></i>'
         f"{escape(line.name)}</span>"
         for k, line in enumerate(lines)
     )

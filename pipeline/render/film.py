@@ -129,32 +129,23 @@ def _frames(
 
 
 def _subtitle(caption: str, size: tuple[int, int]) -> Image.Image:
-    """The caption in at most two lines, as a mask; of no height where there is none."""
+    """The caption as a mask, in at most two lines, cut by an ellipsis; of no height without one."""
     face = ImageFont.load_default(max(11, size[1] // 30))
-    step = round(size[1] / 30 * 1.35)
-    lines = _wrap(caption, size[0] - 24, face, 2) if caption else []
+    step, width = round(size[1] / 30 * 1.35), size[0] - 24
+    lines = [""] if caption else []
+    for word in caption.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if face.getlength(longer) <= width or not lines[-1]:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    if len(lines) > 2:
+        lines = [lines[0], f"{lines[1]} …"]
+    for row, line in enumerate(lines):
+        while face.getlength(lines[row]) > width and line:
+            line = line[:-1]
+            lines[row] = line.rstrip(" …") + "…"
     out = Image.new("L", (size[0] - 24, step * len(lines)))
     for row, line in enumerate(lines):
         ImageDraw.Draw(out).text((0, row * step), line, fill=255, font=face)
-    return out
-
-
-def _wrap(
-    text: str, width: float, face: ImageFont.FreeTypeFont | ImageFont.ImageFont, lines: int
-) -> list[str]:
-    """Break text into at most `lines` lines of `width` pixels; what does not fit ends in an ellipsis."""
-    out = [""]
-    for word in text.split():
-        longer = f"{out[-1]} {word}".strip()
-        if face.getlength(longer) <= width or not out[-1]:
-            out[-1] = longer
-        else:
-            out.append(word)
-    if len(out) > lines:
-        out = [*out[: lines - 1], f"{out[lines - 1]} …"]
-    for row, line in enumerate(out):
-        kept = line
-        while face.getlength(out[row]) > width and kept:
-            kept = kept[:-1]
-            out[row] = kept.rstrip(" …") + "…"
     return out

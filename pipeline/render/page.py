@@ -99,7 +99,32 @@ class Page:
 
         A `pinned` first column stays in sight while the others are scrolled.
         """
-        self._blocks.append(_table(columns, rows, caption, digits, pinned))
+        for row in rows:
+            if len(row) != len(columns):
+                raise UserError(f"table '{caption}': a row has {len(row)} cells for {len(columns)} columns")
+        numeric = [
+            any(_is_number(row[k]) for row in rows)
+            and all(_is_number(row[k]) or row[k] is None for row in rows)
+            for k in range(len(columns))
+        ]
+        short = [all(len(str(row[k])) <= SHORT for row in rows) for k in range(len(columns))]
+        align = [
+            ' class="number"' if number else ' class="short"' if brief else ""
+            for number, brief in zip(numeric, short, strict=True)
+        ]
+        head = "".join(
+            f'<th scope="col"{a}>{_cell(name, digits)}</th>' for name, a in zip(columns, align, strict=True)
+        )
+        body = "".join(
+            "<tr>"
+            + "".join(f"<td{a}>{_cell(v, digits)}</td>" for v, a in zip(row, align, strict=True))
+            + "</tr>"
+            for row in rows
+        )
+        title = f"<caption><span>{escape(caption)}</span></caption>" if caption else ""
+        kind = ' class="pinned"' if pinned else ""
+        inner = f"{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
+        self._blocks.append(f'<div class="scroll"><table{kind}>{inner}</table></div>')
         return self
 
     @contextmanager
@@ -117,7 +142,8 @@ class Page:
     def add_facts(self, facts: Mapping[str, Value]) -> Page:
         """A short list of names and values, shown as tiles."""
         tiles = "".join(
-            f"<div><dt>{escape(name)}</dt><dd>{_cell(_short(value), 3)}</dd></div>"
+            f"<div><dt>{escape(name)}</dt>"
+            f"<dd>{_cell(f'{value:.4g}' if isinstance(value, float) else value, 3)}</dd></div>"
             for name, value in facts.items()
         )
         self._blocks.append(f'<dl class="facts">{tiles}</dl>')
@@ -200,44 +226,8 @@ class Page:
         return self
 
 
-def _table(
-    columns: Sequence[str | Cell],
-    rows: Sequence[Sequence[Value]],
-    caption: str,
-    digits: int,
-    pinned: bool = False,
-) -> str:
-    for row in rows:
-        if len(row) != len(columns):
-            raise UserError(f"table '{caption}': a row has {len(row)} cells for {len(columns)} columns")
-    numeric = [
-        any(_is_number(row[k]) for row in rows) and all(_is_number(row[k]) or row[k] is None for row in rows)
-        for k in range(len(columns))
-    ]
-    short = [all(len(str(row[k])) <= SHORT for row in rows) for k in range(len(columns))]
-    align = [
-        ' class="number"' if number else ' class="short"' if brief else ""
-        for number, brief in zip(numeric, short, strict=True)
-    ]
-    head = "".join(
-        f'<th scope="col"{a}>{_cell(name, digits)}</th>' for name, a in zip(columns, align, strict=True)
-    )
-    body = "".join(
-        "<tr>" + "".join(f"<td{a}>{_cell(v, digits)}</td>" for v, a in zip(row, align, strict=True)) + "</tr>"
-        for row in rows
-    )
-    title = f"<caption><span>{escape(caption)}</span></caption>" if caption else ""
-    kind = ' class="pinned"' if pinned else ""
-    inner = f"{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody>"
-    return f'<div class="scroll"><table{kind}>{inner}</table></div>'
-
-
 def _is_number(value: Value) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _short(value: Value) -> Value:
-    return f"{value:.4g}" if isinstance(value, float) else value
 
 
 def _cell(value: Value, digits: int) -> str:

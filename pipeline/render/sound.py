@@ -58,12 +58,12 @@ def embed_sounds(uses: Iterable[tuple[Sound | None, float]]) -> tuple[list[Sound
         samples, longest = distinct[number]
         distinct[number] = (samples, max(longest, seconds))
         chosen.append(number)
-    return [_encode(samples[: round(seconds * RATE)]) for samples, seconds in distinct], chosen
-
-
-def _encode(samples: NDArray[np.float32]) -> SoundData:
-    data = base64.b64encode(_mp3(samples)).decode("ascii")
-    return {"mime": "audio/mpeg", "seconds": len(samples) / RATE, "data": data}
+    sounds: list[SoundData] = []
+    for samples, seconds in distinct:
+        part = samples[: round(seconds * RATE)]
+        data = base64.b64encode(_mp3(part)).decode("ascii")
+        sounds.append({"mime": "audio/mpeg", "seconds": len(part) / RATE, "data": data})
+    return sounds, chosen
 
 
 def film_sound(sound: Sound, seconds: float) -> bytes:

@@ -14,7 +14,6 @@ minimum over `w` is again of this form in `d_a`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +31,6 @@ _STILL = 1e-10
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-8, 1e4
 """Damping (Levenberg-Marquardt), as a share of the bones' squared lengths; decides the twist about single
 bones, which no position determines: it stays as at the start."""
-
-
-@dataclass(frozen=True)
-class _Level:
-    """The joints of one depth that have children, and the bones to these."""
-
-    joints: list[int]
-    children: list[int]
-    owner: list[int]
-    """Row in `joints` of each child's parent."""
 
 
 def solve_poses(
@@ -81,8 +70,13 @@ class _Solver:
         self.offsets = np.asarray(offsets, dtype=np.float64)
         self.parents = parents
         self.weights = np.ascontiguousarray(weights.T, dtype=np.float64)
-        self.levels = _inner_levels(parents)
-        self.inner = sorted(joint for level in self.levels for joint in level.joints)
+        self.levels: list[tuple[list[int], list[int], list[int]]] = []
+        """Of each depth the joints that have children, these, and the row of each child's parent."""
+        for level in [[0], *levels(parents)]:
+            if joints := [joint for joint in level if joint in parents]:
+                children = [child for child, above in enumerate(parents) if above in joints]
+                self.levels.append((joints, children, [joints.index(parents[child]) for child in children]))
+        self.inner = sorted(joint for joints, _, _ in self.levels for joint in joints)
 
     def solve(self, rotations: NDArray[np.floating], root: NDArray[np.floating]) -> tuple[Floats, Floats]:
         """Levenberg-Marquardt, each frame with its own damping."""
@@ -143,12 +137,11 @@ class _Solver:
         weight = self.weights[:, rows]
         hessian = weight[..., None, None] * np.eye(3)
         gradient = weight[..., None] * (points - self.targets[:, rows])
-        solved: list[tuple[_Level, Floats, Floats, Floats]] = []
+        solved: list[tuple[Floats, Floats, Floats]] = []
         # From the leaves up: each joint's turn is eliminated, and what is left of its children's cost, a
         # quadratic function of the joint's own displacement, is added to its own.
-        for level in reversed(self.levels):
-            owner, children = level.owner, level.children
-            bones = points[children] - points[np.asarray(level.joints)[owner]]
+        for joints_here, children, owner in reversed(self.levels):
+            bones = points[children] - points[np.asarray(joints_here)[owner]]
             lever = _skew(bones)
             pulled = lever @ hessian[children]
             firm = _sum_by(-(pulled @ lever), owner)
@@ -159,35 +152,27 @@ class _Solver:
             both = np.linalg.solve(firm, np.concatenate([mixed, force[..., None]], axis=-1))
             ratio, rest = both[..., :3], both[..., 3]
             across = mixed.swapaxes(-1, -2)
-            hessian[level.joints] += _sum_by(hessian[children], owner) - across @ ratio
-            gradient[level.joints] += _sum_by(gradient[children], owner) - (across @ rest[..., None])[..., 0]
-            solved.append((level, bones, ratio, rest))
+            hessian[joints_here] += _sum_by(hessian[children], owner) - across @ ratio
+            gradient[joints_here] += _sum_by(gradient[children], owner) - (across @ rest[..., None])[..., 0]
+            solved.append((bones, ratio, rest))
         move = np.zeros_like(points)
         # The root is as firm as its own weight; a root that counts for nothing still hangs on its bones.
         move[0] = -np.linalg.solve(hessian[0] + 1e-12 * np.eye(3), gradient[0][..., None])[..., 0]
         spin = np.zeros_like(points)
         # From the root down: displacements are known now, so turns follow, and from these the children's.
-        for level, bones, ratio, rest in reversed(solved):
-            turned = -((ratio @ move[level.joints][..., None])[..., 0] + rest)
-            spin[level.joints] = turned
-            above = np.asarray(level.joints)[level.owner]
-            move[level.children] = move[above] + np.cross(turned[level.owner], bones)
+        for (joints_here, children, owner), (bones, ratio, rest) in zip(
+            self.levels, reversed(solved), strict=True
+        ):
+            turned = -((ratio @ move[joints_here][..., None])[..., 0] + rest)
+            spin[joints_here] = turned
+            above = np.asarray(joints_here)[owner]
+            move[children] = move[above] + np.cross(turned[owner], bones)
         vectors = spin[self.inner].swapaxes(0, 1)
         # Beyond a radian the linear model means nothing; the next steps go on from there.
         length = np.linalg.norm(vectors, axis=-1, keepdims=True)
         vectors = vectors / np.maximum(length, 1.0)
         turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(frames, -1, 3, 3)
         return move[0], turns
-
-
-def _inner_levels(parents: Sequence[int]) -> list[_Level]:
-    out = []
-    for level in [[0], *levels(parents)]:
-        joints = [joint for joint in level if joint in parents]
-        if joints:
-            children = [c for c, above in enumerate(parents) if above in joints]
-            out.append(_Level(joints, children, [joints.index(parents[c]) for c in children]))
-    return out
 
 
 def _sum_by(values: Floats, owner: Sequence[int]) -> Floats:

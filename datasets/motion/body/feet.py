@@ -84,7 +84,8 @@ def foot_contacts(
         stated = np.asarray(features)[:, layout.slice("foot_contacts")] > 0.5
         slow = stated[:, [1, 3]]  # ankle and ball of the left foot, then of the right one
     else:
-        slow = _speeds(balls, fps) < options.speed
+        way = np.gradient(balls[..., [0, 2]], axis=0) if len(balls) > 1 else np.zeros((1, 2, 2))
+        slow = np.linalg.norm(way * fps, axis=-1) < options.speed
     shortest = max(1, round(options.shortest * fps))
     standing = low & slow
     # Gaps first: a contact that flickers is one contact, and only then may a short one be dropped.
@@ -129,14 +130,6 @@ def plant_feet(
 
 def _balls(skeleton: Skeleton) -> list[int]:
     return [skeleton.index(f"{side}_foot") for side in SIDES]
-
-
-def _speeds(points: NDArray[np.float64], fps: float) -> NDArray[np.float64]:
-    """Speed along the floor [T, ...] of points [T, ..., 3] in m/s, over two steps where possible."""
-    if len(points) < 2:
-        return np.zeros(points.shape[:-1])
-    way = np.gradient(points[..., [0, 2]], axis=0) * fps
-    return np.asarray(np.linalg.norm(way, axis=-1), dtype=np.float64)
 
 
 def _slide(balls: NDArray[np.float64], contacts: NDArray[np.bool_], fps: float) -> float:

@@ -95,7 +95,10 @@ def reached(
             # Elbows and knees give way, so that a hand or foot is reached by bending, not by moving the body.
             weights[:, skeleton.parents[joint]] = np.minimum(weights[:, skeleton.parents[joint]], _BENDS)
         # Fingers follow their wrist, and toes their ankle.
-        for joint, above in enumerate(_nearest_pinned(skeleton, pinned_joints)):
+        nearest: list[int | None] = []
+        for joint, parent in enumerate(skeleton.parents):
+            above = joint if joint in changes else nearest[parent] if parent >= 0 else None
+            nearest.append(above)
             if above is not None:
                 targets[:, joint] += np.where(fixed[:, joint, None], 0.0, changes[above])
         for joint in pinned_joints:
@@ -117,14 +120,6 @@ def reached(
         out[rows] += np.where(fixed[rows][..., None], 0.0, posed.joints - figure.joints[rows])
         for key, place in pinned.items():
             missing[key] = missing[key] + np.asarray(place) - out[key]
-    return out
-
-
-def _nearest_pinned(skeleton: Skeleton, pinned: Sequence[int]) -> list[int | None]:
-    """For every joint itself or the nearest joint above it that is pinned."""
-    out: list[int | None] = []
-    for joint, parent in enumerate(skeleton.parents):
-        out.append(joint if joint in pinned else out[parent] if parent >= 0 else None)
     return out
 
 

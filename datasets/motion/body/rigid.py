@@ -108,6 +108,8 @@ def measured_skeleton(joints: NDArray[np.floating], skeleton: Skeleton) -> Skele
 
     Bones of joints with one child keep the rest pose's direction, so that the rest stays a T-pose.
     """
+    from scipy.spatial.transform import Rotation
+
     points = np.asarray(joints, dtype=np.float64)
     parents = np.asarray(skeleton.parents)
     own = skeleton.with_lengths_of(points)
@@ -127,7 +129,8 @@ def measured_skeleton(joints: NDArray[np.floating], skeleton: Skeleton) -> Skele
             ends = np.flatnonzero((parents == joint) & (lengths[:, 0] > _NO_BONE))
             seen = np.einsum("tji,tcj->tci", world[:, joint], bones[:, ends])
             middle = np.median(seen, axis=0)
-            offsets[ends] = _turned_back(middle, skeleton.offsets[ends])
+            if len(ends):  # the bones as a whole lie over their rest offsets as well as they can
+                offsets[ends] = Rotation.align_vectors(skeleton.offsets[ends], middle)[0].apply(middle)
         size = np.linalg.norm(offsets, axis=-1, keepdims=True)
         offsets *= lengths / np.where(size > _NO_BONE, size, 1.0)
         own = with_offsets(skeleton, offsets)
@@ -187,16 +190,6 @@ def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
 def with_offsets(skeleton: Skeleton, offsets: NDArray[np.floating]) -> Skeleton:
     """The skeleton with other rest offsets [N, 3]."""
     return replace(skeleton, rest=tuple((float(x), float(y), float(z)) for x, y, z in offsets))
-
-
-def _turned_back(bones: Floats, rest: Floats) -> Floats:
-    """A joint's bones [C, 3] turned as a whole so that they lie over its rest offsets as well as they can."""
-    from scipy.spatial.transform import Rotation
-
-    if not len(bones):
-        return bones
-    turn, _ = Rotation.align_vectors(rest, bones)
-    return np.asarray(turn.apply(bones), dtype=np.float64)
 
 
 def _check(joints: NDArray[np.floating], skeleton: Skeleton, rotations: NDArray[np.floating] | None) -> None:

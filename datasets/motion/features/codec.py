@@ -39,7 +39,10 @@ def encode(
         out[start : start + group] = kernel(clips[start : start + group], layout)
     out = out.reshape(*joints.shape[:-3], frames, layout.dim)
     if face is not None:
-        _check_face(face, joints, layout)
+        if not layout.has("face"):
+            raise UserError(f"layout {layout.name} has no face columns; wholebody363 has")
+        if face.shape != (*joints.shape[:-2], FACE_DIMS):
+            raise UserError(f"face of shape {list(face.shape)} does not fit joints {list(joints.shape)}")
         out[..., layout.slice("face")] = face[..., :frames, :]
     return out
 
@@ -63,25 +66,12 @@ def face_of(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.
 
 
 def _check_family(layout: MotionLayout) -> None:
-    if not layout.has("root_yaw_velocity"):
+    if layout.family == "raw" or not layout.has("root_yaw_velocity"):
         raise UserError(
-            f"layout {layout.name} is raw parameters, not motion features; convert it to joints first"
+            f"layout {layout.name} (family '{layout.family}') is raw parameters; convert it to joints first"
         )
-    if layout.family == "raw":
-        raise UserError(f"layout {layout.name} says family 'raw'; motion features are 'exact' or 'h3d'")
     if layout.family == "exact" and layout.has("rotations_6d"):
         raise UserError(f"layout {layout.name} holds rotations and contacts, which only the h3d family has")
-
-
-def _check_face(face: NDArray[np.floating], joints: NDArray[np.floating], layout: MotionLayout) -> None:
-    if not layout.has("face"):
-        raise UserError(f"layout {layout.name} has no face columns; use wholebody363 for clips with a face")
-    wanted = (*joints.shape[:-2], FACE_DIMS)
-    if face.shape != wanted:
-        raise UserError(
-            f"face of shape {list(face.shape)} does not fit joints {list(joints.shape)}: "
-            f"expected {list(wanted)}"
-        )
 
 
 def _check_joints(joints: NDArray[np.floating], layout: MotionLayout) -> None:

@@ -9,6 +9,7 @@ figure's local rotations.
 from __future__ import annotations
 
 import io
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -113,8 +114,11 @@ class _Scene:
         self.gltf.nodes += [Node(name="body", mesh=0, skin=0), Node(name="head_mesh", mesh=1, skin=0)]
         self.gltf.nodes.append(Node(name="figure", children=[0]))
         self.gltf.scenes = [Scene(name="scene", nodes=[count + 2, count, count + 1])]
-        names = _distinct([clip.name for clip in clips])
-        for name, clip, figure in zip(names, clips, figures, strict=True):
+        names = Counter[str]()
+        for clip, figure in zip(clips, figures, strict=True):
+            name = clip.name or "motion"
+            names[name] += 1  # tools tell animations apart by name, so a repeated one gets a number
+            name = name if names[name] == 1 else f"{name} ({names[name]})"
             self._animation(name, clip, figure, head=count + 1)
         self.gltf.buffers = [Buffer(byteLength=len(self.blob))]
         self.gltf.set_binary_blob(bytes(self.blob))
@@ -252,18 +256,6 @@ def _unit(vectors: Values) -> NDArray[np.float32]:
     """Unit vectors [..., C] to float32's last digit, as validators ask."""
     rounded = np.asarray(vectors, dtype=np.float64)
     out: NDArray[np.float32] = (rounded / np.linalg.norm(rounded, axis=-1, keepdims=True)).astype(np.float32)
-    return out
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    """Names that tools can tell apart: a repeated one gets a number."""
-    out: list[str] = []
-    for name in names:
-        number, wanted = 2, name or "motion"
-        base = wanted
-        while wanted in out:
-            wanted, number = f"{base} ({number})", number + 1
-        out.append(wanted)
     return out
 
 

@@ -113,7 +113,7 @@ def test_face_columns() -> None:
     np.testing.assert_array_equal(face_of(features, layout), face)
     np.testing.assert_array_equal(face_of(encode(joints, layout), layout), 0.0)
     np.testing.assert_array_equal(features[:, :313], encode(joints, layout)[:, :313])
-    with pytest.raises(UserError, match=r"expected \[20, 50\]"):
+    with pytest.raises(UserError, match=r"face of shape \[19, 50\]"):
         encode(joints, layout, face[:-1])
     with pytest.raises(UserError, match="face"):
         encode(clip(BODY, 20, 0.0), BODY, face)
