@@ -116,7 +116,7 @@ def _plain(truth: Truth, rng: np.random.Generator, hands: bool) -> str:
         return _pick(rng, table.actions[_key(part)]).format(
             v=f" {_pick(rng, table.speed[part.speed])}" if part.speed else "",
             n=f" {_pick(rng, table.times[part.count])}" if part.count else "",
-            s=_plain_limb(part, rng),
+            s=_limb(part, rng) if part.action in ("wave", "raise") else part.side or "",
             b=part.bpm,
             t=_tempo(part),
         )
@@ -135,7 +135,7 @@ def _varied(truth: Truth, rng: np.random.Generator, hands: bool, bare: bool = Fa
         phrases = table.actions[_key(part)]
         return _pick(rng, table.bare.get(_key(part), phrases) if bare else phrases).format(
             s=part.side,
-            h=_varied_limb(part, rng),
+            h=_limb(part, rng, "both of the {}s", "the two {}s"),
             n=f" {_pick(rng, table.times[part.count])}" if part.count else "",
             v=f" {_pick(rng, table.speed[part.speed])}" if part.speed else "",
             b=part.bpm,
@@ -198,18 +198,12 @@ def _tempo(truth: Truth) -> str:
     return "slow" if bpm < 100 else "moderate" if bpm < 125 else "fast"
 
 
-def _plain_limb(truth: Truth, rng: np.random.Generator) -> str:
-    if truth.action not in ("wave", "raise"):
-        return truth.side or ""
+def _limb(truth: Truth, rng: np.random.Generator, *more: str) -> str:
+    """The hand or arm that acts; `more` are other words for "both {}s"."""
     word = "hand" if truth.action == "wave" else _pick(rng, ("arm", "hand"))
-    return f"both {word}s" if truth.side == "both" else f"the {truth.side} {word}"
-
-
-def _varied_limb(truth: Truth, rng: np.random.Generator) -> str:
-    word = "hand" if truth.action == "wave" else _pick(rng, ("arm", "hand"))
-    if truth.side == "both":
-        return _pick(rng, (f"both {word}s", f"both of the {word}s", f"the two {word}s"))
-    return f"the {truth.side} {word}"
+    if truth.side != "both":
+        return f"the {truth.side} {word}"
+    return (_pick(rng, ("both {}s", *more)) if more else "both {}s").format(word)
 
 
 def _hand_phrases(

@@ -172,15 +172,11 @@ def _phrases(song: Song, numbers: list[int], rng: np.random.Generator) -> list[_
             out.append(out[-1])
             continue
         phrase = _draw_phrase(song, number, energy, rng)
-        while out and _alike(phrase, out[-1]):
+        # Of legs, arms and how the arms share them two differ from the phrase before.
+        while out and sum(getattr(phrase, of) != getattr(out[-1], of) for of in ("legs", "arms", "way")) < 2:
             phrase = _draw_phrase(song, number, energy, rng)
         out.append(phrase)
     return out
-
-
-def _alike(one: _Phrase, other: _Phrase) -> bool:
-    """Whether less than two of legs, arms and how the arms share them differ."""
-    return (one.legs != other.legs) + (one.arms != other.arms) + (one.way != other.way) < 2
 
 
 def _draw_phrase(song: Song, number: int, energy: float, rng: np.random.Generator) -> _Phrase:
@@ -188,19 +184,15 @@ def _draw_phrase(song: Song, number: int, energy: float, rng: np.random.Generato
     if energy == 0:
         legs, arms, way = "stand", _one_of(FREEZES[song.genre], rng), "freeze"
     else:
-        legs = _draw_legs(genre.style, energy, rng)
+        weights = dict(QUIET_LEGS[genre.style] if energy < _QUIET else LEGS_OF[genre.style])
+        if energy > _LOUD:
+            weights["round"] = 0.1 * sum(weights.values())
+        chances = np.array(list(weights.values()))
+        legs = list(weights)[int(rng.choice(len(chances), p=chances / chances.sum()))]
         own = rng.random() < _OWN_ARMS
         arms = genre.arms[song.section(number)] if own else _one_of(MORE_ARMS[song.genre], rng)
         way = _one_of(ARM_WAYS, rng)
     return _Phrase(legs, arms, way, float(rng.normal(0.0, 0.05)), float(rng.uniform(-0.06, 0.1)))
-
-
-def _draw_legs(style: Style, energy: float, rng: np.random.Generator) -> str:
-    weights = dict(QUIET_LEGS[style] if energy < _QUIET else LEGS_OF[style])
-    if energy > _LOUD:
-        weights["round"] = 0.1 * sum(weights.values())
-    chances = np.array(list(weights.values()))
-    return list(weights)[int(rng.choice(len(chances), p=chances / chances.sum()))]
 
 
 def _one_of(choices: Sequence[_T], rng: np.random.Generator) -> _T:

@@ -30,15 +30,14 @@ from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.actions import arms, floor, legs, locomotion
-from motionloom.datasets.synth.actions.maths import Array
-from motionloom.datasets.synth.actions.pose import Track
+from motionloom.datasets.synth.actions.maths import Array, ease
+from motionloom.datasets.synth.actions.pose import OVERLAP, Track, joined
 from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, Span, Truth, draw, require_known
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
-from motionloom.datasets.synth.chain import animate_in_turn
 from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
 from motionloom.datasets.synth.dances import Dance, DanceConfig, DanceTruth, dance, plan_dance
 from motionloom.datasets.synth.face import express
-from motionloom.datasets.synth.hands import shape_hand
+from motionloom.datasets.synth.hands import grip_hand, shape_hand
 from motionloom.datasets.synth.music.performance import render_song, song_features
 
 CONVERTER_VERSION = 2  # the face's words are about the body's person
@@ -127,26 +126,19 @@ class SynthConfig(Config):
             )
         if self.val_fraction + self.test_fraction >= 1:
             raise ValueError("val_fraction and test_fraction leave nothing to train on")
-        if self.dances is not None:
-            self._check_dances(self.dances)
-        return self
-
-    def _check_dances(self, dances: DanceConfig) -> None:
-        danced = "dance" in self.action_names
-        if not danced and dances.share is None:
+        dances = self.dances
+        if dances is not None and dances.share is None and "dance" not in self.action_names:
             raise ValueError("`dances` is given but `actions` has no dance; add it, or give dances.share")
-        if dances.share is not None and dances.share < 1 and not self.other_actions:
+        if dances is not None and dances.share is not None and dances.share < 1 and not self.other_actions:
             raise ValueError("dances.share below 1 needs other actions than dance")
-        if dances.song_seconds < self.min_seconds:
+        if dances is not None and dances.song_seconds < self.min_seconds:
             raise ValueError("dances.song_seconds is below min_seconds: no clip fits into a song")
+        return self
 
     @property
     def action_names(self) -> list[str]:
-        return (
-            self.actions
-            if isinstance(self.actions, list)
-            else list(BASIC if self.actions == "basic" else ACTIONS)
-        )
+        named = {"basic": list(BASIC), "all": list(ACTIONS)}
+        return self.actions if isinstance(self.actions, list) else named[self.actions]
 
     @property
     def other_actions(self) -> list[str]:
@@ -203,7 +195,13 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
     face = (
         dancing_face(planned.song, begin, track.t, shape) if planned else express(truth.face, track.t, shape)
     )
-    audio, wav = _music_of(planned, layout.fps, config) if planned else (None, None)
+    audio = wav = None
+    if planned and config.dances and planned.comes in ("audio", "both"):
+        rate, end = config.dances.sample_rate, planned.start + planned.frames
+        audio = song_features(planned.song, rate, layout.fps, config.dances.width)[planned.start : end]
+        if config.dances.sound:
+            first, samples = round(begin * rate), round(planned.frames / layout.fps * rate)
+            wav = render_song(planned.song, rate)[first : first + samples], rate
     texts, face_texts = _captions(index, config, truth, planned)
     return Clip(
         joints=canonicalize(solved[:, : layout.num_joints] * size),
@@ -236,25 +234,24 @@ def _captions(
 
 
 def animate(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
-    """The body of one action, or of two in turn."""
+    """The body of one action, or of two in turn with their hands."""
     if truth.parts is None:
         return ANIMATORS[truth.action](truth, span, fps, rng)
-    return animate_in_turn(truth.parts, animate, span, fps, rng)
-
-
-def _music_of(
-    dance: Dance, fps: float, config: SynthConfig
-) -> tuple[NDArray[np.float32] | None, tuple[NDArray[np.float32], int] | None]:
-    """Features [T, 438 or RHYTHM_DIM] and sound of a dance, where it comes with them."""
-    if config.dances is None or dance.comes not in ("audio", "both"):
-        return None, None
-    rate = config.dances.sample_rate
-    rows = song_features(dance.song, rate, fps, config.dances.width)[dance.start : dance.start + dance.frames]
-    if not config.dances.sound:
-        return rows, None
-    first = round(dance.start / fps * rate)
-    samples = render_song(dance.song, rate)[first : first + round(dance.frames / fps * rate)]
-    return rows, (samples, rate)
+    # Each is as long as half of the span allows; the second begins where the first has ended.
+    half = Span(1.9, 0.5 * (span.high + OVERLAP), returns=True)
+    first, second = (animate(part, half, fps, rng) for part in truth.parts)
+    track = joined(first, second)
+    change = len(first.t) / fps - 0.5 * OVERLAP
+    for side in (0, 1):
+        # The same noise on both sides of the change, where the hand is relaxed.
+        seed = int(rng.integers(2**32))
+        grips = (ease((change - track.t) / 0.3), ease((track.t - change) / 0.3))
+        before, after = (
+            grip_hand(part.hand(side), track.t, grip, np.random.default_rng(seed))
+            for part, grip in zip(truth.parts, grips, strict=True)
+        )
+        track.fingers[side] = np.where((track.t < change)[:, None, None, None], before, after)
+    return track
 
 
 def dance_of(index: int, config: SynthConfig) -> Dance | None:

@@ -19,14 +19,10 @@ THRESHOLD = 0.35 * APEX
 """Below this length along every emotion a face is neutral."""
 
 
-def _basis() -> NDArray[np.float64]:
-    index = np.arange(FACE_DIMS)
-    waves = [np.cos(np.pi * (index + 0.5) * (k + 1) / 24) * np.exp(-index / 18) for k in range(8)]
-    q, r = np.linalg.qr(np.stack(waves).T)
-    return np.asarray(q * np.sign(np.diag(r)))
-
-
-BASIS = _basis()
+_INDEX = np.arange(FACE_DIMS)
+_WAVES = [np.cos(np.pi * (_INDEX + 0.5) * (k + 1) / 24) * np.exp(-_INDEX / 18) for k in range(8)]
+_Q, _R = np.linalg.qr(np.stack(_WAVES).T)
+BASIS: NDArray[np.float64] = _Q * np.sign(np.diag(_R))
 """Orthonormal columns [50, 8]; see the module's description."""
 
 

@@ -107,7 +107,12 @@ def squat(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     for k in range(count):
         at = begin + k * period
         bent += _bump(track.t, at, down * squeeze, hold * squeeze)
-    _lower(track, bent, depth, back=rng.uniform(0.1, 0.15), pitch=rng.uniform(0.5, 0.7))
+    back, pitch = rng.uniform(0.1, 0.15), rng.uniform(0.5, 0.7)
+    track.root[:, 1] -= depth * bent
+    track.root[:, 2] -= back * bent
+    track.pelvis[:, 0] += 0.6 * pitch * bent
+    track.spine[:, 0] += 0.4 * pitch * bent
+    track.head[:, 0] -= 0.5 * pitch * bent
     track.knee_out += 0.25 * bent
     end = begin + count * period - gap * squeeze
     out = (rng.uniform(0.0, 0.15), rng.uniform(-0.15, 0.05), 1.0)
@@ -237,14 +242,6 @@ def bow(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track
         track.arms[side].direction += bent[:, None] * np.array([-0.1, 0.0, rng.uniform(0.25, 0.45) * deep])
     track.lower_to_reach()
     return track
-
-
-def _lower(track: Track, bent: Array, depth: float, back: float, pitch: float) -> None:
-    track.root[:, 1] -= depth * bent
-    track.root[:, 2] -= back * bent
-    track.pelvis[:, 0] += 0.6 * pitch * bent
-    track.spine[:, 0] += 0.4 * pitch * bent
-    track.head[:, 0] -= 0.5 * pitch * bent
 
 
 def _bump(t: Array, begin: float, rise: float, hold: float) -> Array:

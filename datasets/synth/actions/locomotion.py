@@ -172,10 +172,10 @@ class Step:
     end: float
     xz: tuple[float, float]
     yaw: float
-    height: float = 0.04
-    off: float = 0.7
+    height: float
+    off: float
     """Heel-up angle at toe-off, radians."""
-    land: float = -0.3
+    land: float
     """Foot pitch at landing; negative is heel first."""
 
 
@@ -243,7 +243,9 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
         times, values = [-1e3], [0.0]
         for step in mine:
             span = step.end - step.start
-            s = _carry((t - step.start) / span)
+            # Gentler than `ease`, so that the foot lags less behind a fast body.
+            s = np.clip((t - step.start) / span, 0.0, 1.0)
+            s = s * s * (3.0 - 2.0 * s)
             xz += s[:, None] * (np.asarray(step.xz) - before)
             yaw += s * (step.yaw - before_yaw)
             before, before_yaw = np.asarray(step.xz), step.yaw
@@ -278,12 +280,6 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
     track.spine[:, 2] -= 0.03 * share
     lead = smooth(ahead, 0.25 * window, fps)
     return np.asarray(lead / max(np.abs(lead).max(), 0.25))
-
-
-def _carry(x: Array) -> Array:
-    """Path of a swinging foot, 0 to 1: gentler than `ease`, so that it lags less behind a fast body."""
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
 
 
 def swing_body(track: Track, lead: Array, stride: Stride, moving: Array, amount: float = 1.0) -> None:

@@ -9,7 +9,7 @@ side is its mirror image, so one set of numbers serves both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.synth.actions.maths import (
     Array,
     cross,
+    ease,
     lower_envelope,
     rot_x,
     rot_y,
@@ -35,6 +36,8 @@ SHOULDER = SKELETON.rest_joints[16] - SKELETON.rest_joints[9]
 """Left shoulder seen from the chest joint (spine3) at rest."""
 UPPER_ARM, FOREARM = (float(np.linalg.norm(OFFSETS[j])) for j in (18, 20))
 ARM = UPPER_ARM + FOREARM
+OVERLAP = 0.4
+"""Seconds in which one action passes into the next."""
 LEG_REACH = 0.988
 """Longest hip-to-ankle distance as a fraction of the straight leg."""
 _MIRROR = np.outer([-1.0, 1.0, 1.0], [-1.0, 1.0, 1.0])
@@ -54,40 +57,31 @@ class Arm:
     flex: Array  # [T] wrist flexion towards the palm
 
 
-@dataclass
+BODY = ("root", "yaw", "pelvis", "spine", "head")
+FEET = ("ball", "foot_yaw", "foot_pitch", "knee_out")
+"""What a track holds over time [T, ...], and for both feet [2, T, ...]."""
+
+
 class Track:
     """A clip before it is solved. Index 0 is left, 1 right."""
 
-    t: Array
-    fps: float
-    root: Array = field(init=False)
-    yaw: Array = field(init=False)
-    pelvis: Array = field(init=False)
-    spine: Array = field(init=False)
-    head: Array = field(init=False)
-    ball: Array = field(init=False)
-    foot_yaw: Array = field(init=False)
-    foot_pitch: Array = field(init=False)
-    knee_out: Array = field(init=False)
-    arms: tuple[Arm, Arm] = field(init=False)
-    fingers: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        n = len(self.t)
-        self.root = np.tile([0.0, STAND - 0.008, 0.0], (n, 1))
-        self.yaw = np.zeros(n)
-        self.pelvis = np.zeros((n, 3))  # pitch, yaw, roll
-        self.spine = np.zeros((n, 3))
-        self.head = np.zeros((n, 3))
-        self.ball = np.zeros((2, n, 3))
+    def __init__(self, t: Array, fps: float) -> None:
+        n = len(t)
+        self.t, self.fps = t, fps
+        self.root: Array = np.tile([0.0, STAND - 0.008, 0.0], (n, 1))
+        self.yaw: Array = np.zeros(n)
+        self.pelvis: Array = np.zeros((n, 3))  # pitch, yaw, roll
+        self.spine: Array = np.zeros((n, 3))
+        self.head: Array = np.zeros((n, 3))
+        self.ball: Array = np.zeros((2, n, 3))
         self.ball[:, :, 2] = BALL[1]
         self.ball[0, :, 0], self.ball[1, :, 0] = BALL[0], -BALL[0]
-        self.foot_yaw = np.zeros((2, n))
+        self.foot_yaw: Array = np.zeros((2, n))
         self.foot_yaw[0], self.foot_yaw[1] = 0.1, -0.1
-        self.foot_pitch = np.zeros((2, n))
-        self.knee_out = np.zeros((2, n))
+        self.foot_pitch: Array = np.zeros((2, n))
+        self.knee_out: Array = np.zeros((2, n))
         self.arms = (hanging_arm(n), hanging_arm(n))
-        self.fingers = np.tile(np.eye(3), (2, n, 15, 1, 1))
+        self.fingers: Array = np.tile(np.eye(3), (2, n, 15, 1, 1))
 
     @staticmethod
     def standing(seconds: float, fps: float, rng: np.random.Generator, width: float | None = None) -> Track:
@@ -116,13 +110,11 @@ class Track:
         """`frames` frames of the track from frame `first` on."""
         part = slice(first, first + frames)
         out = Track(self.t[part] - self.t[first], self.fps)
-        for name in ("root", "yaw", "pelvis", "spine", "head"):
+        for name in BODY:
             setattr(out, name, getattr(self, name)[part])
-        for name in ("ball", "foot_yaw", "foot_pitch", "knee_out", "fingers"):
+        for name in (*FEET, "fingers"):
             setattr(out, name, getattr(self, name)[:, part])
-        left, right = (
-            Arm(a.direction[part], a.reach[part], a.bend[part], a.roll[part], a.flex[part]) for a in self.arms
-        )
+        left, right = (Arm(*(values[part] for values in vars(arm).values())) for arm in self.arms)
         out.arms = (left, right)
         return out
 
@@ -217,6 +209,49 @@ class Track:
         parts = (collar, collar.swapaxes(-1, -2) @ upper, upper.swapaxes(-1, -2) @ lower, rot_z(-arm.flex))
         for joint, rotation in zip((13, 16, 18, 20), parts, strict=True):
             local[:, joint + side] = rotation * _MIRROR if side else rotation
+
+
+def joined(first: Track, second: Track) -> Track:
+    """One track of two that begin and end standing; the feet are set one after the other into new places."""
+    fps = first.fps
+    shared = round(OVERLAP * fps)
+    start, frames = len(first.t) - shared, len(first.t) - shared + len(second.t)
+    out = Track(np.arange(frames) / fps, fps)
+    turn = float(first.yaw[-1])
+    cos, sin = np.cos(turn), np.sin(turn)
+
+    def placed(xyz: Array) -> Array:
+        x, z = xyz[..., 0] - old[0], xyz[..., 2] - old[1]
+        moved = xyz.copy()
+        moved[..., 0], moved[..., 2] = cos * x + sin * z + new[0], cos * z - sin * x + new[1]
+        return moved
+
+    new = first.ball[:, -1].mean(0)[[0, 2]]
+    old = second.ball[:, 0].mean(0)[[0, 2]]
+    progress = (np.arange(frames) - start) / max(shared - 1, 1)
+
+    def mixed(a: Array, b: Array, weight: Array) -> Array:
+        a = np.concatenate([a, np.repeat(a[-1:], frames - len(a), axis=0)])
+        b = np.concatenate([np.repeat(b[:1], frames - len(b), axis=0), b])
+        return a + weight.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)
+
+    weight = ease(progress)
+    out.root = mixed(first.root, placed(second.root), weight)
+    out.yaw = mixed(first.yaw, second.yaw + turn, weight)
+    for name in BODY[2:]:
+        setattr(out, name, mixed(getattr(first, name), getattr(second, name), weight))
+    for side in (0, 1):
+        step = np.clip(2 * progress - side, 0.0, 1.0)
+        out.ball[side] = mixed(first.ball[side], placed(second.ball[side]), ease(step))
+        out.ball[side, :, 1] += 0.03 * np.sin(np.pi * step) ** 2
+        out.foot_yaw[side] = mixed(first.foot_yaw[side], second.foot_yaw[side] + turn, ease(step))
+        for name in FEET[2:]:
+            getattr(out, name)[side] = mixed(getattr(first, name)[side], getattr(second, name)[side], weight)
+        for name in vars(out.arms[side]):
+            before, after = (getattr(track.arms[side], name) for track in (first, second))
+            setattr(out.arms[side], name, mixed(before, after, weight))
+    out.lower_to_reach()
+    return out
 
 
 def hanging_arm(frames: int) -> Arm:
