@@ -73,19 +73,6 @@ def test_columns_of_a_circle_to_the_left() -> None:
     np.testing.assert_allclose(root, [[0, 0, speed]] * frames, atol=1e-6)
 
 
-def test_velocities_are_the_steps_in_the_heading_frame_and_the_last_frame_repeats() -> None:
-    joints = clip(BODY, 80, 1.2)
-    features = encode(joints, BODY)
-    back = decode(features, BODY)
-    heading = np.concatenate([[0], np.cumsum(features[:-1, 0].astype(np.float64))])
-    for frame in (0, 20, 78):
-        step = turn(back[frame + 1] - back[frame], -heading[frame])
-        np.testing.assert_allclose(features[frame, BODY.slice("velocities")], step.ravel(), atol=1e-6)
-    for field in ("root_yaw_velocity", "root_xz_velocity", "velocities"):
-        columns = BODY.slice(field)
-        np.testing.assert_array_equal(features[-1, columns], features[-2, columns])
-
-
 def test_batches_and_any_leading_dimensions_equal_single_clips() -> None:
     layout = MotionLayout.named("wholebody363")
     joints = np.stack([clip(layout, 50, turns, seed) for seed, turns in enumerate((0.0, 1.0, -2.0, 3.0))])

@@ -246,48 +246,6 @@ def test_planted_feet_stay_where_they_stand_and_the_report_says_so() -> None:
     assert moved < 1.5 * 0.1 / 3
 
 
-def walking(frames: int = 80, sliding: float = 0.3) -> NDArray[np.float64]:
-    """Legs that swing by sines while the root goes faster than they step: one foot is down at a time."""
-    time = np.arange(frames) / FPS
-    local = np.broadcast_to(np.eye(3), (frames, 22, 3, 3)).copy()
-    for side, sign in (("left", 1.0), ("right", -1.0)):
-        swing = sign * np.sin(2 * np.pi * 0.9 * time)
-        bend = 0.9 * np.clip(
-            sign * np.cos(2 * np.pi * 0.9 * time), 0, 1
-        )  # the knee bends while it swings ahead
-        local[:, SKELETON.index(f"{side}_hip")] = Rotation.from_euler(
-            "x", (-0.35 * swing - bend / 2)[:, None]
-        ).as_matrix()
-        local[:, SKELETON.index(f"{side}_knee")] = Rotation.from_euler("x", bend[:, None]).as_matrix()
-    joints, _ = forward_kinematics(local, np.zeros((frames, 3)), SKELETON.offsets, SKELETON.parents)
-    joints[..., 1] -= joints[:, BALLS, 1].min(axis=1)[:, None]
-    # The root goes on by as much as the lower foot goes back, and slides on top of that.
-    lower = joints[:, BALLS, 1].argmin(axis=1)
-    back = -np.diff(joints[:, BALLS, 2], axis=0)[np.arange(frames - 1), lower[1:]]
-    path = np.concatenate([[0], np.cumsum(back)]) + sliding * time
-    joints[..., 2] += path[:, None]
-    return joints
-
-
-def test_a_walk_keeps_its_swing() -> None:
-    joints = walking()
-    fitted = fit_rigid(joints, SKELETON)
-    contacts = foot_contacts(fitted.joints, SKELETON, FPS)
-    assert 0.2 < contacts.mean() < 0.8
-    planted, report = plant_feet(fitted, joints, contacts, FPS)
-    assert report.slide_before > 15
-    assert report.slide_after < 0.1 * report.slide_before
-    away = np.linalg.norm(planted.joints - fitted.joints, axis=-1)
-    assert away[:, SKELETON.index("head")].max() < 0.05
-    # A foot in the air, farther from its contacts than the blend, goes where it went.
-    near = np.zeros_like(contacts)
-    for shift in range(-4, 5):
-        near |= np.roll(contacts, shift, axis=0)
-    for foot, ball in enumerate(BALLS):
-        swinging = ~near[:, foot]
-        assert away[swinging, ball].max(initial=0.0) < 2e-3
-
-
 def posed(skeleton: Skeleton, frames: int = 12, seed: int = 0) -> tuple[Floats, RigidMotion]:
     """Local rotations of a smooth random motion, and the motion fitted to its joints."""
     local, _, joints = moving(skeleton, frames, seed, size=0.3)

@@ -7,7 +7,6 @@ text encoder of the installation, computed once for the sentences below.
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 
 import pytest
 import torch
@@ -67,36 +66,3 @@ def test_by_hand() -> None:
     assert cider_d([cat, ["dog"]], [[cat], [["dog"]]]) == pytest.approx([10, 2.5])  # of one word, one of four
     assert cider_d([cat], [[cat]]) == [0]
     assert words_of("A counter-clockwise TURN, man's!") == ["a", "counter-clockwise", "turn", "man's"]
-
-
-def test_cider_d_is_its_definition_written_out() -> None:
-    """Of pairs of words alone, counted without tables, for sentences of one length."""
-    said, known = [["a", "b", "c"], ["a", "b", "a"]], [[["a", "b", "d"]], [["b", "a", "b"]]]
-
-    def vector(words: list[str]) -> dict[tuple[str, str], float]:
-        pairs = list(pairwise(words))
-        holding = {p: sum(p in set(pairwise(one)) for own in known for one in own) for p in pairs}
-        return {p: pairs.count(p) * math.log(2 / max(holding[p], 1)) for p in pairs}
-
-    def cosine(one: list[str], other: list[str]) -> float:
-        a, b = vector(one), vector(other)
-        shared = sum(min(a[p], b[p]) * b[p] for p in a if p in b)
-        norms = math.hypot(*a.values()) * math.hypot(*b.values())
-        return shared / norms if norms else 0.0
-
-    longer = [cider_d(said, known)[row] for row in range(2)]
-    singles = [2.5 * _singles(said[row], known[row][0], known) for row in range(2)]
-    pairs = [2.5 * cosine(said[row], known[row][0]) for row in range(2)]
-    assert longer == pytest.approx([one + two for one, two in zip(singles, pairs, strict=True)])
-
-
-def _singles(one: list[str], other: list[str], known: list[list[list[str]]]) -> float:
-    def vector(words: list[str]) -> dict[str, float]:
-        return {
-            w: words.count(w) * math.log(2 / max(sum(w in text for own in known for text in own), 1))
-            for w in words
-        }
-
-    a, b = vector(one), vector(other)
-    norms = math.hypot(*a.values()) * math.hypot(*b.values())
-    return sum(min(a[w], b[w]) * b[w] for w in a if w in b) / norms if norms else 0.0

@@ -33,7 +33,6 @@ from motionloom.pipeline.render.body.face import (
 )
 from motionloom.pipeline.render.body.mesh import (
     Body,
-    Detail,
     asset,
     body_for,
     colours,
@@ -171,38 +170,6 @@ def test_shapes_move_the_face_and_nothing_else() -> None:
     assert blink["Left"][left].max() > 0.005 > 1e-3 > blink["Left"][~left].max()
     both = body.shapes["eyeBlinkLeft"] + body.shapes["eyeBlinkRight"]
     np.testing.assert_allclose(both, body.shapes["blink"], atol=5e-4)
-
-
-@pytest.mark.parametrize("detail", ["near", "far"])
-def test_fingers_move_apart_and_lips_open(detail: Detail) -> None:
-    body = neutral_body("smplx52", detail)
-    # From its second joint on, a finger has neither a weight nor a triangle in common with another.
-    names = [name[:-1] if name[-1] in "23" and "spine" not in name else "" for name in SMPLX.joints]
-    fingers = sorted(set(names) - {""})
-    shares = np.stack([dense(body)[:, np.array(names) == finger].sum(axis=1) for finger in fingers], axis=1)
-    assert len(fingers) == 10 and (shares > 0.5).any(axis=0).all()
-    assert ((shares > 0).sum(axis=1) <= 1).all()
-    assert ((shares[body.triangles] > 0.25).any(axis=1).sum(axis=1) <= 1).all()
-    # What is dark red lies behind the lips, and the lips' middle lets it be seen.
-    x, y, z = body.vertices.T
-    lips, hollow = (np.flatnonzero((body.swatch == s) & (np.abs(x) < 0.005)) for s in (8, 9))
-    assert len(hollow) > 1 and z[hollow].mean() < z[lips].mean() - 0.01
-    sinks = body.shapes["mouth_open"][lips, 1]
-    assert sinks.min() < -0.015 and sinks.max() > -0.002 and np.abs(y[lips] - y[hollow].mean()).min() < 0.002
-
-
-def test_sad_is_not_neutral() -> None:
-    """Corners of the mouth down, inner brows up, lids half shut; an angry brow is turned over."""
-    body = neutral_body()
-    for name, corners, inner_brow in (("sad", -1, 1), ("angry", -1, -1), ("happy", 1, 0)):
-        move = body.shapes[name][:, 1]
-        lips, brows, white = (np.flatnonzero(body.swatch == swatch) for swatch in (8, 7, 5))
-        away = np.abs(body.vertices[:, 0])
-        middle = move[lips[away[lips].argmin()]]
-        assert corners * (move[lips[away[lips].argmax()]] - middle) > 0.005
-        slope = move[brows[away[brows].argmin()]] - move[brows[away[brows].argmax()]]
-        assert inner_brow * slope > 0.005 if inner_brow else abs(slope) < 0.001
-        assert move[white].min() < -0.001
 
 
 def test_synthetic_faces_become_the_arkit_shapes_that_mean_them() -> None:

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.camera import FIELD_OF_VIEW, Camera, fit_distance, smooth_path
+from motionloom.pipeline.render.camera import FIELD_OF_VIEW, Camera, fit_distance
 from motionloom.pipeline.render.charts import Line
 from motionloom.pipeline.render.film import write_mp4
 from motionloom.pipeline.render.page import Page
@@ -72,14 +72,6 @@ def test_a_figure_fits_its_picture(
     slack = 0.06  # perspective and the tilt may cost a few percent
     assert seen[:, 0].min() > -slack * width and seen[:, 0].max() < (1 + slack) * width
     assert seen[:, 1].min() > -slack * 400 and seen[:, 1].max() < (1 + slack) * 400
-
-
-def test_smooth_path_equals_a_plain_mean() -> None:
-    root = np.random.default_rng(0).normal(size=(30, 3))
-    path = smooth_path(root, fps=10.0)
-    for k in range(30):
-        window = [root[min(max(k + d, 0), 29)] for d in range(-4, 5)]
-        np.testing.assert_allclose(path[k], np.mean(window, axis=0))
 
 
 # ---- viewer file

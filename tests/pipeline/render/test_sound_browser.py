@@ -148,26 +148,6 @@ def test_scrubbing_silences_and_a_new_round_starts_the_sound_again(
     assert_in_step(moments(page, 10))
 
 
-def test_mute_and_volume(visit: Make, until: Make, dance: Path) -> None:
-    page = visit(dance, plays=True)
-    turn_on(page, until)
-    volume = page.get_by_label("Volume")
-    volume.focus()
-    frame = page.evaluate("__viewer.playing")
-    volume.press("Home")
-    until(page, "__viewer.audio.volume === 0")
-    volume.press("ArrowRight")
-    until(page, "Math.abs(__viewer.audio.volume - 0.05) < 1e-9")
-    assert page.evaluate("__viewer.playing") is frame  # the arrow turned the sound up and stepped no frame
-    page.locator("canvas").first.focus()
-    page.keyboard.press("m")
-    until(page, "__viewer.audio.paused && !__viewer.sound")
-    before = page.evaluate("__viewer.frame")
-    until(page, f"__viewer.frame !== {before}")
-    page.keyboard.press("m")
-    until(page, "__viewer.sound && !__viewer.audio.paused")
-
-
 def test_another_motions_music_is_heard_in_its_place(visit: Make, until: Make, songs: Path) -> None:
     page = visit(songs, plays=True)
     assert page.locator(".mlv-hear:visible").count() == 2

@@ -184,13 +184,6 @@ def test_dark_and_light(visit: Any, single: Path, pixels: Any) -> None:
     assert changed(pixels(light), pixels(dark)) < 0.002
 
 
-def test_reduced_motion_starts_still_but_plays_on_request(visit: Any, until: Any, single: Path) -> None:
-    page = visit(single)
-    assert page.evaluate("[__viewer.playing, __viewer.frame]") == [False, 0]
-    page.get_by_role("button", name="Play").click()
-    until(page, "__viewer.frame > 1")
-
-
 def test_unknown_skeletons_and_single_poses_draw(visit: Any, tmp_path: Path, pixels: Any) -> None:
     chain = np.array([[[0, 1, 0], [0, 1.5, 0], [0, 1.8, 0], [0.5, 1, 0], [-0.5, 1, 0]]], float)
     write_viewer(tmp_path / "v.html", [ViewerMotion(chain, 30, [-1, 0, 1, 0, 0], "pose")], "still")

@@ -170,11 +170,3 @@ def test_without_webgl2_or_when_asked_there_are_sticks(
         still(page, 5)
         assert all(mask.sum() > 300 for mask in limbs(pixels(page)))
         page.close()
-
-
-def test_printed_pages_have_the_body(visit: Any, page_file: Path, pixels: Any) -> None:
-    page = visit(page_file, **SIZE)
-    still(page, 5)
-    page.evaluate("window.dispatchEvent(new Event('beforeprint'))")
-    assert all(mask.sum() > 400 for mask in limbs(pixels(page, False)))
-    page.evaluate("window.dispatchEvent(new Event('afterprint'))")
