@@ -1,8 +1,7 @@
 """The clips of a data set that look wrong, for a person to decide about: what `motionloom data clean` shows.
 
-Motions by `faults.py`, and clips that are another one again, as they are or mirrored: by a signature that a
-mirror image shares, heights at eight moments, whose near neighbours are compared joint by joint. Mirror
-images that are declared (`mirror_of`) in the split of their original are meant.
+Motions by `faults.py`, and clips that are another one again, as they are or mirrored (`duplicates.py`).
+Mirror images that are declared (`mirror_of`) in the split of their original are meant.
 
 Decisions about them lie in `cleaned.json` beside the shards, so that they last when the set is converted
 again, and the manifest lists what is left out. Since the manifest's checksum is what a run knows a data set
@@ -11,7 +10,7 @@ by, stages that have read other clips run again. No shard changes.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -22,11 +21,10 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.files import write_json
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.check.duplicates import SAME_METRES, likeness
+from motionloom.datasets.check.duplicates import likeness, near, signature
 from motionloom.datasets.check.faults import Fault, motion_faults
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import (
     CLEANED_FILE,
     MANIFEST_FILE,
@@ -38,17 +36,6 @@ from motionloom.datasets.schema import (
 )
 from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
-
-MOMENTS = 8
-"""Frames of a clip, evenly spread, that its signature is of."""
-NEIGHBOURS = 4
-"""Clips of near signatures that each is compared with."""
-
-_NAMED = Skeleton.named("smpl22")
-_PAIRS = [
-    [_NAMED.index(f"{side}_{joint}") for side in ("left", "right")]
-    for joint in ("wrist", "elbow", "knee", "ankle")
-]
 
 
 class Place(NamedTuple):
@@ -98,7 +85,7 @@ def find_suspects(
                     faults[places[-1]] = found
                 meter.advance()
     twins: dict[Place, Place] = {}
-    for first, second in _near(np.array(signatures)) if places else ():
+    for first, second in near(signatures):
         one, other = places[first], places[second]
         again = None if other in twins else _again(splits, one, other)
         if again is not None:
@@ -122,26 +109,6 @@ def floored_joints(dataset: ShardDataset, clip: int) -> NDArray[np.float64]:
     """Joints [T, N, 3] of a clip; those of raw parameters are moved from their source's axes to the floor."""
     joints = joints_of(dataset.motion(clip), dataset.layout)
     return canonicalize(joints) if dataset.layout.family == "raw" else joints
-
-
-def signature(joints: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return what a clip of joints [T, N, 3] shares with its mirror image and no other: its length in frames,
-    and heights of the pelvis and of the higher and the lower of pairs of joints at some moments [S].
-    """
-    heights = joints[np.linspace(0, len(joints) - 1, MOMENTS).round().astype(int), :, 1]
-    pairs = np.sort(heights[:, _PAIRS], axis=-1)
-    return np.concatenate([[len(joints)], heights[:, 0], pairs.ravel()]).astype(np.float32)
-
-
-def _near(signatures: NDArray[np.float32]) -> Iterator[tuple[int, int]]:
-    """Pairs (earlier, later) of signatures [n, S] that hardly differ, by the later."""
-    from scipy.spatial import KDTree
-
-    reach = SAME_METRES * np.sqrt(signatures.shape[1])
-    most = min(NEIGHBOURS + 1, len(signatures))
-    _, near = KDTree(signatures).query(signatures, k=most, distance_upper_bound=reach)
-    for later, others in enumerate(near.reshape(len(signatures), -1).tolist()):
-        yield from ((other, later) for other in sorted(others) if other < later)
 
 
 def _again(splits: Splits, one: Place, other: Place) -> Fault | None:
