@@ -16,6 +16,7 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.pipeline.evaluation.truth import different_first
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.render.sound import Score, Segment
@@ -131,14 +132,8 @@ def dances_of(
     """
     # A permutation of a fixed seed spreads the choice over the data set, whatever its order.
     order = np.random.default_rng(0).permutation(np.flatnonzero(with_music(dataset)))
-    seen: set[str] = set()
-    first: list[int] = []
-    rest: list[int] = []
-    for index in order.tolist():
-        song = song_of(dataset, index)
-        (rest if song in seen else first).append(index)
-        seen.add(song)
-    clips = (dance_at(dataset, i, unit=unit, seconds=seconds) for i in sorted((first + rest)[:count]))
+    chosen = different_first(order.tolist(), [song_of(dataset, index) for index in order.tolist()])
+    clips = (dance_at(dataset, i, unit=unit, seconds=seconds) for i in sorted(chosen[:count]))
     return [clip for clip in clips if clip is not None]
 
 

@@ -132,29 +132,23 @@ def group_figures(
     rows: Mapping[str, Mapping[str, Estimate]],
     protocol: Protocol,
     notes: Mapping[str, str] | None = None,
+    *,
+    prefix: str = "",
 ) -> list[Figure]:
     """The figures of one table: row -> name of a metric -> its estimate; what a row lacks is left out.
 
-    `notes` says by the name of a metric why its figures are not to be trusted.
+    `notes` says by the name of a metric why its figures are not to be trusted; `prefix` begins their names.
     """
-    return [
-        Figure(
-            metric.name,
-            estimates[metric.name].value,
-            estimates[metric.name].interval,
-            metric.unit,
-            metric.better,
-            row,
-            protocol,
-            group,
-            metric.title,
-            estimates[metric.name].over,
-            (notes or {}).get(metric.name, ""),
-        )
-        for row, estimates in rows.items()
-        for metric in metrics
-        if metric.name in estimates and math.isfinite(estimates[metric.name].value)
-    ]
+    out = []
+    for row, estimates in rows.items():
+        for metric in metrics:
+            found = estimates.get(metric.name)
+            if found is None or not math.isfinite(found.value):
+                continue
+            name, note = f"{prefix}{metric.name}", (notes or {}).get(metric.name, "")
+            shown = (metric.unit, metric.better, row, protocol, group, metric.title)
+            out.append(Figure(name, found.value, found.interval, *shown, found.over, note))
+    return out
 
 
 def facts(values: Mapping[str, Any]) -> dict[str, Fact]:

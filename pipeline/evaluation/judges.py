@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,41 +12,42 @@ from torch import Tensor
 from motionloom.pipeline.evaluation.latent_metrics import Latents
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
-from motionloom.pipeline.store.networks import LoadedTma, MotionJudge, embed_motions
+from motionloom.pipeline.store.networks import LoadedTma, embed_motions
 
 
 @dataclass(frozen=True)
 class Judge:
     """Embeds captions and motions in one space; a judge of faces embeds expressions and their captions."""
 
-    motions: MotionJudge
-    texts: Callable[[Sequence[Truth]], Tensor]
-    """Latents [n, Z] of the captions of n clips."""
+    motions: LoadedTma | LoadedEvaluator
 
-    @staticmethod
-    def tma(tma: LoadedTma) -> Judge:
-        """TMA reads captions by the text stage that it was trained with; that of another run encodes anew
-        what its own data did not say.
+    @property
+    def of_faces(self) -> bool:
+        return self.motions.part == "face"
+
+    def words(self, truths: Sequence[Truth]) -> list[str]:
+        """The captions that it reads."""
+        return [t.face_caption if self.of_faces else t.caption for t in truths]
+
+    def texts(self, truths: Sequence[Truth]) -> Tensor:
+        """Latents [n, Z] of the captions of n clips.
+
+        An evaluator reads captions, or their tags, as it was trained to, and refuses others. TMA reads them
+        by the text stage that it was trained with; that of another run encodes anew what its own data did
+        not say.
         """
-        return Judge(tma, lambda truths: tma.embed_captions([t.caption for t in truths], tma.given["text"]))
+        if isinstance(self.motions, LoadedEvaluator):
+            return self.motions.embed_captions(self.words(truths), [t.tokens for t in truths])
+        text = self.motions.given["text"]
+        return self.motions.embed_captions(self.words(truths), text.cache if self.of_faces else text)
 
-    @staticmethod
-    def evaluator(loaded: LoadedEvaluator) -> Judge:
-        """An evaluator reads captions, or their tags, as it was trained to, and refuses others."""
-        return Judge(
-            loaded,
-            lambda truths: loaded.embed_captions([t.caption for t in truths], [t.tokens for t in truths]),
-        )
-
-    @staticmethod
-    def faces(tma: LoadedTma) -> Judge:
-        return Judge(
-            tma, lambda truths: tma.embed_captions([t.face_caption for t in truths], tma.given["text"].cache)
-        )
+    def judged(self, truths: Sequence[Truth]) -> list[Truth]:
+        """The clips that it can judge: those with faces, where it judges faces."""
+        return [t for t in truths if not self.of_faces or t.face is not None]
 
     def read(self, truth: Truth) -> NDArray[np.float32]:
         """The features of a clip that are judged: of body and hands, or its expression."""
-        if self.motions.part != "face":
+        if not self.of_faces:
             return truth.features
         if truth.face is None:
             raise ValueError(f"clip '{truth.id}' has no face to be judged")
@@ -67,7 +68,7 @@ class Judge:
 
         Args:
             truths: The clips.
-            made: Latents [n, Z] of motions for their captions, once a repeat.
+            generated: Latents [n, Z] of motions for their captions, once a repeat.
             others: Training clips.
             nearest: Row -> the training clip that it finds for each caption.
         """

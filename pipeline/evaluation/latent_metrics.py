@@ -1,7 +1,7 @@
 """Metrics of motions in a judge's latent space: retrieval, distance of distributions, variety.
 
-A metric is a function of `LatentRow`, called for generated motion and for every reference baseline, and a
-line in a list here. Definitions and whose they are: docs/evaluation.md.
+A metric is a function of `LatentRow`, called for generated motion and for every reference baseline, and its
+columns here. Definitions and whose they are: docs/evaluation.md.
 
 Legend: n clips, Z latent width.
 """
@@ -84,24 +84,19 @@ class Latents:
         return Latents(text, real, made, self.others, still, nearest)
 
 
-@dataclass(frozen=True)
-class LatentMetric:
-    """A function of a row of latents, and its columns, whose names get the judge's in front."""
-
-    measure: Callable[[LatentRow], Values]
-    columns: tuple[Metric, ...]
-
-
 def recalls(row: LatentRow) -> Values:
     """TMA-R-Precision both ways, by cosine (protocols C and D)."""
     values = recall(row.text, row.motion, batch=row.size, recalls=(1, 2, 3), seed=row.seed * 1000)
     return {name.replace("/R@", "_r"): value for name, value in values.items() if "/R@" in name}
 
 
-def caption_distance(row: LatentRow) -> Values:
-    """Mean distance of each caption's latent from its motion's, both of length 1, and as they are."""
+def tma_alignment(row: LatentRow) -> Values:
+    """`recalls`, and the mean distance of each caption's latent from its motion's, both of length 1, and as
+    they are.
+    """
     unit = matching_score(_unit(row.text), _unit(row.motion))
-    return {"matching_score": float(unit), "latent_distance": float(matching_score(row.text, row.motion))}
+    plain_score = matching_score(row.text, row.motion)
+    return recalls(row) | {"matching_score": float(unit), "latent_distance": float(plain_score)}
 
 
 def guo_precision(row: LatentRow) -> Values:
@@ -130,44 +125,23 @@ def spread(row: LatentRow) -> Values:
     }
 
 
-TMA_METRICS = (
-    LatentMetric(
-        recalls,
-        (
-            *(Metric(f"t2m_r{k}", f"text to motion R@{k}", "higher") for k in (1, 2, 3)),
-            *(Metric(f"m2t_r{k}", f"motion to text R@{k}", "higher") for k in (1, 2, 3)),
-        ),
-    ),
-    LatentMetric(
-        caption_distance,
-        (
-            Metric("matching_score", "TMA-Matching score", "lower"),
-            Metric("latent_distance", "distance of the latents", "lower"),
-        ),
-    ),
+_TOPS = tuple(Metric(f"top-{k}", f"R-Precision top-{k}", "higher") for k in (1, 2, 3))
+TMA_COLUMNS = (
+    *(Metric(f"t2m_r{k}", f"text to motion R@{k}", "higher") for k in (1, 2, 3)),
+    *(Metric(f"m2t_r{k}", f"motion to text R@{k}", "higher") for k in (1, 2, 3)),
+    Metric("matching_score", "TMA-Matching score", "lower"),
+    Metric("latent_distance", "distance of the latents", "lower"),
 )
-"""Text-motion alignment by TMA."""
-EVALUATOR_METRICS = (
-    LatentMetric(
-        guo_precision,
-        (
-            *(Metric(f"top-{k}", f"R-Precision top-{k}", "higher") for k in (1, 2, 3)),
-            Metric("matching_score", "Matching score", "lower"),
-        ),
-    ),
+"""Columns of `tma_alignment`; the judge stands before the names."""
+EVALUATOR_COLUMNS = (*_TOPS, Metric("matching_score", "Matching score", "lower"))
+"""Columns of `guo_precision`."""
+SPREAD_COLUMNS = (
+    Metric("fid", "FID", "lower"),
+    Metric("fid_unit", "FID, length 1", "lower"),
+    Metric("diversity", "Diversity"),
+    Metric("multimodality", "MModality"),
 )
-"""Text-motion alignment by an evaluator, as Guo et al. define it."""
-SPREAD_METRICS = (
-    LatentMetric(
-        spread,
-        (
-            Metric("fid", "FID", "lower"),
-            Metric("fid_unit", "FID, length 1", "lower"),
-            Metric("diversity", "Diversity"),
-        ),
-    ),
-)
-"""Distance to recorded motion and variety, by any judge."""
+"""Columns of `spread`, and the variety of motions for one caption."""
 
 
 def judged_figures(
@@ -197,39 +171,34 @@ def judged_figures(
     facts = {**protocol, "candidates": size}
     if role != "tma":
         title = f"R-Precision by {whose} (higher is better; the score: lower)"
-        out = _precision(role, title, EVALUATOR_METRICS, latents, facts, size, seed)
+        out = _precision(role, title, latents, facts, size, seed)
     else:
         # Clips are those drawn, as in the paper, so two of a batch may have one caption.
         title = "TMA-R-Precision (higher is better; the score: lower)"
-        out = _precision(role, title, TMA_METRICS, latents, facts, size, seed)
+        out = _precision(role, title, latents, facts, size, seed)
         first = sorted({caption: row for row, caption in reversed(list(enumerate(words)))}.values())
         if 1 < len(first) < len(words):
             some = latents.of(first)
             size = min(size, len(first))
             facts = {**protocol, "clips": len(first), "candidates": size, "captions": "different"}
             title = "TMA-R-Precision among different captions"
-            out += _precision("tma.different", title, TMA_METRICS, some, facts, size, seed)
+            out += _precision("tma.different", title, some, facts, size, seed)
         out += _choice(latents, words, protocol, among, seed)
     return out + _spread(role, f"{whose[:1].upper()}{whose[1:]}'s latents", latents, protocol, seed)
 
 
 def _precision(
-    role: str,
-    title: str,
-    metrics: Sequence[LatentMetric],
-    latents: Latents,
-    protocol: Protocol,
-    size: int,
-    seed: int,
+    role: str, title: str, latents: Latents, protocol: Protocol, size: int, seed: int
 ) -> list[Figure]:
     """Figures of captions and motions compared, beside recorded motion, the mean pose and chance."""
+    tma = role.startswith("tma")
+    measure, columns = (tma_alignment, TMA_COLUMNS) if tma else (guo_precision, EVALUATOR_COLUMNS)
     # One draw of batches for each repeat of generated motion; of what exists once, several draws.
     draws = max(len(latents.made), DRAWS)
     once = {RECORDED: latents.real, STILL: latents.still, **latents.nearest}
     motions = {MODEL: latents.made} | {row: [motion] * draws for row, motion in once.items()}
-    rows = _measured(role, metrics, latents.row(seed, size), motions, decodings_of(protocol))
-    rows[CHANCE] = _named(role, _chance(size))
-    return group_figures(title, _columns(role, metrics), rows, protocol)
+    rows = _measured(measure, latents.row(seed, size), motions, decodings_of(protocol))
+    return group_figures(title, columns, rows | {CHANCE: _chance(size)}, protocol, prefix=f"{role}.")
 
 
 def _chance(size: int) -> dict[str, Estimate]:
@@ -251,13 +220,13 @@ def _choice(
     def accuracy(row: LatentRow) -> Values:
         return accuracy_among(row.motion, row.text, candidates=among, same=same, seed=row.seed)
 
-    metric = LatentMetric(accuracy, tuple(Metric(f"top-{k}", f"top-{k}", "higher") for k in (1, 5)))
     once = {RECORDED: latents.real, **latents.nearest}
     motions = {MODEL: latents.made} | {row: [motion] for row, motion in once.items()}
-    rows = _measured("tma", (metric,), latents.row(seed), motions, decodings_of(protocol), draw=False)
-    rows[CHANCE] = _named("tma", plain({f"top-{k}": min(1.0, k / among) for k in (1, 5)}))
+    rows = _measured(accuracy, latents.row(seed), motions, decodings_of(protocol), draw=False)
+    rows[CHANCE] = plain({f"top-{k}": min(1.0, k / among) for k in (1, 5)})
+    columns = [Metric(f"top-{k}", f"top-{k}", "higher") for k in (1, 5)]
     facts = {**protocol, "candidates": among}
-    return group_figures("Own caption the nearest, by TMA", _columns("tma", (metric,)), rows, facts)
+    return group_figures("Own caption the nearest, by TMA", columns, rows, facts, prefix="tma.")
 
 
 def _spread(role: str, title: str, latents: Latents, protocol: Protocol, seed: int) -> list[Figure]:
@@ -268,20 +237,19 @@ def _spread(role: str, title: str, latents: Latents, protocol: Protocol, seed: i
         MODEL: latents.made, TRAINING: [latents.others], STILL: [latents.still], RECORDED: [latents.real]
     }  # fmt: skip
     motions |= {row: [motion] for row, motion in latents.nearest.items()}
-    rows = _measured(role, SPREAD_METRICS, latents.row(seed), motions, decodings_of(protocol), draw=False)
+    rows = _measured(spread, latents.row(seed), motions, decodings_of(protocol), draw=False)
     for name in ("fid", "fid_unit"):
-        rows[RECORDED].pop(f"{role}.{name}", None)  # the distance of recorded motion to itself says nothing
+        rows[RECORDED].pop(name, None)  # the distance of recorded motion to itself says nothing
     if len(latents.made) > 1 and len(latents.real) > 1:
         several = torch.stack(list(latents.made), dim=1)
-        value = multimodality(several, pairs=PAIRS, seed=seed)
-        rows[MODEL][f"{role}.multimodality"] = Estimate(float(value))
-    columns = [*_columns(role, SPREAD_METRICS), Metric(f"{role}.multimodality", "MModality")]
+        rows[MODEL]["multimodality"] = Estimate(float(multimodality(several, pairs=PAIRS, seed=seed)))
     facts = {**protocol, "training_clips": len(latents.others)}
     # A covariance of so few rows does not have full rank.
     width = latents.real.shape[1]
     few = f"{len(latents.real)} motions for {width} columns, too few to be trusted"
-    notes = {f"{role}.{name}": few for name in ("fid", "fid_unit") if len(latents.real) <= width}
-    return group_figures(f"{title}: distance to recorded motion and variety", columns, rows, facts, notes)
+    notes = {name: few for name in ("fid", "fid_unit") if len(latents.real) <= width}
+    title = f"{title}: distance to recorded motion and variety"
+    return group_figures(title, SPREAD_COLUMNS, rows, facts, notes, prefix=f"{role}.")
 
 
 def reconstructed_figures(
@@ -311,26 +279,24 @@ def reconstructed_figures(
         repeats: Draws of batches.
         seed: Of the draws.
     """
-    prefix, facts = f"reconstruction.{role}", {**protocol, "training_clips": len(others)}
+    facts = {**protocol, "training_clips": len(others)}
     base = LatentRow(real if text is None else text, real, rebuilt, seed, min(size, len(real)))
     # FID of as many training clips says what a draw of clips alone gives.
-    rows = _measured(prefix, SPREAD_METRICS, base, {MODEL: [rebuilt], TRAINING: [others]})
+    rows = _measured(spread, base, {MODEL: [rebuilt], TRAINING: [others]})
     if text is not None:
         facts["candidates"] = base.size
         motions = {
             row: [motion] * max(repeats, DRAWS) for row, motion in ((MODEL, rebuilt), (RECORDED, real))
         }
-        for row, estimates in _measured(prefix, EVALUATOR_METRICS, base, motions).items():
+        for row, estimates in _measured(guo_precision, base, motions).items():
             rows[row] = rows.get(row, {}) | estimates
-        rows[CHANCE] = _named(prefix, _chance(base.size))
-    tops = (Metric(f"{prefix}.top-{k}", f"R-Precision top-{k}", "higher") for k in (1, 2, 3))
-    columns = (Metric(f"{prefix}.fid", "FID", "lower"), *tops)
-    return group_figures(f"Reconstructed motion by {whose}'s latents", columns, rows, facts)
+        rows[CHANCE] = _chance(base.size)
+    title, columns = f"Reconstructed motion by {whose}'s latents", (SPREAD_COLUMNS[0], *_TOPS)
+    return group_figures(title, columns, rows, facts, prefix=f"reconstruction.{role}.")
 
 
 def _measured(
-    role: str,
-    metrics: Sequence[LatentMetric],
+    measure: Callable[[LatentRow], Values],
     base: LatentRow,
     rows: Mapping[str, Sequence[Tensor]],
     nested: int = 1,
@@ -343,24 +309,12 @@ def _measured(
     """
     out = {}
     for name, motions in rows.items():
-        repeats: list[Values] = []
-        for number, motion in enumerate(motions):
-            row = replace(base, motion=motion, seed=base.seed + number * draw)
-            repeats.append({key: value for metric in metrics for key, value in metric.measure(row).items()})
-        out[name] = _named(role, set_estimates(repeats, nested if name == MODEL else 1))
+        repeats = [
+            measure(replace(base, motion=motion, seed=base.seed + number * draw))
+            for number, motion in enumerate(motions)
+        ]
+        out[name] = set_estimates(repeats, nested if name == MODEL else 1)
     return out
-
-
-def _columns(role: str, metrics: Sequence[LatentMetric]) -> list[Metric]:
-    return [
-        Metric(f"{role}.{column.name}", column.title, column.better, column.unit)
-        for metric in metrics
-        for column in metric.columns
-    ]
-
-
-def _named(role: str, estimates: dict[str, Estimate]) -> dict[str, Estimate]:
-    return {f"{role}.{name}": value for name, value in estimates.items()}
 
 
 def caption_distances(text: Tensor, motion: Tensor) -> Tensor:

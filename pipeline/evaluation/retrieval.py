@@ -53,8 +53,12 @@ def retrieve(
     stage_cache = StageCache(choose_device(device))
     model, inputs = stage_cache.get(source), _sources(run, source)
     data = stage_cache.get(inputs["data"])
+    judge = Judge(model)
     # Latents are compared as the judge's own training compared them.
-    judge, distance = _judge(model, source, data)
+    distance: Distance = "cosine"
+    if isinstance(model, LoadedEvaluator):
+        model.require_layout(data.layout, source.name)
+        distance = "euclidean"
     dataset = data.split(split) if split else data.held_out(prefer="test")
     truths = [truth_of(dataset, i) for i in range(len(dataset))]
     truths = [t for t in truths if t.caption and len(t.features) >= 4]
@@ -90,14 +94,6 @@ def retrieve(
         facts |= model.facts
     figures = [one for name, by in found_by.items() for one in _figures(name, *by, facts)]
     return FigureFile("retrieval", tuple(figures), facts)
-
-
-def _judge(model: Any, stage: CompletedStage, data: Any) -> tuple[Judge, Distance]:
-    """A loaded stage as a judge, and how its latents are compared."""
-    if not isinstance(model, LoadedEvaluator):
-        return Judge.tma(model), "cosine"
-    model.require_layout(data.layout, stage.name)
-    return Judge.evaluator(model), "euclidean"
 
 
 def alignment_stage(run: Path, name: str | None = None) -> CompletedStage:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
 from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.generation import MotionGenerator
@@ -36,6 +37,15 @@ class Truth:
     present: int = PRESENT_ALL
     tokens: tuple[str, ...] = ()
     """`word/POS` tags of the caption, where the source brings them."""
+
+    def columns(self, layout: MotionLayout, rest: NDArray[np.float32] | float = 0.0) -> NDArray[np.float32]:
+        """All columns [T, D] of the layout; of what the clip does not hold, `rest`."""
+        out = np.empty((len(self.features), layout.dim), dtype=np.float32)
+        out[:] = rest
+        out[:, layout.part("bodyhand")] = self.features
+        if self.face is not None:
+            out[:, layout.slice("face")] = self.face
+        return out
 
 
 def recorded_seconds(truths: Sequence[Truth], generator: MotionGenerator) -> list[float]:
@@ -125,13 +135,9 @@ def reconstruct_truth(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.f
 
 def reconstruct_all(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.float32]:
     """All columns [T, D] of the layout, likewise."""
-    layout = tokenizer.layout
-    out = np.tile(tokenizer.stats.mean.astype(np.float32), (len(truth.features), 1))
-    given = out.copy()
-    given[:, layout.part("bodyhand")] = truth.features
-    if truth.face is not None:
-        given[:, layout.slice("face")] = truth.face
-    columns = tokenizer.columns
+    mean, columns = tokenizer.stats.mean.astype(np.float32), tokenizer.columns
+    out = np.tile(mean, (len(truth.features), 1))
+    given = truth.columns(tokenizer.layout, mean)
     out[:, columns] = tokenizer.reconstruct(given[:, columns], truth.present)
     return out
 
@@ -165,15 +171,14 @@ def drawn(dataset: ClipDataset, count: int | None) -> list[int]:
     return out[:count]
 
 
-def spread(dataset: ClipDataset, count: int) -> list[int]:
+def spread(dataset: ClipDataset, count: int | None) -> list[int]:
     """Numbers of captioned clips spread evenly over a split, at most `count`, different captions first."""
-    seen: set[str] = set()
-    first: list[int] = []
-    rest: list[int] = []
-    usable = captioned(dataset)
-    order = np.random.default_rng(0).permutation(len(dataset))
-    for index in order[usable[order]].tolist():
-        caption = _main_caption(dataset, index, int(dataset.frames[index])).text
-        (rest if caption in seen else first).append(index)
-        seen.add(caption)
-    return (first + rest)[:count]
+    chosen = drawn(dataset, None)
+    captions = [_main_caption(dataset, index, int(dataset.frames[index])).text for index in chosen]
+    return different_first(chosen, captions)[:count]
+
+
+def different_first(clips: Sequence[int], names: Sequence[str]) -> list[int]:
+    """The clips whose name none before them has, and then the others."""
+    first = set({name: place for place, name in reversed(list(enumerate(names)))}.values())
+    return [clips[k] for k in sorted(range(len(clips)), key=lambda k: k not in first)]

@@ -27,7 +27,6 @@ from motionloom.pipeline.evaluation.figures import (
     Figure,
     FigureFile,
 )
-from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.latent_metrics import (
     GUO_BATCH,
     caption_distances,
@@ -145,14 +144,14 @@ class _Evaluation(EvaluationUnits):
         out += face_figures([row for table in found for row in as_rows(table, FACE)], protocol)
         for role, judge in self.judges.items():
             latents = [table[LATENT[role]] for table in found if LATENT[role] in table]
-            shown = self.judged(judge, self.shown)
+            shown = judge.judged(self.shown)
             if latents:
                 out += reconstructed_figures(
                     role,
                     _NAMES[role],
                     judge.recorded(shown),
                     torch.from_numpy(np.concatenate(latents)),
-                    judge.recorded(self.judged(judge, self.others)[: len(shown)]),
+                    judge.recorded(judge.judged(self.others)[: len(shown)]),
                     judge.texts(shown) if self.shown is self.truths else None,
                     {**protocol, "judge": self._weights(role)},
                     size=min(self.config.size, GUO_BATCH),
@@ -173,9 +172,9 @@ class _Evaluation(EvaluationUnits):
         """Figures by the latents of each judge."""
         config, out = self.config, list[Figure]()
         for role, judge in self.performed_by.items():
-            truths = self.judged(judge, self.truths)
-            others = self.judged(judge, self.others)
-            nearest = {} if judge.motions.part == "face" else self._nearest_captions
+            truths = judge.judged(self.truths)
+            others = judge.judged(self.others)
+            nearest = {} if judge.of_faces else self._nearest_captions
             latents = judge.latents(truths, self._latents(made, role), others, nearest)
             if role == "tma":
                 far = caption_distances(latents.text, latents.made[0]).tolist()
@@ -184,7 +183,7 @@ class _Evaluation(EvaluationUnits):
                 role,
                 _NAMES[role],
                 latents,
-                _captions(judge, truths),
+                judge.words(truths),
                 {**self.protocol, "clips": len(truths), "judge": self._weights(role)},
                 size=config.size if role == "tma" else min(config.size, GUO_BATCH),
                 among=config.among,
@@ -261,11 +260,6 @@ class _Evaluation(EvaluationUnits):
             torch.from_numpy(np.concatenate([table[name] for table in some if name in table]))
             for some in self._repeats(made)
         ]
-
-
-def _captions(judge: Judge, truths: Sequence[Truth]) -> list[str]:
-    """The words that a judge reads."""
-    return [t.face_caption if judge.motions.part == "face" else t.caption for t in truths]
 
 
 register(EvaluateStage())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -34,7 +34,7 @@ from motionloom.pipeline.evaluation.dances import (
     require_dances,
     seed_frames,
 )
-from motionloom.pipeline.evaluation.estimate import plain, row_estimates, set_estimates
+from motionloom.pipeline.evaluation.estimate import plain
 from motionloom.pipeline.evaluation.figures import (
     CHANCE,
     MODEL,
@@ -43,11 +43,8 @@ from motionloom.pipeline.evaluation.figures import (
     RANDOM_DANCE,
     RECORDED,
     STILL,
-    Estimate,
     Fact,
-    Figure,
     FigureFile,
-    Metric,
     group_figures,
 )
 from motionloom.pipeline.evaluation.movement import all_features, movement_figures
@@ -57,11 +54,6 @@ from motionloom.pipeline.stages.results.evaluation import Evaluation, Evaluation
 
 _AT_ONCE = 16
 """Dances generated together, at most."""
-WAY = tuple(
-    Metric(column.name.replace("beat_align", "beat_way"), f"way to the truth, {column.title}", "higher")
-    for column in BEAT_ALIGN.columns
-)
-"""How far Beat Align goes from other music (0) to the recorded dances (1)."""
 
 
 class EvaluateDancesConfig(StageConfig):
@@ -170,7 +162,6 @@ class _DanceEvaluation(Evaluation):
         if any(apart):
             rows[OTHER_MUSIC] = self.under_other_music(motions[MODEL], apart)
         figures = clip_figures(metrics_of("dances"), rows, self.protocol)
-        figures += self.way(rows) if any(apart) else []
         chance = plain({f"recognition.{name}": share for name, share in commonest(clips).items()})
         figures += group_figures(RECOGNITION.name, RECOGNITION.columns, {CHANCE: chance}, self.protocol)
         features = {
@@ -224,33 +215,6 @@ class _DanceEvaluation(Evaluation):
             for motions in repeats
             for turn in range(most)
         ]
-
-    def way(self, rows: Mapping[str, Sequence[Sequence[Row]]]) -> list[Figure]:
-        """How far Beat Align goes from other music to the recorded dances, repeat by repeat.
-
-        Left out where the recorded dances are less than 0.01 above other music **[ours]**: then it says
-        nothing.
-        """
-        turns = len(rows[OTHER_MUSIC]) // self.draws
-        true = row_estimates(rows[RECORDED])
-        ways: list[dict[str, float]] = []
-        for repeat, made in enumerate(rows[MODEL]):
-            other = row_estimates(rows[OTHER_MUSIC][repeat * turns : (repeat + 1) * turns])
-            ways.append(dict(_ways(row_estimates([made]), other, true)))
-        return group_figures(
-            BEAT_ALIGN.name, WAY, {MODEL: set_estimates(ways, self.config.decodings)}, self.protocol
-        )
-
-
-def _ways(
-    made: Mapping[str, Estimate], other: Mapping[str, Estimate], true: Mapping[str, Estimate]
-) -> Iterator[tuple[str, float]]:
-    for column, way in zip(BEAT_ALIGN.columns, WAY, strict=True):
-        if not all(column.name in found for found in (made, other, true)):
-            continue
-        room = true[column.name].value - other[column.name].value
-        if room >= 0.01:
-            yield way.name, (made[column.name].value - other[column.name].value) / room
 
 
 def _performance(joints: Joints, clip: DanceClip) -> Performance:

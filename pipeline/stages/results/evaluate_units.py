@@ -113,21 +113,12 @@ class EvaluationUnits(Evaluation):
             )
 
     def _judges(self) -> dict[str, Judge]:
-        """TMA and the evaluator, those that are there, by role."""
-        given, out = self.context.given, dict[str, Judge]()
-        if "tma" in given:
-            out["tma"] = Judge.tma(given["tma"])
+        """The judges that are there, by role."""
+        given = self.context.given
         if "evaluator" in given:
             found: LoadedEvaluator = given["evaluator"]
             found.require_layout(self.dataset.layout, self.context.inputs["evaluator"].name)
-            out["evaluator"] = Judge.evaluator(found)
-        if "face_evaluator" in given:
-            out["face_evaluator"] = Judge.faces(given["face_evaluator"])
-        return out
-
-    def judged(self, judge: Judge, truths: Sequence[Truth]) -> list[Truth]:
-        """Return the motions that a judge can judge: faces where there are some."""
-        return [t for t in truths if judge.motions.part != "face" or t.face is not None]
+        return {role: Judge(given[role]) for role in LATENT if role in given}
 
     @cached_property
     def basis(self) -> NDArray[np.float64] | None:
@@ -144,7 +135,7 @@ class EvaluationUnits(Evaluation):
         return {
             role: judge
             for role, judge in self.judges.items()
-            if judge.motions.part != "face" or (makes_faces and self.judged(judge, self.truths))
+            if not judge.of_faces or (makes_faces and judge.judged(self.truths))
         }
 
     @property
@@ -169,7 +160,7 @@ class EvaluationUnits(Evaluation):
             self.drawn_as(self.bundle)
             for judge in self.performed_by.values():
                 # Captions that it cannot read are refused before anything is made.
-                judge.texts(self.judged(judge, self.truths))
+                judge.texts(judge.judged(self.truths))
         slices, pieces = self.slices, self.performances
         self.make(
             "reconstructed",
@@ -212,8 +203,8 @@ class EvaluationUnits(Evaluation):
         if models_faces:
             out |= as_table([face_errors(faces, truth, self.basis) for truth in truths], FACE)
         for role, judge in self.judges.items():
-            some = self.judged(judge, truths)
-            if judge.motions.part != "face":
+            some = judge.judged(truths)
+            if not judge.of_faces:
                 made = bodies
             elif models_faces:
                 made = [reconstruct_all(faces, t)[:, faces.layout.slice("face")] for t in some]
@@ -248,7 +239,7 @@ class EvaluationUnits(Evaluation):
         if draw == 0:
             out |= {f"{MOTION}{number:03d}": m.joints for number, m in enumerate(motions)}
         for role, judge in self.performed_by.items():
-            if judge.motions.part == "face":
+            if judge.of_faces:
                 made = [m.face for t, m in zip(truths, motions, strict=True) if t.face is not None]
             else:
                 made = [m.features for m in motions]

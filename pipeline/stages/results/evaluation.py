@@ -79,9 +79,8 @@ class Evaluation:
         self.dataset: ClipDataset = data.held_out(prefer="test")
         self.train: ClipDataset = data.split("train")
 
-    @abstractmethod
     def share(self) -> None:
-        """This process's share of what is made clip by clip."""
+        """Make this process's share of what is made clip by clip; nothing where one process makes all."""
 
     @abstractmethod
     def measured(self) -> FigureFile:

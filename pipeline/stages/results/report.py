@@ -174,7 +174,12 @@ def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion
             seed=context.seed,
             sampling=config.sampling,
         )
-    return _motions(context, truths, generated)
+    out = []
+    for number, (truth, made) in enumerate(zip(truths, generated, strict=True), start=1):
+        same = truth.face_caption == truth.caption
+        words = truth.caption if same else f"{truth.caption} (face: {truth.face_caption})"
+        out += _rows(context, truth, made, words, f"{number}", Score())
+    return out
 
 
 def _bundle(context: StageContext, modality: str) -> Bundle | None:
@@ -206,17 +211,6 @@ def _danced(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
         truth = truth_at(dataset, clip.index, len(clip.joints))
         words, group = f"dance to {clip.title}", f"dance {number}"
         out += _rows(context, truth, motion, words, group, clip.score())
-    return out
-
-
-def _motions(
-    context: StageContext, truths: list[Truth], generated: Sequence[GeneratedMotion | None]
-) -> list[ViewerMotion]:
-    out = []
-    for number, (truth, made) in enumerate(zip(truths, generated, strict=True), start=1):
-        same = truth.face_caption == truth.caption
-        words = truth.caption if same else f"{truth.caption} (face: {truth.face_caption})"
-        out += _rows(context, truth, made, words, f"{number}", Score())
     return out
 
 

@@ -275,7 +275,6 @@ def test_dances_of_a_run_are_evaluated(run: tuple[Path, str]) -> None:
         key = f"beat_align.{name}"
         worse = (value(key, row) for row in {*answers, MODEL})
         assert value(key, RECORDED) > max(worse), "nothing was learned in two steps"
-        assert value(f"beat_way.{name}") < 0.7
     assert OTHER_MUSIC in said and "test clips" in said
     # Captioned clips and dances without captions beside each other, no TMA in the run.
     captions = FigureFile.read(folder / "stages/evaluate/metrics.json")

@@ -93,7 +93,7 @@ def test_it_finds_the_motion_of_a_caption(judge: Path) -> None:
     data, evaluator = loaded(judge / "run")
     test = data.split("test")
     truths = [truth_of(test, i) for i in range(len(test))]
-    latents = Judge.evaluator(evaluator).latents(truths, [], truths[:8], {})
+    latents = Judge(evaluator).latents(truths, [], truths[:8], {})
     both = replace(latents, made=[latents.real])
     words = [truth.caption for truth in truths]
     figures = judged_figures("evaluator", "it", both, words, {}, size=32, among=2, seed=0)
@@ -126,7 +126,7 @@ def test_an_evaluation_is_judged_by_it(judge: Path, call: Callable[..., Any], tm
     assert "R-Precision by the evaluator" in done.out
     retrieved = retrieve(tmp_path / "run", "evaluator")
     truths = [t for t in (truth_of(data.split("test"), i) for i in range(60)) if t.caption]
-    judge_ = Judge.evaluator(evaluator)
+    judge_ = Judge(evaluator)
     text, motion = judge_.texts(truths), judge_.recorded(truths)
     closest = torch.cdist(text.double(), motion.double()).argmin(1) == torch.arange(len(truths))
     first = retrieved.of("A.t2m/R@1")
