@@ -238,7 +238,7 @@ def test_the_commands_settings_reach_the_sampling(
     asked = {"sampler": "dpm++", "denoising_steps": 7, "cfg_scale": 3.0, "temperature": 0.0}
     words = [word for name, value in asked.items() for word in ("--set", f"{name}={value}")]
     words += ["--set", "guidance.audio=1.2"]
-    assert call("generate", "somewhere", "a person walks", *words, "-o", tmp_path, "-f", "npz").code == 0
+    assert call("generate", tmp_path, "a person walks", *words, "-o", tmp_path, "-f", "npz").code == 0
     assert seen["strict"]
     assert seen["sampling"].model_dump(exclude_unset=True) == {**asked, "guidance": {"audio": 1.2}}
     for wrong in ("sampler=euler", "smapler=ddim", "top_p"):
