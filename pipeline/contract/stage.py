@@ -291,10 +291,6 @@ class StageKind(ABC, Generic[C]):
         """Sizes of a kind that trains; None for the others."""
         return None
 
-    def step_seconds(self, config: C, given: Inputs, hardware: Hardware) -> float | None:
-        """How long a step of its training takes on this machine, tried out; None where that would be long."""
-        return None
-
     def disk(self, config: C) -> int | None:
         """Bytes of what it leaves on disk, where that is much and can be said."""
         return None

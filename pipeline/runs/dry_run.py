@@ -64,42 +64,20 @@ def estimate(recipe: Recipe, names: Collection[str] | None = None) -> dict[str, 
     return cards
 
 
-@dataclass(frozen=True)
-class TrainingTime:
-    """Expected duration of a training."""
-
-    seconds: float
-    """Seconds for the steps that are left."""
-    own: bool
-    """Whether the run itself has taken such steps; else they were tried out here."""
-
-
-_TRIED_BYTES, _TRIED_PARAMETERS = 2 * 2**30, 10_000_000
-"""A training that needs more is not tried out: its steps take long on a CPU."""
-
-
-def training_times(
-    recipe: Recipe, run: Path, rows: Sequence[PlannedStage], cards: Mapping[str, ModelCard]
-) -> dict[str, TrainingTime]:
-    """Durations of the trainings in `rows`, from the run's own telemetry; else small ones are tried out."""
-    stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
+def training_times(run: Path, rows: Sequence[PlannedStage]) -> dict[str, float]:
+    """Seconds that are left of the trainings in `rows`, by the run's own telemetry; others are not known."""
     out = {}
     for row in (row for row in rows if row.stage.kind.trains):
-        stage, card = row.stage, cards.get(row.stage.name)
-        flights = read_flight(stage_folder(run, stage.name)).get(0, ())
+        flights = read_flight(stage_folder(run, row.stage.name)).get(0, ())
         measured = [one["step_seconds"] for one in flights if "step_seconds" in one]
         done = max((int(one["step"]) for one in flights), default=0) if row.action == "resume" else 0
-        seconds = median(measured) if measured else None
-        small = card and card.memory_bytes < _TRIED_BYTES and card.parameters < _TRIED_PARAMETERS
-        if seconds is None and small:
-            seconds = stage.kind.step_seconds(stage.config, previews(stage, stages), recipe.hardware)
-        if seconds is not None:
-            left = max(0, stage.config.train.steps - done)
-            out[stage.name] = TrainingTime(seconds * left, bool(measured))
+        if measured:
+            left = max(0, row.stage.config.train.steps - done)
+            out[row.stage.name] = median(measured) * left
     return out
 
 
-def estimate_table(cards: Mapping[str, ModelCard], times: Mapping[str, TrainingTime]) -> Table:
+def estimate_table(cards: Mapping[str, ModelCard], times: Mapping[str, float]) -> Table:
     """The estimates as a table for a terminal."""
     table = Table(title="what the trainings take (one process)", title_justify="left")
     for column in ("stage", "parameters", "batch", "steps", "time", "memory", "checkpoints", "tokens"):
@@ -108,7 +86,7 @@ def estimate_table(cards: Mapping[str, ModelCard], times: Mapping[str, TrainingT
         parameters = _count(card.parameters)
         if card.codebook:
             parameters += f" + {_count(card.codebook)} codebook"
-        took = f"about {duration(times[name].seconds)}" if name in times else "not known here"
+        took = f"about {duration(times[name])}" if name in times else "not known here"
         memory, disk = _size(card.memory_bytes), _size(card.checkpoint_bytes)
         cells = str(card.local_batch), f"{card.steps:,}", took, memory, disk, card.note
         table.add_row(name, parameters, *cells)
@@ -140,9 +118,9 @@ def say_estimate(
             console.print(str(error), markup=False)
             return
     cards = estimate(recipe, {stage.name for stage in named})
-    times = {} if run is None or todo is None else training_times(recipe, run, todo, cards)
+    times = {} if run is None or todo is None else training_times(run, todo)
     console.print(estimate_table(cards, times))
-    total = sum(one.seconds for one in times.values())
+    total = sum(times.values())
     sizes = [size for stage in named if (size := stage.kind.disk(stage.config)) is not None]
     lines = [f"disk: {_size(sum(card.checkpoint_bytes for card in cards.values()))} for checkpoints"]
     lines += [f"about {_size(sum(sizes))} for data"] if sizes else []
@@ -168,7 +146,7 @@ def plan_record(
     todo = [row for row in plan if row.action in {"run", "resume"}]
     require_fit(todo, loaded.hardware)  # before the estimate, which takes seconds
     cards = estimate(loaded, {row.stage.name for row in todo})
-    times = training_times(loaded, run, todo, cards)
+    times = training_times(run, todo)
     return {
         "recipe": loaded.name,
         "folder": run,

@@ -28,8 +28,6 @@ class Sources:
     own: Sequence[Stage]
     where: str
     """The recipe, for messages."""
-    removed: Mapping[str, str] = field(default_factory=dict)
-    """Stages that were left out, and what has done so."""
     strict: bool = True
     """Refuse what is gone; else it is noted, since what was made of it may still be used."""
     outside: dict[str, CompletedStage] = field(default_factory=dict)
@@ -78,13 +76,8 @@ class Sources:
         names = [other.name for other in self.own if other.name != stage.name]
         raise UserError(
             f"{self.where}: stage '{stage.name}' needs a stage '{source}' (role '{role.name}')"
-            f"{self._why_not(source) or nearest(str(source), names)}"
+            f"{nearest(str(source), names)}"
         )
-
-    def _why_not(self, name: object) -> str:
-        """Where a stage has been left out, by what."""
-        by = self.removed.get(str(name))
-        return "" if by is None else f", which {by} leaves out; name another one in inputs, or null"
 
     def _find(self, stage: Stage, role: str, place: str) -> CompletedStage | None:
         at = f"{self.where}: stages.{stage.name}.inputs.{role}"
@@ -132,10 +125,7 @@ class Sources:
                 yield role.key(name), name
                 continue
             hint = nearest(str(name), giving) if giving else ""
-            raise UserError(
-                f"{at}: '{name}' is no stage that gives a {role.gives}"
-                f"{', as ' + self.removed[name] + ' leaves it out' if name in self.removed else ''}{hint}"
-            )
+            raise UserError(f"{at}: '{name}' is no stage that gives a {role.gives}{hint}")
 
 
 def find_outside(name: str, where: str) -> CompletedStage:

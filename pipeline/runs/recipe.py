@@ -154,11 +154,11 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, stri
 
     Unless `strict`, inputs from outside may be gone: what a run has made of them may still be used.
     """
-    resolved = resolve(find_recipe(str(name_or_path)), overrides)
-    where = resolved.where
-    file = RecipeFile.parse(resolved.data, where)
+    path = find_recipe(str(name_or_path))
+    where = f"{path} with --set" if overrides else str(path)
+    file = RecipeFile.parse(resolve(path, overrides, where), where)
     parsed = _parse(file.stages, where)
-    sources = Sources([stage for stage, _ in parsed], where, resolved.removed, strict)
+    sources = Sources([stage for stage, _ in parsed], where, strict)
     stages = [replace(stage, inputs=sources.resolve(stage, written)) for stage, written in parsed]
     if not sources.gone:
         _check(stages, sources, where)

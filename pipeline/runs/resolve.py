@@ -24,7 +24,7 @@ tokenizer, its TMA. Data come in the model's layout and frame rate, and `generat
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -55,17 +55,6 @@ _COMPLETED_LATER = {"missing", "value_error"}
 """Errors that defaults may have, since a stage's own entry completes them."""
 
 
-@dataclass
-class Resolved:
-    """A recipe with every layer applied; `stages` says all of each stage but the defaults of its config."""
-
-    data: Tree
-    where: str
-    """Name of the recipe in messages."""
-    removed: dict[str, str] = field(default_factory=dict)
-    """Stages that a layer has left out, and the file or option that did."""
-
-
 def shipped_recipes() -> dict[str, Path]:
     """Recipes that come with the package, by name: `FOLDER/SIZE.yaml` is called `FOLDER-SIZE`, `NAME.yaml` at
     the top `NAME`.
@@ -89,24 +78,24 @@ def find_recipe(name_or_path: str) -> Path:
     return shipped[name]
 
 
-def resolve(path: Path, overrides: Sequence[str] = ()) -> Resolved:
-    """Read a recipe and all that it builds on, apply `--set`, and write out what its stages share."""
-    where = f"{path} with --set" if overrides else str(path)
-    out = Resolved({}, where)
-    _read(path, out)
+def resolve(path: Path, overrides: Sequence[str], where: str) -> Tree:
+    """A recipe with all that it builds on and `--set` applied; each stage has what it shares with others.
+
+    `where` is the recipe's name in messages.
+    """
+    data = _read(path)
     # Defaults of what is extended may concern stages that this recipe has replaced; its own may not.
-    _require_used(read_file(path).get("defaults"), out.data.get("stages"), str(path))
-    inherited = set(out.data.get("defaults") or ())
+    _require_used(read_file(path).get("defaults"), data.get("stages"), str(path))
+    inherited = set(data.get("defaults") or ())
     for text in overrides:
-        _override(out, text)
-    data = out.data
+        data = _override(data, text)
     name, stages, defaults = data.pop(START, None), data.get("stages"), data.pop("defaults", None) or {}
     if not isinstance(defaults, dict):
         raise UserError(f"{where}: defaults must map kinds of stages to settings")
     for key, fields in defaults.items():
         _require_default(key, fields, where)
     if not isinstance(stages, dict):
-        return out
+        return data
     # Layers are merged now; each stage's entry is completed by what is more general than it.
     model = None if name is None else StartingModel.open(name, where)
     missing = {} if model is None else {r: one for r, one in model.stages.items() if r not in stages}
@@ -124,7 +113,7 @@ def resolve(path: Path, overrides: Sequence[str] = ()) -> Resolved:
             shared = merge(shared, defaults.get(concerning, {}))
         stages[key] = merge(shared, entry)
     _require_used(defaults.keys() - inherited, stages, where)
-    return out
+    return data
 
 
 # Files and what they extend.
@@ -143,38 +132,34 @@ def read_file(path: Path) -> Tree:
     return data
 
 
-def _read(path: Path, out: Resolved, depth: int = 0) -> None:
+def _read(path: Path, depth: int = 0) -> Tree:
+    """A recipe file over those that it extends."""
     data = read_file(path)
     base = data.pop("extends", None)
     if base is None:
-        out.data = data
-        return
+        return data
     if depth > _DEEPEST:
         raise UserError(f"{path}: 'extends' goes in a circle or more than four files deep")
     # A file next to this one goes before a shipped recipe of the same name.
     beside = path.parent / (str(base) if str(base).endswith((".yaml", ".yml")) else f"{base}.yaml")
-    _read(beside if beside.is_file() else find_recipe(str(base)), out, depth + 1)
-    old, new = out.data.get("stages"), data.get("stages")
-    out.data = merge(out.data, {key: value for key, value in data.items() if key != "stages"})
+    extended = _read(beside if beside.is_file() else find_recipe(str(base)), depth + 1)
+    old, new = extended.get("stages"), data.get("stages")
+    out = merge(extended, {key: value for key, value in data.items() if key != "stages"})
     if not isinstance(old, dict) or not isinstance(new, dict):
-        out.data["stages"] = new if "stages" in data else old
-        return
+        return {**out, "stages": new if "stages" in data else old}
     stages = dict(old)
     for name, entry in new.items():
         before = old.get(name)
         if entry is None:
             _require_there(str(name), old, f"{path}: stages.{name} is null and")
             del stages[name]
-            out.removed[str(name)] = f"stages.{name}: null in {path}"
-            continue
-        out.removed.pop(name, None)
-        if isinstance(before, dict) and isinstance(entry, dict):
+        elif isinstance(before, dict) and isinstance(entry, dict):
             # Settings of one kind mean nothing to another.
             same = entry.get("kind", before.get("kind")) == before.get("kind")
             stages[name] = merge(before, entry) if same else entry
         else:
             stages[name] = entry
-    out.data["stages"] = stages
+    return {**out, "stages": stages}
 
 
 def _require_there(name: str, stages: Iterable[str], where: str) -> None:
@@ -185,28 +170,26 @@ def _require_there(name: str, stages: Iterable[str], where: str) -> None:
 # `--set`.
 
 
-def _override(out: Resolved, text: str) -> None:
-    """Apply one `--set`: `stage.field=value`, `seed=8`, or `stage=null`, which leaves the stage out."""
+def _override(data: Tree, text: str) -> Tree:
+    """The recipe with one `--set`: `stage.field=value`, `seed=8`, or `stage=null` to leave the stage out."""
     key, equals, value = text.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
         raise UserError(f"--set {text}: write it as stage.field=value")
-    new, stages = load_yaml(value, f"--set {text}"), out.data.get("stages") or {}
+    new, stages = load_yaml(value, f"--set {text}"), data.get("stages") or {}
     if parts[0] not in _TOP:
         if parts[0] not in stages:
             hint = nearest(parts[0], [*stages, *_TOP], list(stages))
-            by = out.removed.get(parts[0])
-            raise UserError(f"--set {text}: no stage '{parts[0]}'{hint if by is None else f'; {by}'}")
+            raise UserError(f"--set {text}: no stage '{parts[0]}'{hint}")
         parts = ["stages", *parts]
     if parts[0] == "stages" and len(parts) == 2 and new is None:
         _require_there(parts[1], stages, f"--set {text}:")
-        del stages[parts[1]]
-        out.removed[parts[1]] = f"--set {text}"
-        return
+        return {**data, "stages": {name: entry for name, entry in stages.items() if name != parts[1]}}
     # A value replaces what is there, a mapping too.
-    out.data = _put(out.data, parts, new)
+    out: Tree = _put(data, parts, new)
     if parts[0] == "stages" and len(parts) > 2:
-        out.data["stages"][parts[1]] = _placed(out.data["stages"][parts[1]], None)
+        out["stages"][parts[1]] = _placed(out["stages"][parts[1]], None)
+    return out
 
 
 def _put(data: object, parts: Sequence[str], value: object) -> Any:

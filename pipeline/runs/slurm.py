@@ -28,7 +28,6 @@ from motionloom.datasets.base.progress import duration
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.process import SAVED
 from motionloom.pipeline.runs.dry_run import (
-    TrainingTime,
     explain_replacements,
     replaced_stages,
     say_estimate,
@@ -155,7 +154,7 @@ def launch_recipe(
             raise
         planned = []  # the data may be on another machine
         console.print(f"time and disk not estimated: {error}", soft_wrap=True, markup=False)
-    _require_time(plan, slurm, training_times(loaded, run, planned, {}))
+    _require_time(plan, slurm, training_times(run, planned))
     if dry_run:
         say_estimate(loaded, console, run, planned)
         _show_scripts(plan, slurm, console)
@@ -164,10 +163,10 @@ def launch_recipe(
     return plan
 
 
-def _require_time(plan: LaunchPlan, options: SlurmOptions, times: Mapping[str, TrainingTime]) -> None:
+def _require_time(plan: LaunchPlan, options: SlurmOptions, times: Mapping[str, float]) -> None:
     """Refuse a time limit within which, with all its tries, a group's trainings cannot end."""
     for group in plan.groups:
-        needed = sum(times[name].seconds for name in group.stages if name in times)
+        needed = sum(times[name] for name in group.stages if name in times)
         if needed > 60 * group.machines.minutes * (options.requeues + 1):
             raise UserError(
                 f"group {group.name} takes about {duration(needed)} and has {group.machines.minutes} minutes "

@@ -1,4 +1,4 @@
-"""Cost of a training before it runs: parameters and memory of one process, on fake tensors, and time.
+"""Cost of a training before it runs: parameters and memory of one process, on fake tensors.
 
 The network is built and its loss computed on tensors that have shapes but no values, so the figures come from
 the code that will run, under the precision it will run in. Memory counts weights, gradients, the optimizer's
@@ -9,12 +9,9 @@ fused kernels keep none. A CPU keeps them where `attention_dropout` is above 0.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from typing import Any
 
 import torch
-from lightning.fabric import Fabric
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
@@ -25,7 +22,7 @@ from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import Execution, precision_of, prepare_module, set_threads
+from motionloom.pipeline.training.execution import prepare_module
 
 _BYTES_A_PARAMETER = 16
 """Weight, gradient and two moments in float32."""
@@ -62,41 +59,6 @@ def model_card(
         steps=train.steps,
         checkpoint_bytes=copies * (4 * numbers + buffers),
     )
-
-
-_TRIED_SECONDS = 3.0
-"""A trial ends after so long."""
-
-
-def seconds_a_step(
-    make: Callable[[], tuple[StageModule, Batch, str]], train: TrainConfig, hardware: Hardware
-) -> float | None:
-    """Seconds of a step on random numbers, here; None where its GPU is elsewhere."""
-    gpu = hardware.resolved_accelerator() == "gpu"
-    if gpu and not torch.cuda.is_available():
-        return None
-    with torch.random.fork_rng():
-        module, example, _ = make()
-        set_threads(module, hardware)
-        precision = precision_of(train.precision, hardware)
-        fabric = Fabric(accelerator=hardware.lightning_accelerator(), devices=1, plugins=[precision])
-        execution, batch = Execution(fabric, module, train), fabric.to_device(_random(example))
-        begin = time.perf_counter()
-        times: list[float] = []
-        while len(times) < 4 and time.perf_counter() - begin < _TRIED_SECONDS:
-            before = time.perf_counter()
-            float(execution.take_step([batch] * train.accumulate))
-            times.append(time.perf_counter() - before)
-    return min(times)
-
-
-def _random(value: Any) -> Any:
-    """Numbers for a batch that has shapes alone."""
-    if isinstance(value, Tensor):
-        return torch.randn_like(value) if value.is_floating_point() else value
-    if isinstance(value, dict):
-        return {name: _random(inner) for name, inner in value.items()}
-    return type(value)(*map(_random, value)) if isinstance(value, tuple) else value
 
 
 def _trained(module: StageModule) -> list[nn.Parameter]:

@@ -205,21 +205,13 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         """Parameters and memory of one training process, from the code that will run, on fake tensors."""
         from motionloom.pipeline.training.memory import model_card
 
-        size = config.train.local_batch(hardware.world())
-        return model_card(lambda: self._dry(config, given, size), config.train, size, hardware)
+        inputs, size = self.inputs.of(given), config.train.local_batch(hardware.world())
 
-    def step_seconds(self, config: C, given: Inputs, hardware: Hardware) -> float | None:
-        from motionloom.pipeline.training.memory import seconds_a_step
+        def dry() -> tuple[StageModule, Batch, str]:
+            net = self.network(self.facts(config, inputs), inputs)
+            return self.dry_module(config, net, inputs), *self.example(config, net, inputs, size)
 
-        if config.published is not None:
-            return None
-        size = config.train.local_batch(hardware.world())
-        return seconds_a_step(lambda: self._dry(config, given, size), config.train, hardware)
-
-    def _dry(self, config: C, given: Inputs, size: int) -> tuple[StageModule, Batch, str]:
-        inputs = self.inputs.of(given)
-        net = self.network(self.facts(config, inputs), inputs)
-        return self.dry_module(config, net, inputs), *self.example(config, net, inputs, size)
+        return model_card(dry, config.train, size, hardware)
 
 
 def hyper_parameters(

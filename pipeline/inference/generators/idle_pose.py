@@ -1,7 +1,7 @@
 """An idle pose: what the figure does in silence, where no words say what to do [ours].
 
 No network knows how to do nothing. So the frames of such a stretch are those of a person who stands with
-lowered arms and breathes, in the layout's own columns; what is before and after it is blended in.
+lowered arms, in the layout's own columns; what is before and after it is blended in.
 """
 
 from __future__ import annotations
@@ -18,10 +18,14 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout, Part
 
 EASE = 1.0
 """Seconds from moving to the idle pose, and back."""
-BREATH = 4.0
-"""Seconds of a breath: 15 a minute, as of adults at rest."""
-_ARMS = 1.25
-"""Radians by which the rest pose's arms are lowered."""
+_TURNS = {
+    "neck": (0, 0.06),
+    "left_shoulder": (2, -1.25),
+    "right_shoulder": (2, 1.25),
+    "left_elbow": (1, -0.25),
+    "right_elbow": (1, 0.25),
+}
+"""Axis and radians by which joints of the rest pose are turned: lowered arms, bent a little."""
 
 
 class IdleBlend:
@@ -34,11 +38,11 @@ class IdleBlend:
 
     def __init__(self, layout: MotionLayout, part: Part) -> None:
         self._fps, columns = layout.fps, layout.part(part)
-        self._breath, posed, held = (values[..., columns] for values in _breath(layout))
+        pose, posed, held = (values[columns] for values in _standing(layout))
         self._posed, self._held = np.flatnonzero(posed), np.flatnonzero(held)
+        self._pose = pose[self._posed]
         self._level: float | None = None
         """Share of the idle pose, 0..1, before the next frame."""
-        self._number = 0
         self._place: NDArray[np.float32] | None = None
         """The held columns, as they were when the idle stretch began."""
 
@@ -61,11 +65,9 @@ class IdleBlend:
             self._place = motion[0, self._held].copy()
         # A smooth step leaves and arrives at speed 0, so that neither end of the blend jerks.
         weight = (levels * levels * (3 - 2 * levels))[:, None]
-        frames = (self._number + np.arange(len(motion))) % len(self._breath)
         goal = motion.copy()
-        goal[:, self._posed] = self._breath[frames][:, self._posed]
+        goal[:, self._posed] = self._pose
         goal[:, self._held] = self._place
-        self._number += len(motion)
         return np.asarray(motion + weight * (goal - motion), dtype=np.float32)
 
 
@@ -80,63 +82,39 @@ def blend_to_idle(
     return np.concatenate([blend(piece, calm) for piece, calm in zip(pieces, idle, strict=True)])
 
 
-def _breath(layout: MotionLayout) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """A breath [T, D]; which columns [D] it poses, and which are held as they were where a stretch begins."""
+def _standing(layout: MotionLayout) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """A frame [D] of somebody who stands; which columns [D] it poses, and which are held as they were where a
+    stretch begins.
+
+    Of SMPL parameters, place and turn of the figure are held, and shape and face go on.
+    """
     from scipy.spatial.transform import Rotation
 
-    frames, skeleton = round(BREATH * layout.fps), layout.skeleton
-    turns = _turns(layout, np.sin(2 * np.pi * np.arange(2 * frames + 1) / frames))
-    if layout.family == "raw":
-        return _raw_breath(layout, turns[:frames])
-    local = np.array([Rotation.from_rotvec(frame).as_matrix() for frame in turns])
-    joints, _ = forward_kinematics(local, np.zeros(3), skeleton.offsets, skeleton.parents)
-    joints[..., 1] -= joints[..., 1].min()
-    # Of two breaths the middle: steps and contacts at a cycle's end go on into the next.
-    posed, held = np.ones(layout.dim, dtype=bool), np.zeros(layout.dim, dtype=bool)
-    return encode(joints, layout)[frames - 1 : 2 * frames - 1], posed, held
-
-
-def _raw_breath(
-    layout: MotionLayout, turns: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """As `_breath`, of SMPL parameters: place and turn of the figure are held; shape and face go on."""
-    out = np.zeros((len(turns), layout.dim), dtype=np.float32)
+    skeleton = layout.skeleton
+    turns = np.zeros((len(skeleton), 3))
+    for name, (axis, angle) in _TURNS.items():
+        turns[skeleton.index(name), axis] = angle
+    if len(skeleton) > BODY_JOINTS:
+        fingers = Rotation.from_matrix(relaxed_fingers()).as_rotvec()
+        turns[BODY_JOINTS:] = np.concatenate([fingers, fingers * [1.0, -1.0, -1.0]])
+    if layout.family != "raw":
+        local = Rotation.from_rotvec(turns).as_matrix()[None]
+        joints, _ = forward_kinematics(local, np.zeros(3), skeleton.offsets, skeleton.parents)
+        joints[..., 1] -= joints[..., 1].min()
+        # Features of a frame look at its neighbours, which are equal.
+        frame = encode(np.repeat(joints, 3, axis=0), layout)[1]
+        return frame, np.ones(layout.dim, dtype=bool), np.zeros(layout.dim, dtype=bool)
+    out = np.zeros(layout.dim, dtype=np.float32)
     posed, held = np.zeros((2, layout.dim), dtype=bool)
-    pose = turns[:, 1:].reshape(len(turns), -1)
+    pose, body = turns[1:].ravel(), 3 * (BODY_JOINTS - 1)
     held[layout.slice("trans")] = True
     if layout.has("pose"):
         first = layout.slice("pose").start
         held[first : first + 3] = True
-        fields = [(slice(first + 3, first + 3 + pose.shape[1]), pose)]
+        fields = [(slice(first + 3, first + 3 + len(pose)), pose)]
     else:
         held[layout.slice("root_orient")] = True
-        body = 3 * (BODY_JOINTS - 1)
-        fields = [(layout.slice("pose_body"), pose[:, :body]), (layout.slice("pose_hand"), pose[:, body:])]
+        fields = [(layout.slice("pose_body"), pose[:body]), (layout.slice("pose_hand"), pose[body:])]
     for columns, values in fields:
-        out[:, columns], posed[columns] = values, True
+        out[columns], posed[columns] = values, True
     return out, posed, held
-
-
-def _turns(layout: MotionLayout, air: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation vectors [T, N, 3] of somebody who stands; `air` [T] goes from -1, breathed out, to 1."""
-    from scipy.spatial.transform import Rotation
-
-    skeleton = layout.skeleton
-    out = np.zeros((len(air), len(skeleton), 3))
-    for name, axis, still, breath in (
-        ("spine2", 0, 0.0, -0.012),
-        ("spine3", 0, 0.0, -0.012),
-        ("neck", 0, 0.06, 0.015),
-        ("left_collar", 2, 0.0, 0.02),
-        ("right_collar", 2, 0.0, -0.02),
-        ("left_shoulder", 2, -_ARMS, -0.02),
-        ("right_shoulder", 2, _ARMS, 0.02),
-        ("left_elbow", 1, -0.25, 0.0),
-        ("right_elbow", 1, 0.25, 0.0),
-    ):
-        out[:, skeleton.index(name), axis] = still + breath * air
-    if len(skeleton) > BODY_JOINTS:
-        fingers = Rotation.from_matrix(relaxed_fingers()).as_rotvec()
-        out[:, BODY_JOINTS : BODY_JOINTS + len(fingers)] = fingers
-        out[:, BODY_JOINTS + len(fingers) :] = fingers * [1.0, -1.0, -1.0]
-    return out

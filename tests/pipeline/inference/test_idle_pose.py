@@ -14,12 +14,12 @@ MOVING = ("body133", "wholebody363", "h3d263", "tomato623", "smpl75", "smplx322"
 
 
 @pytest.mark.parametrize("name", MOVING)
-def test_somebody_stands_and_breathes(name: str) -> None:
+def test_somebody_stands(name: str) -> None:
     layout = MotionLayout.named(name, fps=FPS)
     wild = np.random.default_rng(0).normal(0, 0.2, (200, layout.dim)).astype(np.float32)
     joints = joints_of(IdleBlend(layout, "all")(wild, True), layout)
     speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1) * FPS
-    assert 1e-4 < speed.max() < 0.1, "metres a second, of a breath"
+    assert speed.max() < 1e-3, "metres a second"
     skeleton = layout.skeleton
     high = joints[:, :, 1] - joints[:, [10, 11], 1].min(axis=1, keepdims=True)
     if layout.family != "raw":  # parameters keep their own turn in space

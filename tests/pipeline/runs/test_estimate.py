@@ -18,7 +18,7 @@ from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.tokenizer.single import VqConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.showing import ModelCard
-from motionloom.pipeline.runs.dry_run import TrainingTime, estimate, estimate_table, plan_record
+from motionloom.pipeline.runs.dry_run import estimate, estimate_table, plan_record
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.slurm import launch_recipe
 from motionloom.pipeline.training.memory import _saved_bytes
@@ -89,17 +89,17 @@ stages:
 """
 
 
-def test_time_is_tried_out_or_known_from_the_run_itself(tmp_path: Path) -> None:
+def test_time_is_known_from_the_run_itself(tmp_path: Path) -> None:
     """And a time limit that cannot be enough is refused."""
     path, flight = tmp_path / "small.yaml", tmp_path / "run/stages/tokenizer/flight/rank_0.jsonl"
     path.write_text(SMALL)
     (row,) = [row for row in plan_record(path, tmp_path / "run")["stages"] if row["training"]]  # type: ignore[attr-defined]
-    assert row["time"].seconds > 0 and not row["time"].own and row["training"].steps == 7
+    assert row["time"] is None and row["training"].steps == 7
     # Weights and two moments in float32, of the two checkpoints that are kept.
     assert row["training"].checkpoint_bytes >= 2 * 3 * 4 * row["training"].parameters
     write_text(flight, "".join(json.dumps({"step": k, "step_seconds": 3600.0}) + "\n" for k in range(3)))
     (row,) = [row for row in plan_record(path, tmp_path / "run")["stages"] if row["training"]]  # type: ignore[attr-defined]
-    assert row["time"] == TrainingTime(7 * 3600.0, own=True)
+    assert row["time"] == 7 * 3600.0
     quiet = Console(quiet=True)
     for minutes, requeues in ((300, 1), (300, 0)):
         words = [f"time_minutes={minutes}", f"requeues={requeues}"]
