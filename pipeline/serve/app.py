@@ -31,6 +31,7 @@ from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
 from motionloom.pipeline.serve.work import Busy, Stopped, Worker
 
+T = TypeVar("T")
 RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
 
 _BROKEN = "something broke here; the server's log says what"
@@ -137,55 +138,38 @@ class Site:
     async def _respond(
         self, http: Request, request: MotionRequest | ChangeRequest, call: Callable[[], Answer]
     ) -> Response:
-        result = asyncio.wrap_future(self.worker.submit(call))
-        while not (await asyncio.wait({result}, timeout=_LOOK))[0]:
-            if await http.is_disconnected():
-                result.cancel()  # nothing is made for a client that has left before it was begun
-                raise ClientDisconnect
-        answer, headers = result.result(), {"x-request": request.request}
+        answer, headers = await self._result(http, call), {"x-request": request.request}
         if answer.file:
             headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
         return Response(answer.body, media_type=answer.kind, headers=headers)
 
+    async def _result(self, http: Request, call: Callable[[], T]) -> T:
+        """What the model's thread returns; nothing is made for a client that has left before it was begun."""
+        result = asyncio.wrap_future(self.worker.submit(call))
+        while not (await asyncio.wait({result}, timeout=_LOOK))[0]:
+            if await http.is_disconnected():
+                result.cancel()
+                raise ClientDisconnect
+        return result.result()
+
     async def stream(self, http: Request) -> Response:
-        """Return one motion as JSON lines, while it is made."""
-        # The model's thread puts lines into a queue of this loop, and None behind the last.
+        """Return one motion as JSON lines, while it is made; others have their turn between its chunks."""
         request, sound = await self._read_request(http, MotionRequest)
-        loop, pieces = asyncio.get_running_loop(), asyncio.Queue[str | None]()
-        gone = False
-
-        def work() -> None:
-            try:
-                for piece in lines(self.model, self.name, request, sound, self.config):
-                    loop.call_soon_threadsafe(pieces.put_nowait, piece)
-                    if gone or self.worker.stopped:
-                        break
-            except Exception as error:
-                words = str(error) if isinstance(error, UserError) else _BROKEN
-                if words is _BROKEN:
-                    traceback.print_exception(error, file=sys.stderr)
-                line = json.dumps({"error": words, "request": request.request}) + "\n"
-                loop.call_soon_threadsafe(pieces.put_nowait, line)
-            finally:
-                loop.call_soon_threadsafe(pieces.put_nowait, None)
-
-        future = self.worker.submit(work)
+        made = lines(self.model, self.name, request, sound, self.config)
+        first = await self._result(http, lambda: next(made))
 
         async def body() -> AsyncIterator[str]:
-            nonlocal gone
+            piece = first
             try:
-                # A call that is cancelled before it begins puts no None: so the future is looked at too.
-                while not future.cancelled() and not (future.done() and pieces.empty()):
-                    try:
-                        piece = await asyncio.wait_for(pieces.get(), 1.0)
-                    except TimeoutError:
-                        continue
-                    if piece is None:
-                        return
+                while piece:
                     yield piece
-            finally:
-                gone = True
-                future.cancel()
+                    call = self.worker.submit(lambda: next(made, ""), begun=True)
+                    piece = await asyncio.wrap_future(call)
+            except Exception as error:
+                words = str(error) if isinstance(error, UserError | Stopped) else _BROKEN
+                if words is _BROKEN:
+                    traceback.print_exception(error, file=sys.stderr)
+                yield json.dumps({"error": words, "request": request.request}) + "\n"
 
         return StreamingResponse(
             body(), media_type="application/x-ndjson", headers={"x-request": request.request}

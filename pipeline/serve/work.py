@@ -36,11 +36,13 @@ class Worker:
         self._calls: list[Future[Any]] = []
         self._stopped = threading.Event()
 
-    def submit(self, call: Callable[[], T]) -> Future[T]:
-        """The future of a call; `Busy` where too many wait, `Stopped` after `stop`."""
+    def submit(self, call: Callable[[], T], *, begun: bool = False) -> Future[T]:
+        """The future of a call; `Busy` where too many wait, unless it goes on with one that was begun;
+        `Stopped` after `stop`.
+        """
         if self.stopped:
             raise Stopped(_STOPPING)
-        if self.length >= self.waiting:
+        if self.length >= self.waiting and not begun:
             raise Busy(f"{self.waiting} requests are waiting already; try again in a moment")
         future = self._pool.submit(self._begin, call)
         self._calls.append(future)

@@ -286,23 +286,14 @@ def _winner(figures: Mapping[str, Figure]) -> tuple[str, bool] | None:
 
 def _references(rows: Mapping[str, Mapping[str, Row]]) -> list[ReferenceRow]:
     """One row for each reference baseline; where runs have other values of it, one for each value."""
-    out = []
-    for title in dict.fromkeys(title for own in rows.values() for title in own if title != MODEL):
-        values: list[tuple[Row, list[str]]] = []
-        for label, own in rows.items():
-            if title not in own:
-                continue
-            same = next((labels for row, labels in values if _equal(row, own[title])), None)
-            if same is None:
-                values.append((own[title], [label]))
-            else:
-                same.append(label)
-        for row, labels in values:
-            out.append(ReferenceRow(title, row, () if len(values) == 1 else tuple(labels)))
-    return out
-
-
-def _equal(one: Row, other: Row) -> bool:
-    return {k: (f.value, f.interval) for k, f in one.items()} == {
-        k: (f.value, f.interval) for k, f in other.items()
-    }
+    found: dict[str, dict[object, tuple[Row, list[str]]]] = {}
+    for label, own in rows.items():
+        for title, row in own.items():
+            if title != MODEL:
+                values = frozenset((name, figure.value, figure.interval) for name, figure in row.items())
+                found.setdefault(title, {}).setdefault(values, (row, []))[1].append(label)
+    return [
+        ReferenceRow(title, row, () if len(each) == 1 else tuple(labels))
+        for title, each in found.items()
+        for row, labels in each.values()
+    ]

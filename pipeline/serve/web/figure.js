@@ -4,20 +4,9 @@ import { HANDLES, placeAt } from "./task.js";
 
 const DOT = 7, GRASP = { mouse: 14, touch: 26 }; // pixels: a dot's radius, and how near to it a pointer takes hold
 
-/* Where the middle joint of a limb goes when its end is drawn to `goal`, by the lengths of its two bones. */
-function bend(start, middle, end, goal) {
-  const minus = (a, b) => a.map((v, i) => v - b[i]), size = (a) => Math.hypot(...a), dot = (a, b) => a.reduce((sum, v, i) => sum + v * b[i], 0);
-  const upper = size(minus(middle, start)), lower = size(minus(end, middle)), line = minus(goal, start);
-  const reach = Math.min(Math.max(size(line), Math.abs(upper - lower) + 1e-3), upper + lower - 1e-4);
-  const along = line.map((v) => v / (size(line) || 1)), bone = minus(middle, start);
-  const side = minus(bone, along.map((v) => v * dot(bone, along))), width = size(side) || 1;
-  const x = (reach * reach + upper * upper - lower * lower) / (2 * reach), y = Math.sqrt(Math.max(upper * upper - x * x, 0));
-  return { middle: start.map((v, i) => v + along[i] * x + (side[i] / width) * y), end: start.map((v, i) => v + along[i] * reach) };
-}
-
 /* Tools on the first figure of a viewer.
 
-   `host` gives `state()`, `names` and `parents` of the joints and `maxHeight` in metres, and takes `drag(joint, frame, position, done)`,
+   `host` gives `state()`, the joints' `names` and `maxHeight` in metres, and takes `drag(joint, frame, position, done)`,
    `drew(points, done)` and `hold()`, which stops the motion. */
 export function figureTools(host) {
   const joint = (name) => host.names.indexOf(name), handles = Object.keys(HANDLES).filter((name) => joint(name) >= 0);
@@ -155,17 +144,14 @@ export function figureTools(host) {
     ctx.fillStyle = style.ink;
     ctx.fillText(words, left, y + 4.5);
   }
-  /* The limb as it would be, where a joint is drawn away. */
-  function drawLimb(ctx, lens, joints, name, goal, colour) {
-    const end = joint(name), middle = host.parents[end], start = host.parents[middle];
-    const limb = /wrist|ankle/.test(name) ? bend(...[start, middle, end].map((j) => placeOf(joints, j)), goal) : null;
-    const line = limb ? [placeOf(joints, start), limb.middle, limb.end] : [placeOf(joints, end), goal];
+  /* From where a joint is to where it is drawn. */
+  function drawPull(ctx, lens, joints, name, goal, colour) {
     ctx.strokeStyle = colour;
-    ctx.lineCap = ctx.lineJoin = "round";
+    ctx.lineCap = "round";
     ctx.lineWidth = 9;
     ctx.globalAlpha = 0.45;
     ctx.beginPath();
-    for (const p of line) { const [x, y] = viewer.project(lens, p); ctx.lineTo(x, y); }
+    for (const p of [placeOf(joints, joint(name)), goal]) { const [x, y] = viewer.project(lens, p); ctx.lineTo(x, y); }
     ctx.stroke();
     ctx.globalAlpha = 1;
   }
@@ -181,7 +167,7 @@ export function figureTools(host) {
     }
     for (const { joint: name, frame: when, position } of state.pins) {
       if (when !== own) continue;
-      if (k === 0) drawLimb(ctx, lens, joints, name, position, style.accent);
+      if (k === 0) drawPull(ctx, lens, joints, name, position, style.accent);
       dot(ctx, viewer.project(lens, position), DOT + 2, k ? "transparent" : style.accent, style.accent);
     }
     if (drawing && !held && k === 0) label(ctx, [2, 54], "Draw on the floor, from the feet on", style);

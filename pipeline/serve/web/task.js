@@ -128,9 +128,6 @@ export function paceOf(state, fps) {
 export function missing(state, rows, fps, maxSpeed) {
   const silent = state.words.find(({ text }) => !text.trim());
   if (silent) return `Say what happens from ${time(silent.from, fps)} to ${time(silent.to, fps)} s, or remove these words.`;
-  const stuck = state.pins.find(({ joint, frame }) => HANDLES[joint].rows.some((name) => state.kept[name][frame]));
-  if (stuck) return `The ${HANDLES[stuck.joint].label} cannot move at ${time(stuck.frame, fps)} s while that stays as it is: drag over its row there.`;
-  if (state.path && state.kept.lower.subarray(state.path.from + 1).some(Boolean)) return "The legs cannot follow the path where they stay as they are: drag over their row there.";
   if (state.path && paceOf(state, fps).speed > maxSpeed) return "The path is too long for the time: draw a shorter one, or make the motion longer.";
   const changed = state.frames !== state.clip || rows.some(({ name }) => state.kept[name].some((kept) => !kept));
   return changed ? "" : "Nothing would change yet: do one of the four things above.";
