@@ -205,9 +205,10 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         """Parameters and memory of one training process, from the code that will run, on fake tensors."""
         from motionloom.pipeline.training.memory import model_card
 
-        inputs, size = self.inputs.of(given), config.train.local_batch(hardware.world())
+        size = config.train.local_batch(hardware.world())
 
         def dry() -> tuple[StageModule, Batch, str]:
+            inputs = self.inputs.of(given)
             net = self.network(self.facts(config, inputs), inputs)
             return self.dry_module(config, net, inputs), *self.example(config, net, inputs, size)
 
