@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # `as` has type checkers take the names for exported ones
     from motionloom.datasets.audio.sound import Sound as Sound
+    from motionloom.datasets.base.register import register as register
     from motionloom.datasets.schema import UserError as UserError
     from motionloom.pipeline.contract.generation import Prompt as Prompt
     from motionloom.pipeline.contract.sampling import SamplingConfig as SamplingConfig
     from motionloom.pipeline.contract.sampling import StreamConfig as StreamConfig
     from motionloom.pipeline.contract.stage import StageKind as StageKind
-    from motionloom.pipeline.contract.stage import register as register
     from motionloom.pipeline.inference.captioning import captions as captions
     from motionloom.pipeline.inference.model import MotionModel as MotionModel
     from motionloom.pipeline.inference.motion import GeneratedMotion as GeneratedMotion
@@ -36,10 +36,11 @@ if TYPE_CHECKING:  # `as` has type checkers take the names for exported ones
 
 _NAMES = {
     "datasets.audio.sound": "Sound",
+    "datasets.base.register": "register",
     "datasets.schema": "UserError",
     "pipeline.contract.generation": "Prompt",
     "pipeline.contract.sampling": "SamplingConfig StreamConfig",
-    "pipeline.contract.stage": "StageKind register",
+    "pipeline.contract.stage": "StageKind",
     "pipeline.inference.captioning": "captions",
     "pipeline.inference.model": "MotionModel",
     "pipeline.inference.motion": "GeneratedMotion MotionChunk joined",

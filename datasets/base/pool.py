@@ -16,7 +16,6 @@ from typing import Self, TypeVar
 import threadpoolctl  # type: ignore[import-untyped]
 
 from motionloom.datasets.base.os_errors import of_the_machine, sentence_of
-from motionloom.datasets.base.register import discover
 from motionloom.datasets.schema import UserError
 
 T = TypeVar("T")
@@ -57,7 +56,9 @@ class Workers:
             # Forking would copy the locks of the parent's threads as they are, some of them held for ever.
             if self._pool is None:
                 context = multiprocessing.get_context("spawn")
-                self._pool = ProcessPoolExecutor(min(self.count, len(tasks)), context, initializer=_begin)
+                self._pool = ProcessPoolExecutor(
+                    min(self.count, len(tasks)), context, initializer=_exit_with_parent
+                )
             futures = {
                 self._pool.submit(on_one_thread, work, task): position for position, task in enumerate(tasks)
             }
@@ -88,9 +89,8 @@ def on_one_thread(work: Callable[[T], R], task: T) -> R:
                 torch.set_num_threads(before)
 
 
-def _begin() -> None:
-    """Know what other packages add; end when the parent dies, even by SIGKILL, or it would wait for ever."""
-    discover()
+def _exit_with_parent() -> None:
+    """End this worker when its parent dies, even by SIGKILL; it would otherwise wait for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_watch, args=(parent.sentinel,), daemon=True).start()

@@ -7,12 +7,14 @@ calls `register(thing)`. Recipes, exports and data name no code: reading one run
 
 from __future__ import annotations
 
+import ast
 import os
 import sys
 from collections.abc import Callable, Iterable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec, resolve_name
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,7 +44,7 @@ class Table(dict[str, T]):
     def enter(self, name: str, thing: T) -> None:
         """Add a thing; `UserError` where another one has its name."""
         if self.get(name, thing) is not thing:
-            raise UserError(f"two {self.called}s are called '{name}'; rename one of them")
+            raise UserError(f"{self.called} '{name}': another one has this name; choose a new one")
         if name not in self:
             for do in self._followers:
                 do(thing)
@@ -103,21 +105,56 @@ def distribution_of(module: str) -> str:
 def code_of(modules: Iterable[str]) -> dict[str, str]:
     """sha256 of the code of those modules that are neither motionloom's nor Python's, by their names.
 
-    The code of a module in a package is every `.py` file of its folder and of the packages within it, of any
-    other its own file; what a notebook or a prompt defines has none.
+    A module's code is its file, and those of its own package that it imports, by others or within functions
+    too. What a notebook or a prompt defines has none.
     """
-    out = {}
-    for name in sorted(set(modules)):
-        file = getattr(sys.modules.get(name), "__file__", None)
-        if file is None or name.partition(".")[0] in {"motionloom", *sys.stdlib_module_names}:
+    foreign = {
+        name for name in modules if name.partition(".")[0] not in {"motionloom", *sys.stdlib_module_names}
+    }
+    sources = {name: _sources(name) for name in sorted(foreign)}
+    return {
+        name: sha256_of_json({one: sha256_of(file) for one, file in files.items()})
+        for name, files in sources.items()
+        if files
+    }
+
+
+def _sources(name: str) -> dict[str, Path]:
+    """The files of a module and of what it imports of its package, by the names of the modules."""
+    found: dict[str, Path] = {}
+    todo = [name]
+    while todo:
+        module = todo.pop()
+        file = None if module in found else _source(module)
+        if file is None:
             continue
-        place = Path(file)
-        packaged = "." in name or place.name == "__init__.py"
-        files = _files(place.parent) if packaged else [place]
-        out[name] = sha256_of_json({str(path.relative_to(place.parent)): sha256_of(path) for path in files})
-    return out
+        found[module] = file
+        package = module if file.name == "__init__.py" else module.rpartition(".")[0]
+        for node in ast.walk(ast.parse(file.read_bytes(), str(file))):
+            if isinstance(node, ast.Import):
+                names = [one.name for one in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                base = resolve_name("." * node.level + (node.module or ""), package)
+                names = [base, *(f"{base}.{one.name}" for one in node.names)]
+            else:
+                continue
+            todo += [one for one in names if one.partition(".")[0] == name.partition(".")[0]]
+    return found
 
 
-def _files(folder: Path) -> list[Path]:
-    packages = (path.parent for path in folder.glob("*/__init__.py"))
-    return [*folder.glob("*.py"), *(path for package in packages for path in _files(package))]
+def _source(module: str) -> Path | None:
+    """The file of a module, which need not be imported yet; None where it has none, or is no module."""
+    loaded, parent = sys.modules.get(module), module.rpartition(".")[0]
+    file = getattr(loaded, "__file__", None)
+    if loaded is None and (not parent or _is_package(parent)):
+        spec = find_spec(module)
+        file = None if spec is None else spec.origin
+    return Path(file) if file is not None and file.endswith(".py") else None
+
+
+def _is_package(module: str) -> bool:
+    """Whether modules may lie in it; a module that is not imported stays so."""
+    if module in sys.modules:
+        return hasattr(sys.modules[module], "__path__")
+    file = _source(module)
+    return file is not None and file.name == "__init__.py"

@@ -50,7 +50,7 @@ def converter_named(name: str) -> type[AnyConverter]:
 
 def _require_new(kind: type[AnyConverter]) -> None:
     if kind.name in _own() and not kind.__module__.startswith(_folder.__name__):
-        raise UserError(f"two converters are called '{kind.name}'; rename yours")
+        raise UserError(f"converter '{kind.name}': another one has this name; choose a new one")
 
 
 CONVERTERS.follow(_require_new)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.register import discover
 from motionloom.datasets.motion.npz import read_npy_header
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import MEMBERS
@@ -96,6 +97,8 @@ def _checked_name(path: Path, info: tarfile.TarInfo, foreign: bool) -> tuple[str
     if "/" in name or name.startswith("."):
         raise UserError(f"{path}: '{name}' is a path; shards hold plain names only")
     key, _, member = name.partition(".")
+    if member not in MEMBERS:
+        discover()  # a worker may not have met the modalities of other packages
     if member not in MEMBERS:
         raise UserError(f"{path}: '{name}' is not a known member; known: {', '.join(MEMBERS)}")
     return key, member

@@ -24,7 +24,6 @@ from rich.console import Console
 
 from motionloom.datasets.base.register import VARIABLE, Table, discover
 from motionloom.datasets.base.register import register as register
-from motionloom.datasets.convert.common.converter import CONVERTERS as CONVERTERS
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import MotionGenerator

@@ -76,7 +76,9 @@ def _require_own_columns(metric: ClipMetric) -> None:
     taken = {column.name for other in CLIP_METRICS.values() for column in other.columns}
     for column in metric.columns:
         if column.name in taken:
-            raise UserError(f"two clip metrics have a column '{column.name}'; rename one of them")
+            raise UserError(
+                f"clip metric '{metric.name}': another one has a column '{column.name}'; choose a new name"
+            )
 
 
 CLIP_METRICS.follow(_require_own_columns)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import runpy
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +15,7 @@ from motionloom.pipeline import baselines
 from motionloom.pipeline.contract import stage
 from motionloom.pipeline.runs.api import run_recipe
 
-PACER = Path(__file__).resolve().parents[2] / "helpers/pacer"
+ARCHITECTURE = Path(__file__).resolve().parents[3] / "docs/architecture.md"
 
 
 @pytest.fixture(autouse=True)
@@ -29,17 +28,22 @@ def kinds_are_put_back() -> Iterator[None]:
 
 
 def test_a_folder_beside_the_baselines_is_a_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shutil.copytree(PACER, tmp_path / "pacer")
+    (tmp_path / "swing").mkdir()
+    (tmp_path / "swing/__init__.py").touch()
+    (tmp_path / "swing/stage.py").write_text(
+        "from motionloom.pipeline.contract.stage import FunctionStage, StageConfig, register\n"
+        "register(FunctionStage('swing', 'a toy', StageConfig, print))"
+    )
     monkeypatch.setattr(baselines, "__path__", [*baselines.__path__, str(tmp_path)])
     runpy.run_module("motionloom.pipeline.stages.table")
-    made = sys.modules.pop("motionloom.pipeline.baselines.pacer.stage")
-    assert type(stage.stage_kind("pacer", "here")).__module__ == made.__name__
+    assert sys.modules.pop("motionloom.pipeline.baselines.swing.stage")
+    assert stage.stage_kind("swing", "here").summary == "a toy"
 
 
 def test_the_example_of_the_documents_runs_from_its_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    text = (PACER.parents[2] / "docs/architecture.md").read_text()
+    text = ARCHITECTURE.read_text()
     (tmp_path / "count_clips.py").write_text(text.split("```python\n")[1].split("```")[0])
     register.discover.cache_clear()
     monkeypatch.setattr(sys, "path", list(sys.path))
