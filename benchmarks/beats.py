@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.audio.features import beats as librosa_beats
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.audio.tracker import track
-from motionloom.datasets.synth.music.performance import render_song
+from motionloom.datasets.synth.music.recording import render_song
 from motionloom.pipeline.baselines.beats.songs import RENDER_RATE, SongsConfig
 
 Times = NDArray[np.float64]

@@ -19,7 +19,7 @@ import numpy as np
 from field import Field
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.body.arkit import ARKIT
+from motionloom.pipeline.render.body.face import ARKIT
 
 Floats = NDArray[np.float64]
 Triangles = NDArray[np.int64]

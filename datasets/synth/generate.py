@@ -38,7 +38,7 @@ from motionloom.datasets.synth.choreography import choreograph, dancing_face, da
 from motionloom.datasets.synth.dances import Dance, DanceConfig, DanceTruth, dance, plan_dance
 from motionloom.datasets.synth.face import express
 from motionloom.datasets.synth.hands import grip_hand, shape_hand
-from motionloom.datasets.synth.music.performance import render_song, song_features
+from motionloom.datasets.synth.music.recording import render_song, song_features
 
 CONVERTER_VERSION = 2  # the face's words are about the body's person
 LICENCE = "CC0-1.0"
@@ -202,7 +202,7 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         if config.dances.sound:
             first, samples = round(begin * rate), round(planned.frames / layout.fps * rate)
             wav = render_song(planned.song, rate)[first : first + samples], rate
-    texts, face_texts = _captions(index, config, truth, planned)
+    texts, face_texts = captions_of(index, config)
     return Clip(
         joints=canonicalize(solved[:, : layout.num_joints] * size),
         face=face,
@@ -218,17 +218,11 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
 def captions_of(index: int, config: SynthConfig) -> tuple[list[str], list[str]]:
     """Return the body and face captions of clip `index` without making its motion."""
     planned = dance_of(index, config)
-    return _captions(index, config, planned.truth if planned else truth_of(index, config), planned)
-
-
-def _captions(
-    index: int, config: SynthConfig, truth: Truth, planned: Dance | None
-) -> tuple[list[str], list[str]]:
     if planned is not None and planned.comes not in ("text", "both"):
         return [], []
+    truth = planned.truth if planned else truth_of(index, config)
     layout, words = config.motion_layout, np.random.default_rng([config.seed, index, 3])
-    hands = layout.num_joints > BODY_JOINTS
-    texts = body_captions(truth, words, config.captions, hands, config.wordings)
+    texts = body_captions(truth, words, config.captions, layout.num_joints > BODY_JOINTS, config.wordings)
     face_texts = face_captions(truth, words, body=texts, wordings=config.wordings)
     return texts, face_texts if layout.has("face") else []
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.datasets.motion.features.torch_joints import torch_joints_of, torch_way
-from motionloom.datasets.motion.figure_parts import LOWER, PIECES, piece_columns, step_columns
-from motionloom.datasets.motion.layout import ROOT, MotionLayout
+from motionloom.datasets.motion.layout import LOWER, PIECES, ROOT, MotionLayout, piece_columns, step_columns
 from motionloom.datasets.schema import UserError
 
 PLACE_COLUMNS = 6

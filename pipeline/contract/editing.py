@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from motionloom.datasets.motion.figure_parts import FigurePart
-from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.motion.layout import BODY_JOINTS, FigurePart
 from motionloom.datasets.schema import Config
 
 MAX_SPEED = 12.0

@@ -57,8 +57,7 @@ class OutputClip:
 
     def arkit_weights(self) -> NDArray[np.float64]:
         """Weights of ARKit's shapes [T, 52], by the user's bases where there are any."""
-        from motionloom.datasets.motion.body.arkit import ArkitBases
-        from motionloom.pipeline.render.body.face import synthetic_arkit
+        from motionloom.pipeline.render.body.face import ArkitBases, synthetic_arkit
 
         if self.face is None:
             raise UserError("this model makes no face: leave the format arkit out")
@@ -206,7 +205,7 @@ def write_smplx(path: Path, outputs: Outputs) -> None:
 
 def write_arkit(path: Path, outputs: Outputs) -> None:
     """ARKit's 52 weights of each frame."""
-    from motionloom.datasets.motion.body.arkit import write_arkit_csv
+    from motionloom.pipeline.render.body.face import write_arkit_csv
 
     [clip] = outputs.clips
     write_arkit_csv(path, clip.arkit_weights(), clip.shown.fps)

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.conditions import Condition
-from motionloom.datasets.motion.figure_parts import PIECES
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.layout import PIECES, MotionLayout
 from motionloom.models.diffusion.module import DenoiserModule, InBetweenModule, TextDenoiserModule
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener, TextDenoiserConfig
 from motionloom.models.diffusion.observed import Observations, Recovery

@@ -16,8 +16,7 @@ from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
 from motionloom.datasets.convert.common.look import ADULT_METRES, named_unit
 from motionloom.datasets.motion.bvh.joint_map import JointMap, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
-from motionloom.datasets.motion.frame_rate import wrong_rate
-from motionloom.datasets.motion.plausibility import measure
+from motionloom.datasets.motion.plausibility import measure, wrong_rate
 from motionloom.datasets.motion.skeleton import Skeleton
 
 _ABOVE = 0.8

@@ -23,9 +23,14 @@ from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.motion.bvh.joint_map import METRES, NamedUnit, metres
-from motionloom.datasets.motion.frame_rate import wrong_rate
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.motion.plausibility import MOST, PERSON_METRES, PlausibilityStats, measure
+from motionloom.datasets.motion.plausibility import (
+    MOST,
+    PERSON_METRES,
+    PlausibilityStats,
+    measure,
+    wrong_rate,
+)
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import drop, grouped
 

@@ -1,15 +1,46 @@
-"""Recording of dry music: rooms, equalisers, compression, noise, gain and coding."""
+"""Recorded songs and their features: by the built-in synthesiser, or by a band, whose dry music goes through
+rooms, equalisers, compression, noise, gain and coding.
+"""
 
 from __future__ import annotations
 
 import io
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.audio.features import DIM, features_of
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.synth.actions.maths import Array
+from motionloom.datasets.synth.music.band import play_band
+from motionloom.datasets.synth.music.song import Song
+from motionloom.datasets.synth.music.synthesizer import equalize, synthesize
 
 _CODECS = (("OGG", "VORBIS"), ("MP3", "MPEG_LAYER_III"))
+
+
+@lru_cache(maxsize=64)
+def render_song(song: Song, rate: int) -> NDArray[np.float32]:
+    """The whole song as mono samples [seconds * rate] in -1..1; read-only, the same bytes each time."""
+    if song.played:
+        samples = record(play_band(song, rate), rate, np.random.default_rng([song.seed, song.number, 257]))
+    else:
+        samples = synthesize(song, rate)
+    samples.setflags(write=False)
+    return samples
+
+
+@lru_cache(maxsize=64)
+def song_features(song: Song, rate: int, fps: float, width: int = DIM) -> NDArray[np.float32]:
+    """Audio features [frames, width] of a whole song; row t is at t / fps seconds. Read-only.
+
+    Computed from the whole song, like the features of real dances: its beats and loudness are the song's.
+    """
+    rows = features_of(Sound(render_song(song, rate), rate), fps, width)[: int(song.seconds * fps)]
+    rows = np.ascontiguousarray(rows)
+    rows.setflags(write=False)
+    return rows
 
 
 def record(dry: NDArray[np.float32], rate: int, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -31,16 +62,6 @@ def record(dry: NDArray[np.float32], rate: int, rng: np.random.Generator) -> NDA
     out = gain * out / max(1e-9, float(np.abs(out).max()))
     samples = np.asarray(np.clip(out, -1.0, 1.0), dtype=np.float32)
     return _coded(samples, rate, rng) if rng.random() < 0.5 else samples
-
-
-def equalize(sound: Array, rate: int, decibels: tuple[float, ...]) -> Array:
-    """Low, middle and high bands (edges at 250 Hz and 2.5 kHz) of samples made louder by `decibels`."""
-    from scipy import signal
-
-    edges = [signal.butter(1, hertz, fs=rate, output="sos") for hertz in (250.0, 2500.0)]
-    low, below = (np.asarray(signal.sosfilt(edge, sound)) for edge in edges)
-    bands = (low, below - low, sound - below)
-    return sum((10 ** (gain / 20) * band for gain, band in zip(decibels, bands, strict=True)), np.zeros(1))
 
 
 def _room(sound: Array, rate: int, rng: np.random.Generator) -> Array:

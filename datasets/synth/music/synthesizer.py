@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.synth.actions.maths import Array
 from motionloom.datasets.synth.music.genres import Wave
-from motionloom.datasets.synth.music.recording import equalize
 from motionloom.datasets.synth.music.song import BEATS, Song
 
 _LEVEL = {"x": 1.0, "o": 0.45}
@@ -50,6 +49,16 @@ def synthesize(song: Song, rate: int) -> NDArray[np.float32]:
     # A soft limiter; driven hard it is the distortion of rock.
     out = 0.95 * np.tanh(genre.drive * out)
     return np.asarray(out, dtype=np.float32)
+
+
+def equalize(sound: Array, rate: int, decibels: tuple[float, ...]) -> Array:
+    """Low, middle and high bands (edges at 250 Hz and 2.5 kHz) of samples made louder by `decibels`."""
+    from scipy import signal
+
+    edges = [signal.butter(1, hertz, fs=rate, output="sos") for hertz in (250.0, 2500.0)]
+    low, below = (np.asarray(signal.sosfilt(edge, sound)) for edge in edges)
+    bands = (low, below - low, sound - below)
+    return sum((10 ** (gain / 20) * band for gain, band in zip(decibels, bands, strict=True)), np.zeros(1))
 
 
 def _harmony(out: Array, song: Song, degree: int, kind: int, begin: float, rate: int) -> None:

@@ -17,8 +17,7 @@ from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.genres import GENRES
-from motionloom.datasets.synth.music.performance import render_song
-from motionloom.datasets.synth.music.recording import record
+from motionloom.datasets.synth.music.recording import record, render_song
 from motionloom.datasets.synth.music.scores import excerpt, scores
 from motionloom.datasets.synth.music.song import Song, draw_song
 from motionloom.pipeline.contract.stage import (

@@ -11,7 +11,7 @@ from motionloom.datasets.motion.canonical import ground, retarget
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.exact import encode_exact, place
 from motionloom.datasets.motion.features.torch_joints import torch_way
-from motionloom.datasets.motion.figure_parts import PIECES, piece_columns, piece_joints
+from motionloom.datasets.motion.layout import PIECES, piece_columns, piece_joints
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.observed import known_columns
 from motionloom.models.metrics.dance import foot_skating

@@ -19,8 +19,15 @@ from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.torch_joints import torch_way
-from motionloom.datasets.motion.figure_parts import LOWER, PIECES, piece_joints, pieces_of, step_columns
-from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
+from motionloom.datasets.motion.layout import (
+    BODY_JOINTS,
+    LOWER,
+    PIECES,
+    MotionLayout,
+    piece_joints,
+    pieces_of,
+    step_columns,
+)
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.observed import Places
@@ -62,7 +69,7 @@ class EditFrames:
     features: NDArray[np.float32]
     """[T, D]: the clip's, held before and after it."""
     pieces: NDArray[np.bool_]
-    """Which `figure_parts.PIECES` are kept [T, P]."""
+    """Which `layout.PIECES` are kept [T, P]."""
     anchor: RootPath
     """The anchor frame: the one that `places` and `model_pins` are seen from."""
     places: Places

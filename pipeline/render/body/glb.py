@@ -19,12 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
-from motionloom.datasets.motion.body.arkit import ARKIT
 from motionloom.datasets.motion.body.rigid import RigidMotion, on_one_skeleton
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.face import EXPRESSIONS
+from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS
 from motionloom.pipeline.render.body.mesh import FIRST_OF_HEAD, Body, body_for, colours
 
 _FLOAT, _SHORT, _BYTE = 5126, 5123, 5121

@@ -23,7 +23,7 @@ from motionloom.datasets.audio.beat_net import (
 )
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.synth.music.performance import render_song
+from motionloom.datasets.synth.music.recording import render_song
 from motionloom.datasets.synth.music.song import draw_song
 from motionloom.pipeline.contract.generation import Prompt
 

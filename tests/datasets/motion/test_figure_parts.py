@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.motion.body.landing import eased, landed, reached
-from motionloom.datasets.motion.figure_parts import (
+from motionloom.datasets.motion.layout import (
     PIECES,
     FigurePart,
+    MotionLayout,
     piece_columns,
     piece_joints,
     pieces_of,
     step_columns,
 )
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 
 SIDES = ("left", "right")

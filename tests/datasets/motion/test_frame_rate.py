@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
 from motionloom.datasets.motion.bvh.motion import read_bvh
-from motionloom.datasets.motion.frame_rate import wrong_rate
+from motionloom.datasets.motion.plausibility import wrong_rate
 from motionloom.datasets.motion.skeleton import Skeleton
 
 REST = Skeleton.named("smpl22").rest_joints

@@ -15,7 +15,7 @@ from motionloom.datasets.motion.canonical import canonicalize, facing
 from motionloom.datasets.synth.dances import DanceConditions, DanceConfig
 from motionloom.datasets.synth.generate import Clip, SynthConfig, dance_of, make_clip, make_sample, split_of
 from motionloom.datasets.synth.music.genres import GENRES
-from motionloom.datasets.synth.music.performance import render_song
+from motionloom.datasets.synth.music.recording import render_song
 
 FPS = 20.0
 CONFIG = SynthConfig(

@@ -8,8 +8,7 @@ import torch
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.features.codec import decode
-from motionloom.datasets.motion.figure_parts import LOWER, PIECES
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.layout import LOWER, PIECES, MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import CaptionSpan, Filling, KnownMotion, Pins
 from motionloom.models.diffusion.module import InBetweenModule

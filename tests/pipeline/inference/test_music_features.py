@@ -14,7 +14,7 @@ from motionloom.datasets.audio.features import features_of
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.dances import DanceConfig
-from motionloom.datasets.synth.music.performance import render_song
+from motionloom.datasets.synth.music.recording import render_song
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.requests import encode_prompts, prompts_of
 

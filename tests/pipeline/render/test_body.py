@@ -15,7 +15,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.body.arkit import ARKIT
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.body.rigid import fit_rigid, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
@@ -23,6 +22,7 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.embed import mesh_data, pack_turns, pose_data
 from motionloom.pipeline.render.body.face import (
+    ARKIT,
     CONTROLS,
     EXPRESSIONS,
     control_weights,

@@ -16,13 +16,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.body.arkit import ARKIT
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.face import EXPRESSIONS, expression_weights
+from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS, expression_weights
 from motionloom.pipeline.render.body.glb import GlbClip, write_glb
 from motionloom.pipeline.render.body.mesh import FIRST_OF_HEAD, body_for
 

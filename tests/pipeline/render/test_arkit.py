@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from motionloom.datasets.motion.body.arkit import ARKIT, ArkitBases, bounded_least_squares, write_arkit_csv
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.body.face import ARKIT, ArkitBases, bounded_least_squares, write_arkit_csv
 
 
 def test_bounded_least_squares_is_scipys() -> None:
