@@ -18,7 +18,7 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import HANDS, PRESENT_ALL, Dropped, UserError
 from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.sample import Sample
-from motionloom.pipeline.contract.captioning import MotionCaptioner, Sentence
+from motionloom.pipeline.contract.captioning import Sentence
 from motionloom.pipeline.inference.edits.clip_file import LEAST_FRAMES, features_for, read_clip
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
@@ -66,12 +66,30 @@ def captions(
     has no captioner.
     """
     captioner = model.bundle.captioner
-    for clip in clips:
-        if isinstance(clip, GeneratedMotion):
-            features = features_for(clip.joints, clip.fps, captioner.layout, clip.face)
-            yield from caption_clips(captioner, [ReadClip("", clip.words, *features)], count)
+    layout, columns = captioner.layout, captioner.layout.part(captioner.part)
+    least = max(captioner.min_frames, LEAST_FRAMES)
+    for given in clips:
+        if isinstance(given, GeneratedMotion):
+            features = features_for(given.joints, given.fps, layout, given.face)
+            found: Iterable[ReadClip | Dropped] = [ReadClip("", given.words, *features)]
         else:
-            yield from caption_clips(captioner, read_clips(Path(clip), captioner.layout), count)
+            found = read_clips(Path(given), layout)
+        for clip in found:
+            if isinstance(clip, Dropped):
+                yield clip
+                continue
+            frames = len(clip.features)
+            if frames < least:
+                yield Dropped(
+                    source=clip.file,
+                    reason=f"{frames} frames at {layout.fps:g} a second; a captioner reads {least} or more",
+                )
+                continue
+            # Without a part that the tokens cannot do without, it is read at rest.
+            present = clip.present if captioner.reads(clip.present) else PRESENT_ALL
+            (sentences,) = captioner.caption([clip.features[:, columns]], count, [present])
+            seconds = min(frames, captioner.max_frames) / layout.fps
+            yield CaptionedClip(clip.id, clip.file, seconds, tuple(sentences))
 
 
 def read_clips(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped]:
@@ -127,27 +145,3 @@ def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped
                 continue
             assert isinstance(sample, Sample)
             yield ReadClip(clip.id, clip.found.path, sample.motion, HANDS * hands)
-
-
-def caption_clips(
-    captioner: MotionCaptioner, clips: Iterable[ReadClip | Dropped], count: int
-) -> Iterator[CaptionedClip | Dropped]:
-    """Yield at most `count` sentences about each clip that the captioner can read, in order."""
-    layout, columns = captioner.layout, captioner.layout.part(captioner.part)
-    for clip in clips:
-        if isinstance(clip, Dropped):
-            yield clip
-            continue
-        frames = len(clip.features)
-        least = max(captioner.min_frames, LEAST_FRAMES)
-        if frames < least:
-            yield Dropped(
-                source=clip.file,
-                reason=f"{frames} frames at {layout.fps:g} a second; a captioner reads {least} or more",
-            )
-            continue
-        # Without a part that the tokens cannot do without, it is read at rest.
-        present = clip.present if captioner.reads(clip.present) else PRESENT_ALL
-        (found,) = captioner.caption([clip.features[:, columns]], count, [present])
-        seconds = min(frames, captioner.max_frames) / layout.fps
-        yield CaptionedClip(clip.id, clip.file, seconds, tuple(found))

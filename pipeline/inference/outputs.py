@@ -137,21 +137,13 @@ def score_of(motion: GeneratedMotion) -> Score:
 
 
 def page_title(captions: Sequence[str], sounds: Sequence[str] = (), script: Path | None = None) -> str:
-    """The words or the music where all motions have the same, else their number.
-
-    Args:
-        captions: One a motion; empty where no words drive it.
-        sounds: File names of the music.
-        script: The file of segments that drives every motion.
-    """
+    """The script, or the words and the music where all motions have the same, else how many there are."""
     if script is not None:
         return f"Script {script.name}"
     words, music = list(dict.fromkeys(filter(None, captions))), list(dict.fromkeys(sounds))
-    if len(words) <= 1 and len(music) <= 1:
-        to = f"to {music[0]}" if music else ""
-        return f"{words[0]}, {to}" if words and to else words[0] if words else f"Motion {to}".strip()
-    sources = " and ".join([*(["text"] if words else []), *(["music"] if music else [])])
-    return f"{len(captions)} motions from {sources}"
+    if len(words) > 1 or len(music) > 1:
+        return f"{len(captions)} motions"
+    return ", to ".join(words + music) or "Motion"
 
 
 def page_note(count: int, model: str, seed: int, remarks: Sequence[object] = ()) -> str:

@@ -3,16 +3,16 @@
     # show.yaml
     segments:
       - {text: a person walks forward, seconds: 4}
-      - {music: song.ogg, start: 30, end: 42}
+      - {music: song.ogg@0:30-0:42}
       - {text: a person waves with the right hand, seconds: 3}
 
-`music` is a file beside the script, of any rate and length; `song.ogg@0:30-0:42` is another way to say start
-and end. `text` beside `music` drives the segment by both.
+`music` is a file beside the script, of any rate and length, whole or a part by its name; the segment lasts as
+long. `text` beside `music` drives it by both.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -33,38 +33,19 @@ class ScriptSegment(Config):
     face: str = ""
     """Describes the face; empty takes `text`."""
     music: str | None = None
-    """A sound file, seen from the script's folder."""
+    """A sound file, seen from the script's folder, or a part of one: `song.ogg@0:30-0:42`."""
     seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
-    """Length of the segment; of one with music the length from `start` on, as far as the file goes."""
-    start: float = Field(0.0, ge=0, allow_inf_nan=False)
-    """Second of the music where the segment begins."""
-    end: float | None = Field(None, gt=0, allow_inf_nan=False)
-    """Second of the music where it ends."""
+    """Length of a segment of text alone."""
 
     @model_validator(mode="after")
     def _one_way(self) -> ScriptSegment:
         if not self.text.strip() and self.music is None:
             raise ValueError("a segment needs text, music or both")
-        if self.music is None:
-            if self.end is not None or self.start:
-                raise ValueError("start and end are seconds of the music; of text give seconds")
-            if self.seconds is None:
-                raise ValueError("a segment of text needs its length: seconds: 4")
-        elif self.end is not None and self.seconds is not None:
-            raise ValueError("give seconds or end, not both")
-        elif self.end is not None and self.end <= self.start:
-            raise ValueError(f"end {self.end:g} is not after start {self.start:g}")
+        if self.music is None and self.seconds is None:
+            raise ValueError("a segment of text needs its length: seconds: 4")
+        if self.music is not None and self.seconds is not None:
+            raise ValueError("music says itself how long it lasts: leave seconds out, name a part of it")
         return self
-
-    def excerpt(self, file: Path, where: str) -> Excerpt:
-        """The part of the music that it asks for; `file` may name one itself, `where` is for errors."""
-        named = Excerpt.named(file)
-        if named.whole:
-            end = self.start + self.seconds if self.seconds is not None else self.end
-            return replace(named, start=self.start, end=end)
-        if self.start or self.end is not None or (self.seconds is not None and named.end is not None):
-            raise UserError(f"{where}: {self.music} says itself which part is meant; leave start and end out")
-        return named if self.seconds is None else replace(named, end=named.start + self.seconds)
 
 
 class Script(Config):
@@ -90,7 +71,7 @@ class Script(Config):
                 out.append(DrivenSegment(prompt, segment.seconds or 0.0, segment.text))
                 continue
             where = f"{name}: segments.{number}"
-            part = segment.excerpt(folder / segment.music, where)
+            part = Excerpt.named(folder / segment.music)
             if part.path not in sounds:
                 sounds[part.path] = read_music(part.path)
             whole = sounds[part.path]

@@ -133,9 +133,10 @@ def find_outside(name: str, where: str) -> CompletedStage:
     folder = Path(name).resolve()
     if not folder.is_dir():
         raise UserError(f"{where}: {name}: no such folder{_hint(folder)}")
-    if (folder / "recipe.yaml").is_file() or (folder / "bundle.json").is_file():
-        what = "a whole run" if (folder / "recipe.yaml").is_file() else "a whole export"
-        raise UserError(f"{where}: {name}: {what}; name one of its stages{_hint(_first(folder))}")
+    for file, what, below in (("recipe.yaml", "run", "stages"), ("bundle.json", "export", "")):
+        if (folder / file).is_file():
+            hint = _hint(folder / below)
+            raise UserError(f"{where}: {name}: a whole {what}; name one of its stages{hint}")
     stage = outside_stage(folder)
     if stage is None:
         started = (folder / "started.json").is_file()
@@ -172,11 +173,6 @@ def _needed(stage: CompletedStage) -> Iterable[CompletedStage]:
     for role in stage.kind.exported(stage.config):
         if role in stage.inputs:
             yield from _needed(stage.inputs[role])
-
-
-def _first(folder: Path) -> Path:
-    """Where the stages of a run or an export lie."""
-    return folder / "stages" / "" if (folder / "recipe.yaml").is_file() else folder / ""
 
 
 def _hint(folder: Path) -> str:

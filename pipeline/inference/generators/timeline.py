@@ -89,12 +89,8 @@ class TokenTimeline:
             new = torch.minimum(wanted[rows] - done[rows], self.window_groups - seen)
             first = (done[rows] - seen) * GROUP_FRAMES
             frames = (seen + new) * GROUP_FRAMES
-            part = {
-                name: cut(_rows_of(condition, rows), first, frames)
-                if name in self.net.mate.timed
-                else _rows_of(condition, rows)
-                for name, condition in conditions.items()
-            }
+            own_rows = {name: _rows_of(condition, rows) for name, condition in conditions.items()}
+            part = self.within(own_rows, first, frames)
             own = [seeds[row] for row in rows.tolist()]
             noise = None if z is None else z[rows]
             more = self.window(part, here, noise, new, window_seeds(own, number, turn), sampling)
@@ -102,6 +98,11 @@ class TokenTimeline:
             done[rows] += more.groups
             turn += 1
         return made
+
+    def within(self, conditions: Conditions, first: Tensor, frames: Tensor) -> dict[str, Condition]:
+        """Conditions of a window of `frames` [B] from the frame `first` [B] of the stretch on."""
+        timed = self.net.mate.timed
+        return {name: cut(one, first, frames) if name in timed else one for name, one in conditions.items()}
 
     def window(
         self,
@@ -239,12 +240,7 @@ class TimelineFlow:
         seen = int(self._before.groups[0])
         self._open = min(self._hop if left is None else left, self._line.window_groups - seen)
         first, frames = (self._done - seen) * GROUP_FRAMES, (seen + self._open) * GROUP_FRAMES
-        self._inside = {
-            name: cut(condition, self._count(first), self._count(frames))
-            if name in self._line.net.mate.timed
-            else condition
-            for name, condition in self._conditions.items()
-        }
+        self._inside = self._line.within(self._conditions, self._count(first), self._count(frames))
 
     def _last(self, codes: Codes) -> Codes:
         kept = min(int(codes.groups[0]), self._line.context)

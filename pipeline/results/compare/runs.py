@@ -44,29 +44,13 @@ class ComparedRun:
 
     @cached_property
     def files(self) -> dict[str, Path]:
-        """Files of figures by stage: of `motionloom evaluate` where that is newer than all that the run has
-        made, else of the run.
-        """
-        out = {}
-        for stage in self.state.stages:
-            path = stage.folder / FILE_NAME
-            if stage.usable and path.is_file():
-                out[stage.name] = path
-        for path in sorted((self.state.folder / "evaluate").rglob(FILE_NAME)):
-            if self._newest() < path.stat().st_mtime_ns:
-                out[str(FigureFile.read(path).about.get("stage"))] = path
-        return {stage.name: out[stage.name] for stage in self.state.stages if stage.name in out}
+        """Files of figures of the run's finished stages."""
+        paths = {stage.name: stage.folder / FILE_NAME for stage in self.state.stages if stage.usable}
+        return {name: path for name, path in paths.items() if path.is_file()}
 
     @cached_property
     def evaluations(self) -> dict[str, FigureFile]:
         return {name: FigureFile.read(path) for name, path in self.files.items()}
-
-    def _newest(self) -> int:
-        """When the last stage was finished that figures may depend on; pages do not change them."""
-        artifacts = [
-            s.folder / "artifact.json" for s in self.state.stages if s.kind not in ("report", "generate")
-        ]
-        return max((path.stat().st_mtime_ns for path in artifacts if path.is_file()), default=0)
 
 
 def open_runs(folders: Sequence[Path]) -> list[ComparedRun]:

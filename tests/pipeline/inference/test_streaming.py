@@ -165,8 +165,8 @@ def test_a_script_of_text_and_music_is_what_perform_makes(ude: MotionModel, tmp_
     script = Script(
         segments=[
             ScriptSegment(text="a person walks", seconds=5),
-            ScriptSegment(music=music, start=1, end=5.6),
-            ScriptSegment(text="a person waves", music=music, seconds=2),
+            ScriptSegment(music=f"{music}@1-5.6"),
+            ScriptSegment(text="a person waves", music=f"{music}@0-2"),
         ]
     )
     chunks = list(ude.stream(script, seed=4))

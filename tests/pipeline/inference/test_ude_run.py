@@ -44,8 +44,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (place / "show.yaml").write_text("""
 segments:
   - {text: a person walks forward, seconds: 2}
-  - {music: slow.wav, start: 1, end: 4.5}
-  - {music: fast.mp3, seconds: 2, text: a person waves}
+  - {music: slow.wav@1-4.5}
+  - {music: fast.mp3@0-2, text: a person waves}
   - {text: a person squats, seconds: 1}
 """)
     return place

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -151,18 +150,6 @@ def test_figures_of_a_stage_whose_input_was_made_anew_are_outdated(tmp_path: Pat
     for name, line in zip(("tokenizer", "evaluate"), missing_lines(runs[1]), strict=True):
         assert line.startswith(f"{name}: outdated: 'data' ")
     assert [row.run.label for row in compared_tables(runs)[0].rows] == ["one"]
-
-
-def test_a_later_evaluation_is_taken_while_it_is_the_newest(tmp_path: Path) -> None:
-    one, two = (write_run(tmp_path / name, figures=metrics(mpjpe=50.0)) for name in ("one", "two"))
-    again = one / "evaluate/metrics.json"
-    again.parent.mkdir()
-    metrics(mpjpe=45.0).write(again)
-    newest = max(path.stat().st_mtime for path in one.rglob("artifact.json"))
-    for age, mean in ((+10, 45.0), (-10, 50.0)):
-        os.utime(again, (newest + age, newest + age))
-        row = tables_of(one, two)["reconstruction"].rows[0]
-        assert row.figures["reconstruction.mpjpe"].value == mean
 
 
 def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
