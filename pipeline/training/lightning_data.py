@@ -16,7 +16,7 @@ from motionloom.pipeline.contract.lookup import outside_stage
 from motionloom.pipeline.contract.stage import CompletedStage, StageCache, stage_kind
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import every_batch, loader, prepare_module
+from motionloom.pipeline.training.execution import every_batch, loader, prepare_module, set_threads
 from motionloom.pipeline.training.trained_stage import Batches, TrainedStage, hyper_parameters
 
 
@@ -30,6 +30,11 @@ class StageData(L.LightningDataModule):
     def __init__(self, batches: Batches, train: TrainConfig, hardware: Hardware | None = None) -> None:
         super().__init__()
         self.batches, self.config, self.hardware = batches, train, hardware or Hardware()
+
+    def setup(self, stage: str) -> None:
+        """Compute in as many threads of a CPU as the pipeline's own loop: another number rounds otherwise."""
+        if self.trainer is not None:
+            set_threads(self.trainer.lightning_module, self.hardware)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         trainer = self.trainer

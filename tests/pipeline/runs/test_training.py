@@ -1,0 +1,107 @@
+"""`training`: a stage's module and batches for `lightning.Trainer`, and modules from checkpoints."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import pytest
+import torch
+
+from motionloom.datasets.schema import UserError
+from motionloom.models.tma.module import TmaModule
+from motionloom.models.training.stage_module import StageModule
+from motionloom.pipeline.runs.training import training
+from motionloom.pipeline.training.lightning_data import StageData
+
+SMALL = ["tokenizer", "face_tokenizer", "tma", "gpt", "face_gpt", "face_vae", "face_diffusion"]
+
+
+def fitted(module: StageModule, data: StageData, steps: int, folder: Path) -> L.Trainer:
+    """A Trainer that has trained for some steps and validated at the end."""
+    trainer = L.Trainer(
+        max_steps=steps,
+        val_check_interval=steps,
+        accelerator="cpu",
+        default_root_dir=folder,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(module, data)
+    return trainer
+
+
+@pytest.mark.parametrize("stage", [*SMALL, "utt", "dmd"])
+def test_a_trainer_makes_the_weights_of_the_run(stage: str, request: Any, tmp_path: Path) -> None:
+    """Bit for bit those of the run's first checkpoint that is left; and both kinds of checkpoint load."""
+    run = request.getfixturevalue("small_run" if stage in SMALL else "ude_run").folder
+    first = min((run / "stages" / stage / "checkpoints").glob("*.ckpt"))
+    wanted = torch.load(first, weights_only=True)
+    module, data = training(run, stage)
+    trainer = fitted(module, data, wanted["global_step"], tmp_path)
+    assert trainer.callback_metrics["val/loss"].isfinite()
+    assert module.state_dict().keys() == wanted["state_dict"].keys()
+    for name, value in module.state_dict().items():
+        assert torch.equal(value, wanted["state_dict"][name]), name
+    trainer.save_checkpoint(tmp_path / "trainer.ckpt")
+    batch = data.batches.train(8, 0, 1)[0]
+    losses = []
+    for loaded in (StageModule.load_from_checkpoint(path) for path in (first, tmp_path / "trainer.ckpt")):
+        assert type(loaded) is type(module) and loaded.hparams["config"] == module.hparams["config"]
+        torch.manual_seed(0)
+        losses.append(loaded.eval().losses(batch)["loss"])
+    assert losses[0].isfinite() and torch.equal(losses[0], losses[1])
+
+
+def test_checkpoints_follow_their_run(small_run: Any, tmp_path: Path) -> None:
+    """A run that was moved; a Trainer's checkpoint whose run was; one of another class; one built by hand."""
+    moved = tmp_path / "moved"
+    shutil.copytree(small_run.folder, moved)
+    own = min((moved / "stages/tma/checkpoints").glob("*.ckpt"))
+    module = TmaModule.load_from_checkpoint(own)
+    path = tmp_path / "trainer.ckpt"
+    with pytest.raises(TypeError, match="TmaModule"):
+        type(training(moved, "gpt")[0]).load_from_checkpoint(own)
+    content = torch.load(own, weights_only=True)
+    content["hyper_parameters"]["inputs"] = {"data": "/gone", "stats": "/gone", "text": "/gone"}
+    torch.save(content, path)
+    with pytest.raises(UserError, match=r"trainer\.ckpt.*/gone.*inputs"):
+        TmaModule.load_from_checkpoint(path)
+    places = {role: moved / "stages" / role for role in ("data", "stats", "text")}
+    again = TmaModule.load_from_checkpoint(path, inputs=places)
+    by_hand = TmaModule.load_from_checkpoint(
+        own, net=again.net, optim=again.optim_config, seed=0, max_steps=10, loss=again.loss_config
+    )
+    for other in (again, by_hand):
+        for name, value in module.state_dict().items():
+            assert torch.equal(value, other.state_dict()[name]), name
+    del content["hyper_parameters"]
+    torch.save(content, path)
+    with pytest.raises(UserError, match="net="):
+        TmaModule.load_from_checkpoint(path)
+
+
+def test_a_recipe_makes_what_the_stage_needs(
+    small_run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    changes = [
+        "data.clips=24",
+        "tokenizer.train.steps=2",
+        "tokenizer.optim={schedule: cosine, warmup_steps: 0}",
+    ]
+    module, data = training(small_run.recipe, "tokenizer", changes)
+    assert sorted(path.parent.name for path in tmp_path.glob("runs/small/stages/*/artifact.json")) == [
+        "data",
+        "stats",
+    ]
+    assert module.max_steps == 2 and fitted(module, data, 2, tmp_path).global_step == 2
+    assert module.schedule.get_last_lr() == [0.0], "the cosine has ended"
+    with pytest.raises(UserError, match="'text' is not finished"):
+        training(tmp_path / "runs/small", "gpt")
+    with pytest.raises(UserError, match=r"'stats'.*trains nothing"):
+        training(small_run.folder, "stats")
