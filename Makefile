@@ -51,13 +51,13 @@ OLDER := NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" OPENBLAS_CORETY
 test-older: $(STAMP)
 	@$(OLDER) $(MAKE) --no-print-directory test-all
 
-# mypy reads the folders as the namespace package `motionloom`, so it gets a folder of that name that links to them.
+# mypy reads this folder as the package `motionloom`, so it gets one of that name that links to what is in it.
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	@mkdir -p build/types/motionloom
-	@for d in pipeline datasets models configs; do ln -sfn ../../../$$d build/types/motionloom/$$d; done
-	cd build/types && MYPYPATH=. $(BIN)/mypy --config-file ../../pyproject.toml -p motionloom.datasets -p motionloom.models -p motionloom.pipeline -p motionloom.configs
+	@for d in pipeline datasets models configs __init__.py __init__.pyi; do ln -sfn ../../../$$d build/types/motionloom/$$d; done
+	cd build/types && MYPYPATH=. $(BIN)/mypy --config-file ../../pyproject.toml -p motionloom
 
 # The wheel is built from the unpacked sdist: what the tree has beside it, old files in build/ too, is in neither.
 dist: $(STAMP)

@@ -1,4 +1,4 @@
-"""Lists the packages: every folder with Python files is `motionloom.<folder>`. All else is in pyproject.toml.
+"""Lists the packages: this folder is `motionloom`, and every one in it with Python files `motionloom.<folder>`.
 
 A new folder, such as a model's, is so a package without being named anywhere.
 """
@@ -16,7 +16,7 @@ def packages() -> list[str]:
     """Dotted names of all folders that hold Python files."""
     here = Path(__file__).resolve().parent
     folders = {path.parent.relative_to(here) for root in ROOTS for path in (here / root).rglob("*.py")}
-    return sorted(".".join(("motionloom", *folder.parts)) for folder in folders)
+    return ["motionloom", *sorted(".".join(("motionloom", *folder.parts)) for folder in folders)]
 
 
 setup(packages=packages())
