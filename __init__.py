@@ -1,7 +1,8 @@
 """Text or music to whole-body motion: HumanTOMATO, UDE and what both are compared with, as one framework.
 
 `motionloom.models`, `motionloom.datasets` and `motionloom.pipeline` each list their public names; those that
-most programs begin with are here. Each is imported on first use: `import motionloom` alone brings in no torch.
+most programs begin with are here. Each is imported on first use: `import motionloom` alone brings in no
+torch.
 """
 
 from importlib.metadata import version

@@ -1,4 +1,4 @@
-"""Lists the packages: this folder is `motionloom`, and every one in it with Python files `motionloom.<folder>`.
+"""Lists the packages: `motionloom` is this folder, and `motionloom.<folder>` each in it with Python files.
 
 A new folder, such as a model's, is so a package without being named anywhere.
 """

@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "architecture.md"
 SOURCE = ("datasets", "models", "pipeline", "configs")
 CODE = (".py", ".js", ".css", ".html")
-UNCOUNTED = ("__pycache__", "__init__.py", "py.typed")
+UNCOUNTED = ("__pycache__", "__init__.py", "__init__.pyi", "py.typed")
 MARKERS = ("<!-- house -->", "<!-- /house -->")
 
 

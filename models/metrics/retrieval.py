@@ -111,7 +111,7 @@ def r_precision(
 def matching_score(
     text: Tensor, motion: Tensor, *, batch: int | None = None, seed: int | None = None
 ) -> Tensor:
-    """Mean Euclidean distance between each text and its own motion; scalar float64.
+    """Mean Euclidean distance between texts [N, Z] and their own motions [N, Z]; scalar float64.
 
     `batch` and `seed` drop the same rows as `r_precision` does, as the public evaluators do.
     """

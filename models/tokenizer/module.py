@@ -63,5 +63,5 @@ class TokenizerModule(StageModule):
     net: Tokenizer
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """As `tokenizer_losses` has them."""
+        """Return `tokenizer_losses` of "motion" [B, T, D], "length" [B], "present" bool [B, D] (or none)."""
         return tokenizer_losses(self.net, batch)[0]

@@ -95,7 +95,7 @@ class AlternatingModule(StageModule):
         """
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Figures of all groups, each under its name, and the first one's loss as "loss" (validation)."""
+        """Return figures of all groups, scalars [], under GROUP_NAME, and the first one's loss as "loss"."""
         shared: dict[str, Tensor] = {}
         out: dict[str, Tensor] = {}
         for group in self.optimizer_groups():

@@ -145,7 +145,7 @@ class StageModule(L.LightningModule, ABC):
 
     @abstractmethod
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Losses and scalar metrics of one batch; "loss" is minimised, the others are only logged."""
+        """Return figures of one batch, scalars []: "loss" is minimised, the others are only logged."""
 
     def compile_losses(self) -> None:
         """Compile networks and losses as one graph; seeding and logging stay outside. A break is an error.

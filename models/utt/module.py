@@ -73,6 +73,7 @@ class UttModule(AlternatingModule):
         return super().training_step(batch, batch_idx)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the figures of token model and critic, scalars [], of a batch as `losses_of` takes it."""
         self._weigh()
         return super().losses(batch)
 

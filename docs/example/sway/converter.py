@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from motionloom import register
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.features import features_of
@@ -14,7 +15,6 @@ from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.schema import Caption, Split
 from motionloom.datasets.shards.sample import Sample
-from motionloom.pipeline import register
 
 
 class ArraysConfig(ConvertConfig):

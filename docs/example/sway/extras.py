@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
+from motionloom import register
 from motionloom.datasets.modalities.modality import FrameModality
-from motionloom.pipeline import register
 from motionloom.pipeline.contract.units import Row
 from motionloom.pipeline.evaluation.clip_metrics import ClipMetric, Performance
 from motionloom.pipeline.evaluation.figures import Metric

@@ -143,7 +143,7 @@ def test_a_changed_loss_is_a_reason(site: Path, command: list[object], run: Path
 
 REFUSED = """
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline import register
+from motionloom import register
 from sway import converter, extras, stages
 
 from motionloom.datasets.convert.registry import names
