@@ -1,7 +1,8 @@
-"""A small GPT of two streams, and one aligned with a small TMA behind a small tokenizer."""
+"""Random tokens of two streams, a small GPT of them, and one aligned with a small TMA."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.gpt.tokens import TokenSequence, interleave
+from motionloom.models.gpt.tokens import Codes, TokenSequence, interleave
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
@@ -52,10 +53,26 @@ def aligned_gpt(
     return module, tokenizer, tma
 
 
+def random_codes(groups: Sequence[int], streams: Sequence[Stream] = STREAMS) -> Codes:
+    """So many groups a row; 0 behind them."""
+    draws, number, most = torch.Generator().manual_seed(3), torch.tensor(groups), max(groups)
+    codes = {}
+    for name, count, per in streams:
+        values = torch.randint(count, (len(groups), most * per), generator=draws)
+        codes[name] = values * (torch.arange(most * per) < number[:, None] * per)
+    return Codes(codes, number)
+
+
+def closed(groups: Sequence[int]) -> TokenSequence:
+    """Sequences of them, each with its End tokens."""
+    codes = random_codes(groups)
+    return interleave(codes.codes, PATTERN, ends=ENDS, groups=codes.groups)
+
+
 def sequences(groups: list[int], net: InterleavedGPT) -> tuple[TokenSequence, Tensor]:
     """Closed sequences of any codes, and a text for each."""
+    streams = [Stream(name, net.num_codes[name], net.pattern.count(name)) for name in net.names]
+    codes = random_codes(groups, streams)
+    sequence = interleave(codes.codes, net.pattern, ends=net.num_codes, groups=codes.groups)
     draws = torch.Generator().manual_seed(1)
-    shape = {name: (len(groups), max(groups) * net.pattern.count(name)) for name in net.names}
-    codes = {name: torch.randint(net.num_codes[name], shape[name], generator=draws) for name in net.names}
-    sequence = interleave(codes, net.pattern, ends=net.num_codes, groups=torch.tensor(groups))
     return sequence, torch.randn(len(groups), net.text_in.in_features, generator=draws)

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from toy_gpt import PATTERN, STREAMS, random_codes
 
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.dmd_streaming import DmdStream
 from motionloom.models.diffusion.sampling import decode_window
 from motionloom.models.diffusion.schedule import Sampler
-from motionloom.models.tokenizer.base import Stream
 
-STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
 PER = {stream.name: stream.per_group for stream in STREAMS}
 WINDOW, OVERLAP, SEED, STEPS = 24, 8, 2**63 + 11, 3
 
@@ -22,16 +21,9 @@ WINDOW, OVERLAP, SEED, STEPS = 24, 8, 2**63 + 11, 3
 def net() -> Dmd:
     torch.manual_seed(0)
     config = DmdConfig(dim=16, ff=16, heads=2, encoder_layers=1, decoder_layers=1)
-    made = Dmd(config, STREAMS, ("body", "body", "hand"), 6).eval()
+    made = Dmd(config, STREAMS, PATTERN, 6).eval()
     torch.nn.init.normal_(made.motion_out.weight, std=0.5)
     return made
-
-
-def tokens(groups: int) -> dict[str, Tensor]:
-    draws = torch.Generator().manual_seed(groups)
-    return {
-        s.name: torch.randint(0, s.num_codes, (1, groups * s.per_group), generator=draws) for s in STREAMS
-    }
 
 
 def cut(codes: dict[str, Tensor], first: int, last: int) -> dict[str, Tensor]:
@@ -85,7 +77,7 @@ def slow(net: Dmd, codes: dict[str, Tensor], groups: int, sampler: Sampler) -> T
 @pytest.mark.parametrize("sampler", ["dpm++", "ddpm"])
 @pytest.mark.parametrize("groups", [1, 5, 6, 7, 10, 11, 23])
 def test_pieces_are_the_slow_version(net: Dmd, groups: int, sampler: Sampler) -> None:
-    codes = tokens(groups)
+    codes = random_codes([groups]).codes
     wanted = slow(net, codes, groups, sampler)
     for size in (1, 4, groups):
         pieces = [min(size, groups - at) for at in range(0, groups, size)]
@@ -98,6 +90,6 @@ def test_pieces_are_the_slow_version(net: Dmd, groups: int, sampler: Sampler) ->
 
 def test_frames_come_before_the_end(net: Dmd) -> None:
     stream = DmdStream(net, PER, seed=1, sampler="dpm++", steps=STEPS, window=WINDOW, overlap=OVERLAP)
-    codes = tokens(60)
+    codes = random_codes([60]).codes
     came = [found for at in range(60) if (found := stream.push(cut(codes, at, at + 1))) is not None]
     assert [len(frames) for frames in came] == [WINDOW - OVERLAP] * 14

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from motionloom.models.quantize.base import QuantizerConfig, draw_rows, nearest
-from motionloom.models.quantize.ema import EmaQuantizer, ResidualQuantizer, cluster_sums
+from motionloom.models.quantize.base import QuantizerConfig, draw_rows
+from motionloom.models.quantize.ema import EmaQuantizer, ResidualQuantizer
 
 
 @pytest.fixture(scope="module")
@@ -84,17 +84,6 @@ def test_golden_after_their_initialisation_and_outside_resets(golden: dict[str, 
     same = (quantizer.codebook[reset][:, None] == batch).all(-1)
     assert (same.sum(1) == 1).all()  # each is one row of the batch,
     assert same.sum(0).max() == 1  # and all of them different ones
-
-
-def test_codes_are_the_nearest() -> None:
-    z, codebook = torch.randn(300, 7), torch.randn(20, 7)
-    assert torch.equal(nearest(z, codebook), torch.cdist(z.double(), codebook.double()).argmin(1))
-    codes = torch.randint(0, 20, (300,))
-    sums = torch.stack([z[codes == k].sum(0) for k in range(20)])
-    torch.testing.assert_close(cluster_sums(z, codes, 20), sums, rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(
-        torch.zeros(20, 7).index_put_((codes,), z, accumulate=True), sums, rtol=1e-5, atol=1e-5
-    )
 
 
 def test_first_batch_initialises_with_its_own_distinct_rows() -> None:

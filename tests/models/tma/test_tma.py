@@ -1,4 +1,4 @@
-"""TMA's network and Lightning module: masks, shapes, strides, and that it learns to retrieve."""
+"""TMA's network and Lightning module: masks, strides, noise and dropout of the text."""
 
 from __future__ import annotations
 
@@ -51,14 +51,6 @@ def test_frame_stride_sees_every_nth_frame_only(stride: int) -> None:
     torch.testing.assert_close(net.encode_motion(motion, length)[0], full.encode_motion(strided, frames)[0])
     z = torch.randn(2, 32)
     torch.testing.assert_close(net.decode(z, length, 11), full.decode(z, frames, strided.shape[1]))
-
-
-def test_paper_config() -> None:
-    config = TmaConfig()
-    with torch.device("meta"):
-        count = sum(p.numel() for p in Tma(config, 313, 384).parameters())
-    per_layer = 4 * 256 * 256 + 2 * 256 * 1024
-    assert count == pytest.approx(3 * 6 * per_layer, rel=0.05)
 
 
 def test_text_noise_is_as_wide_as_asked_and_of_each_caption() -> None:

@@ -1,20 +1,16 @@
-"""The UTT: prefix mask, causality, padding, z, GRU, cached = uncached, sizes, the way to motion."""
+"""The UTT: causality, padding, z, GRU, music beside its tokens."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 from torch import Tensor
+from toy_gpt import PATTERN, STREAMS, closed
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.tokens import interleave
-from motionloom.models.tokenizer.base import Stream
-from motionloom.models.utt.backbone import prefix_mask
 from motionloom.models.utt.network import Utt, UttConfig
 
-PATTERN = ("body", "body", "hand")
-STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
 TINY = UttConfig(layers=2, dim=16, heads=4, ff=32, block_size=30, dropout=0.0, attention_dropout=0.0, z_dim=3)
 
 
@@ -35,16 +31,6 @@ def conditions(batch: int, size: int = 5, lengths: list[int] | None = None) -> E
     return Encoded(glob, seq, mask)
 
 
-def sequences(batch: int, groups: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    generator = torch.Generator().manual_seed(2)
-    most = max(groups)
-    codes = {
-        "body": torch.randint(7, (batch, 2 * most), generator=generator),
-        "hand": torch.randint(5, (batch, most), generator=generator),
-    }
-    return tuple(interleave(codes, PATTERN, ends={"body": 7, "hand": 5}, groups=torch.tensor(groups)))
-
-
 def hidden(utt: Utt, tokens: Tensor, kinds: Tensor, condition: Encoded, z: Tensor | None = None) -> Tensor:
     """States in float64, of which `forward` gives float32 logits."""
     prefix, mask = utt.prefix(condition, z)
@@ -52,18 +38,8 @@ def hidden(utt: Utt, tokens: Tensor, kinds: Tensor, condition: Encoded, z: Tenso
     return utt.backbone(prefix, mask, utt.motion_inputs(embedded, 0, utt.frame_condition(condition)))
 
 
-def test_prefix_mask_written_out() -> None:
-    mask = torch.tensor([[True, True, False], [True, True, True]])
-    expected = [
-        ["110000", "110000", "110000", "110100", "110110", "110111"],
-        ["111000", "111000", "111000", "111100", "111110", "111111"],
-    ]
-    found = prefix_mask(mask, 3).int()
-    assert [["".join(map(str, row)) for row in rows] for rows in found.tolist()] == expected
-
-
 def test_a_row_depends_on_nothing_but_itself(utt: Utt) -> None:
-    tokens, kinds, _ = sequences(3, [5, 2, 3])
+    tokens, kinds, _ = closed([5, 2, 3])
     condition, z = conditions(3, 5, [5, 0, 2]), torch.randn(3, 3).double()
     condition = condition._replace(seq=condition.seq.masked_fill(~condition.mask[..., None], 1e3))
     together = hidden(utt, tokens, kinds, condition, z)
@@ -76,7 +52,7 @@ def test_a_row_depends_on_nothing_but_itself(utt: Utt) -> None:
 
 
 def test_motion_is_causal_and_sees_the_whole_prefix(utt: Utt) -> None:
-    tokens, kinds, _ = sequences(1, [4])
+    tokens, kinds, _ = closed([4])
     condition = conditions(1)
     condition.seq.requires_grad_()
     embedded = utt.embed(tokens[:, :-1], kinds[:, :-1]).detach().requires_grad_()
@@ -96,7 +72,7 @@ def test_z_is_added_to_the_global_embedding(utt: Utt) -> None:
     moved = condition._replace(glob=condition.glob + utt.z_in(z))
     for a, b in zip(utt.prefix(condition, z), utt.prefix(moved), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
-    tokens, kinds, _ = sequences(2, [3, 3])
+    tokens, kinds, _ = closed([3, 3])
     plain, noisy = hidden(utt, tokens, kinds, condition), hidden(utt, tokens, kinds, condition, z)
     assert (plain - noisy).abs().amax(-1).min() > 1e-6
     still = Utt(TINY.model_copy(update={"z_dim": 0}), STREAMS, PATTERN, glob_dim=6)
@@ -109,7 +85,7 @@ def test_music_beside_a_token_is_that_of_its_own_frames() -> None:
     torch.manual_seed(0)
     config = TINY.model_copy(update={"frame_condition": True})
     utt = Utt(config, STREAMS, PATTERN, glob_dim=6, stride=2).double().eval()
-    tokens, kinds, _ = sequences(2, [4, 4])
+    tokens, kinds, _ = closed([4, 4])
     timed = torch.randn(2, 7, 6, dtype=torch.float64)  # three groups and a half: the last is padded
     condition = conditions(2)._replace(timed=timed)
     plain = hidden(utt, tokens, kinds, condition)
@@ -131,23 +107,11 @@ def test_music_beside_a_token_is_that_of_its_own_frames() -> None:
     assert utt.frame_condition_in.weight.grad is not None
 
 
-@pytest.mark.parametrize("chunks", [[1] * 14, [5, 1, 8], [14]])
-def test_step_by_step_equals_at_once(utt: Utt, chunks: list[int]) -> None:
-    tokens, kinds, _ = sequences(3, [4, 4, 4])
-    condition, z = conditions(3, 5, [5, 0, 2]), torch.randn(3, 3).double()
-    whole = hidden(utt, tokens, kinds, condition, z)
-    prefix, mask = utt.prefix(condition, z)
-    inputs = utt.motion_inputs(utt.embed(tokens[:, :-1], kinds[:, :-1]), 0)
-    state = utt.backbone.begin(prefix, mask, 14)
-    out = torch.cat([utt.backbone.extend(x, state) for x in inputs.split(chunks, dim=1)], dim=1)
-    torch.testing.assert_close(out, whole, rtol=1e-10, atol=1e-10)
-
-
 def test_logits_keep_the_grammar_and_codes_that_a_clip_lacks_are_read_as_zero(utt: Utt) -> None:
-    tokens, kinds, _ = sequences(2, [4, 2])
+    tokens, kinds, _ = closed([4, 2])
     logits = utt(tokens, kinds, conditions(2))
     assert torch.equal(torch.isfinite(logits), utt.legal(tokens, kinds))
-    tokens, kinds, _ = sequences(1, [4])
+    tokens, kinds, _ = closed([4])
     known = kinds == 0
     other = torch.where(known, tokens, (tokens + 1) % 5)
     condition = conditions(1)
@@ -157,20 +121,8 @@ def test_logits_keep_the_grammar_and_codes_that_a_clip_lacks_are_read_as_zero(ut
     assert not torch.equal(a, utt(tokens, kinds, condition, inputs=other))
 
 
-def test_sizes_of_the_paper() -> None:
-    utt = Utt(UttConfig(), (Stream("code", 2048, 1),), ("code",), glob_dim=256)
-    block = 4 * 512 * 512 + 4 * 512 + 2 * 512 * 1024 + 1024 + 512 + 4 * 512
-    tables = 2049 * 512 + 2049 * 513
-    inputs = 257 * 512 + 2 * 257 * 256 + 512 + 160 * 512
-    assert sum(p.numel() for p in utt.parameters()) == 8 * block + 2 * 512 + tables + inputs
-    assert utt.max_groups == 159
-    gru = Utt(UttConfig(kind="gru"), (Stream("code", 2048, 1),), ("code",), glob_dim=256)
-    cells = 8 * (6 * 512 * 512 + 6 * 512 + 2 * 512) + 2 * 512
-    assert sum(p.numel() for p in gru.parameters()) == cells + tables + inputs
-
-
 def test_mistakes_are_named(utt: Utt) -> None:
-    tokens, kinds, _ = sequences(1, [10])
+    tokens, kinds, _ = closed([10])
     with pytest.raises(UserError, match=r"32 tokens.*net\.block_size 30"):
         utt(tokens, kinds, conditions(1))
     with pytest.raises(UserError, match="holds no motion"):

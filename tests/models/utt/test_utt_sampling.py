@@ -1,4 +1,4 @@
-"""Sampling from the UTT: windows, continuation, seeds, batches, lengths, guidance, a toy that it learns."""
+"""Sampling from the UTT: windows, continuation, seeds, batches, lengths, guidance."""
 
 from __future__ import annotations
 
@@ -6,17 +6,15 @@ from typing import Any
 
 import pytest
 import torch
+from toy_gpt import PATTERN, STREAMS, random_codes
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
 from motionloom.models.gpt.sampling import draw, sample_seeds
 from motionloom.models.gpt.tokens import Codes, interleave
-from motionloom.models.tokenizer.base import Stream
 from motionloom.models.utt.network import Utt, UttConfig
 from motionloom.models.utt.sampling import draw_z, generate, join, last_groups, window_start
 
-PATTERN = ("body", "body", "hand")
-STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
 TINY = UttConfig(layers=2, dim=16, heads=4, ff=32, block_size=14, dropout=0.0, attention_dropout=0.0, z_dim=3)
 
 
@@ -47,16 +45,6 @@ def conditions(batch: int, lengths: list[int] | None = None) -> Encoded:
 def null(batch: int) -> Encoded:
     zero = torch.full((batch, 6), 0.3, dtype=torch.float64)
     return Encoded(zero, zero.new_zeros(batch, 0, 6), torch.zeros(batch, 0, dtype=torch.bool))
-
-
-def random_codes(groups: list[int]) -> Codes:
-    generator, most = torch.Generator().manual_seed(3), max(groups)
-    number = torch.tensor(groups)
-    codes = {}
-    for s in STREAMS:
-        values = torch.randint(s.num_codes, (len(groups), most * s.per_group), generator=generator)
-        codes[s.name] = values * (torch.arange(most * s.per_group) < number[:, None] * s.per_group)
-    return Codes(codes, number)
 
 
 def row(codes: Codes, index: int) -> dict[str, list[int]]:

@@ -1,4 +1,4 @@
-"""MotionDiffuse: linear attention beside a slow version, its size, what starts at nothing, and learning."""
+"""MotionDiffuse: linear attention beside a slow version, what starts at nothing, and its loss."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from torch import nn
 
 from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.module import DenoiserModule
-from motionloom.models.diffusion.schedule import ScheduleConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.baselines.motiondiffuse.network import (
     Attend,
@@ -88,16 +87,6 @@ def test_stylization() -> None:
     torch.testing.assert_close(block(x, style), wanted)
 
 
-@pytest.mark.parametrize("attention", get_args(Attention))
-def test_size_of_the_published_model(attention: Attention) -> None:
-    with torch.device("meta"):
-        net = MotionDiffuse(MotionDiffuseConfig(attention=attention), 263, 512)
-    assert sum(p.numel() for p in net.parameters()) == 87_152_135
-    assert tuple(net.positions.shape) == (196, 512)
-    assert tuple(net.layers[0].styles[0].modulate[1].weight.shape) == (1024, 2048)
-    assert tuple(net.layers[7].caption.key.weight.shape) == (512, 256)
-
-
 def test_an_untrained_one_predicts_no_noise() -> None:
     net = MotionDiffuse(SMALL, 5, 7)
     text = Condition(torch.randn(2, 3, 7), torch.ones(2, 3, dtype=torch.bool))
@@ -132,32 +121,6 @@ def test_the_loss_is_a_mean_over_frames() -> None:
     torch.randint(0, 1000, (2,))
     noise = torch.randn(2, 6, 5)  # the untrained network says 0
     assert loss == pytest.approx(float(torch.cat([noise[0], noise[1, :2]]).square().mean()), rel=1e-6)
-
-
-def test_learns_which_motion_a_caption_means() -> None:
-    """Two captions that differ in one token, two motions: each its own, nearer than their mean is."""
-    torch.manual_seed(0)
-    schedule = ScheduleConfig(predicts="epsilon", steps=50)
-    net = MotionDiffuse(SMALL.model_copy(update={"dim": 32, "ff": 32, "schedule": schedule}), 3, 7)
-    module = DenoiserModule(net, OptimConfig(), seed=0, max_steps=1)
-    optimizer = torch.optim.Adam(net.parameters(), lr=4e-3)
-    tokens = torch.randn(1, 3, 7).repeat(2, 1, 1)
-    tokens[1, 1] = torch.randn(7)
-    targets = torch.tensor([1.0, -1.0])[:, None, None] * torch.tensor([1.0, -1.0, 0.5]).expand(2, 8, 3)
-
-    def batch(count: int) -> dict[str, object]:
-        text = Condition(tokens.repeat(count, 1, 1), torch.ones(2 * count, 3, dtype=torch.bool))
-        length = torch.full((2 * count,), 8)
-        return {"motion": targets.repeat(count, 1, 1), "length": length, "conditions": {"text": text}}
-
-    for _ in range(120):
-        optimizer.zero_grad()
-        module.losses(batch(16))["loss"].backward()
-        optimizer.step()
-    text = Condition(tokens, torch.ones(2, 3, dtype=torch.bool))
-    made = sample_motions(net, text, [8, 8], seeds=[1, 2], steps=50)
-    for found, wanted in zip(made, targets, strict=True):
-        assert (found - wanted).abs().mean() < 0.4  # their mean is 0.83 away, the other one 1.67
 
 
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
