@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.convert.common.release import ReleaseClip
 from motionloom.datasets.convert.motionx.convert import MotionXConfig, MotionXEntry
 from motionloom.datasets.convert.registry import prepare
-from motionloom.datasets.convert.sets.shared.release import ReleaseClip
 
 WAVE = "idea400/subset_0001/bandai_wave_right_hand_clip_1"
 TURN = "idea400/subset_0001/bandai_Walking_And_Turn_Left_clip_2"

@@ -19,9 +19,9 @@ import numpy as np
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.convert.common.splits import read_ids
 from motionloom.datasets.convert.sets.shared.body import SOUND_SUFFIXES, BodyConfig, BodyRelease
-from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
 

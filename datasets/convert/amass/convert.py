@@ -1,19 +1,27 @@
 """AMASS (SMPL-H or SMPL-X .npz) -> shards: parameters to joints without the mesh, joints to features.
 
 Z up becomes Y up. Jaw, eyes, soft tissue (`dmpls`) and markers are not used. `smpl75` keeps the parameters,
-without a shape; its two hand joints are SMPL's, at rest for SMPL-H and SMPL-X, which have none.
+without a shape; its two hand joints are SMPL's, at rest for SMPL-H and SMPL-X, which have none. A plan opens
+files that may be used, but only for their headers and a few scalars.
 """
 
 from __future__ import annotations
 
-from typing import cast
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from motionloom.datasets.convert.amass.plan import LICENCE, AmassClip, AmassConfig, plan_amass
-from motionloom.datasets.convert.amass.smpl_npz import SmplMotion, read_motion
-from motionloom.datasets.convert.common.converter import Converter, PlanSettings
+from motionloom.datasets.convert.amass.index import INDEX_FPS, IndexRow, clip_key, read_index, thinning
+from motionloom.datasets.convert.amass.smpl_npz import MotionHeader, read_motion, read_motion_header
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
+from motionloom.datasets.convert.captions.options import CaptionConfig, Listing, settle_captions
+from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import (
     canonical_smpl75,
     features_of,
@@ -21,20 +29,78 @@ from motionloom.datasets.convert.common.features import (
     require_human,
     upright,
 )
+from motionloom.datasets.convert.common.files import check_id, inside
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.release import (
+    Entry,
+    Figure,
+    Release,
+    ReleaseClip,
+    ReleaseConfig,
+    note_broken,
+)
+from motionloom.datasets.convert.common.splits import hash_split, original_of
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 
+SUFFIX = ".npz"
+LICENCE = "AMASS-noncommercial"
+"""Stated for every subset. The motions come from many laboratories with terms of their own, some of them
+freer, but the fits are AMASS's: non-commercial research only, and not to be passed on.
+"""
 FINGERS_MOVE = 1e-3
 """Radians. Fingers that turn less than this over a clip were not captured, but set to one pose."""
 
 _MODEL_OPTIONS = {"neutral": "body_model", "female": "body_model_female", "male": "body_model_male"}
 
 
-class Amass(Converter[AmassConfig, AmassClip]):
+class AmassConfig(CaptionConfig, ReleaseConfig):
+    """AMASS, or any folder tree of SMPL, SMPL-H or SMPL-X clips in .npz files (`SUBSET/subject/clip.npz`)."""
+
+    layouts = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
+    everyday = ("captions",)
+
+    name: str = "amass"
+    layout: str = "body133"
+    """`body133` or `h3d263`; `wholebody313` has the fingers too; `smpl75` keeps the parameters, for UDE."""
+    fps: float = Field(default=20.0, gt=0, le=240)
+    body_model: Path | None = None
+    """Your SMPL-H, SMPL-X or SMPL model (.npz) for clips of any gender. Without one, poses keep their
+    rotations and take the bone lengths of one neutral adult.
+    """
+    body_model_female: Path | None = None
+    """The same, for female clips."""
+    body_model_male: Path | None = None
+    """The same, for male clips."""
+    humanml_index: Path | None = None
+    """HumanML3D's `index.csv`: convert its clips (cut, and named by its numbers) instead of whole files."""
+    humanml_texts: Path | None = None
+    """HumanML3D's folder of texts, for the clips of `humanml_index`."""
+    mirror: bool = False
+    """With `humanml_index`: also the mirrored clips (`M...`), which have texts of their own there."""
+    up: Literal["z", "y"] = "z"
+    """The axis that points up in the files; AMASS's is z."""
+    source_fps: float | None = Field(default=None, ge=1, le=10_000)
+    """Overrides the files' frame rate, for collections that state a wrong one or none."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> AmassConfig:
+        if self.humanml_index is None and (self.mirror or self.humanml_texts is not None):
+            raise ValueError("mirror and humanml_texts need humanml_index")
+        if self.humanml_index is not None and self.captions is not None:
+            raise ValueError("captions and humanml_index exclude each other; the index has humanml_texts")
+        return self
+
+    @property
+    def has_captions(self) -> bool:
+        return self.captions is not None or self.humanml_texts is not None
+
+
+class Amass(Release[AmassConfig]):
     """The AMASS converter."""
 
     name = "amass"
@@ -42,6 +108,7 @@ class Amass(Converter[AmassConfig, AmassClip]):
     summary = "AMASS: SMPL-H and SMPL-X .npz files to shards."
     example = "AMASS shards"
     config_class = AmassConfig
+    terms = LICENCE
 
     def __init__(self, config: AmassConfig) -> None:
         super().__init__(config)
@@ -54,67 +121,206 @@ class Amass(Converter[AmassConfig, AmassClip]):
         """Kind of the user's body models by gender; empty without any."""
         self.bodies = bodies or {"neutral": BodyModel.neutral(skeleton)}
         """By gender; `neutral` serves the genders that are not there."""
+        self.headers: dict[str, MotionHeader] = {}
+        self.rows: dict[str, IndexRow] = {}
+        """Rows of the index by clip id, of mirrored clips too."""
+        self.listing: Listing | None = None
 
-    def plan(self, settings: PlanSettings) -> ConversionPlan[AmassClip]:
-        plan = plan_amass(self.config, self.kinds, settings)
+    def plan(self, settings: PlanSettings) -> ConversionPlan[ReleaseClip]:
+        plan = super().plan(settings)
         plan.notes.extend(sorted({str(body.statement["sentence"]) for body in self.bodies.values()}))
+        if self.listing is not None:
+            settle_captions(self.config, plan, self.listing)
         return plan
 
-    def depends_on(self, clip: AmassClip) -> list[object]:
-        texts = [caption.dump() for caption in clip.texts]
-        return [clip.label(), clip.file.size, clip.first, clip.last, texts]
+    def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterator[Entry]:
+        labels = list_files(self.config.source, draft)
+        draft.found = len(labels)
+        if self.config.humanml_index is not None:
+            yield from self._index_entries(self.config.humanml_index, labels, draft)
+            return
+        listing = self.listing = self.config.listing(labels)
+        draft.notes += listing.notes
+        for label in labels:
+            yield Entry(
+                listing.id_of(label), label, listing.texts_of(label), listing.split_of(label),
+                problem=listing.problem(label),
+            )  # fmt: skip
+
+    def _index_entries(
+        self, index: Path, labels: list[str], draft: ConversionPlan[ReleaseClip]
+    ) -> Iterator[Entry]:
+        """Every row of the index as one clip, or two with `mirror`; files without a row are reported."""
+        by_key: dict[str, str] = {}
+        for label in labels:
+            first = by_key.setdefault(clip_key(label), label)
+            if first is not label:
+                draft.leave_out(label, f"the same clip as {first}")
+        used: set[str] = set()
+        for row in read_index(index):
+            file = by_key.get(clip_key(row.source))
+            used.add(file or "")
+            both = self.config.mirror and file is not None
+            for clip_id, original in [(row.id, None), (f"M{row.id}", row.id)][: 1 + both]:
+                self.rows[clip_id] = row
+                # Stretches of one file may overlap: without split files they stay together.
+                split = (self.listed or {}).get(row.id) or (self.listed or {}).get(f"M{row.id}")
+                yield Entry(
+                    clip_id, file or row.source, split=split or hash_split(clip_key(row.source)),
+                    mirror_of=original,
+                )  # fmt: skip
+        for label in by_key.values():
+            if label not in used:
+                draft.leave_out(label, "in no row of the index")
+
+    def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
+        """Return the splits of the index's clips; those of whole files go with the captions."""
+        listed = super().split_lists(draft) if self.config.humanml_index is not None else None
+        mirrors = self.config.mirror
+        return listed and {key: split for key, split in listed.items() if mirrors or not original_of(key)}
+
+    def length(self, path: Path, label: str) -> tuple[int, float]:
+        header = self.headers[label] = read_motion_header(path, label)
+        if not (fps := self.config.source_fps or header.fps):
+            raise UserError("no mocap_framerate and no mocap_frame_rate in it; set source_fps")
+        return header.frames, fps
+
+    def fitted(self, entry: Entry, frames: int, fps: float, draft: ConversionPlan[ReleaseClip]) -> Entry:
+        header, parts = self.headers[entry.file], PurePosixPath(entry.file).parts
+        subset = parts[-3] if len(parts) > 2 else "."
+        entry = replace(
+            entry,
+            facts={"subset": subset, "gender": header.gender, "model": header.kind, "fps": fps},
+            problem=entry.problem or self._body_problem(header),
+        )
+        if (row := self.rows.get(entry.id)) is None:
+            return entry
+        first, last = row.cut(header.frames, fps)
+        beyond = "" if last > first else f"the index cuts beyond the {header.frames} frames of the file"
+        texts, broken = self._index_texts(entry.id, fps, draft)
+        problem = beyond or broken or entry.problem
+        return replace(entry, texts=texts, first=first, last=last, problem=problem)
+
+    def _index_texts(
+        self, clip_id: str, fps: float, draft: ConversionPlan[ReleaseClip]
+    ) -> tuple[tuple[Caption, ...], str]:
+        """Captions of a clip of the index, in its own seconds, and why it must be left out."""
+        folder = self.config.humanml_texts
+        if folder is None or not (path := folder / f"{clip_id}.txt").is_file():
+            return (), ""
+        try:
+            captions, wrong = read_humanml_captions(path, seconds=None, name=path.name)
+        except UserError as error:
+            return (), str(error)
+        draft.notes += [f"{path.name}: {problem}" for problem in wrong]
+        # The texts count seconds as frames / 20; a file thinned to 20.83 frames a second is a little shorter.
+        scale = INDEX_FPS * thinning(fps) / fps
+        if abs(scale - 1.0) > 1e-6:
+            captions = [
+                caption.model_copy(
+                    update={"start": caption.start * scale, "end": caption.end and caption.end * scale}
+                )
+                for caption in captions
+            ]
+        return tuple(captions), ""
+
+    def _body_problem(self, header: MotionHeader) -> str:
+        """Return the reason that parameters do not fit layout or body models; empty when they do."""
+        if self.layout.num_joints > BODY_JOINTS and not header.hands:
+            return f"{header.kind} without finger rotations; layout {self.config.layout} has fingers"
+        if not self.kinds:
+            return ""
+        kind = self.kinds.get(header.gender) or self.kinds.get("neutral")
+        if kind is None:
+            return f"no body model for gender '{header.gender}'; set body_model, which serves all"
+        if (kind == "SMPL-X") != (header.kind == "SMPL-X"):
+            return (
+                f"{header.kind} parameters, but the body model is {kind}: their shapes and rest poses differ"
+            )
+        return ""
 
     def options(self) -> dict[str, object]:
         return super().options() | {
             "bodies": {gender: body.statement for gender, body in self.bodies.items()}
         }
 
-    def joints(self, clip: AmassClip) -> SourceJoints:
-        return SourceJoints(self._joints(clip, self._read(clip), 1), clip.fps)
+    def figure(self, clip: ReleaseClip) -> Figure:
+        """The frames of a clip."""
+        fingers, palms = self.layout.num_joints > BODY_JOINTS, self.layout.name == "smpl75"
+        frames, label = slice(clip.first, clip.last), clip.entry.file
+        motion = read_motion(self.path_of(label), label, hands=fingers, palms=palms, frames=frames)
+        return Figure(rotations=motion.rotations, trans=motion.trans, betas=motion.betas)
 
-    def convert(self, clip: AmassClip) -> Sample:
-        motion = self._read(clip, palms=self.layout.name == "smpl75")
+    def joints(self, clip: ReleaseClip) -> SourceJoints:
+        return SourceJoints(self._posed(clip, self.figure(clip), 1), clip.fps)
+
+    def convert(self, clip: ReleaseClip) -> Sample:
+        figure, raw = self.figure(clip), self.layout.name == "smpl75"
+        assert figure.rotations is not None
         # Resampling would take every 6th frame as it is (120 to 20 a second): pose no others.
         ratio = clip.fps / self.layout.fps
         step = max(round(ratio), 1) if abs(ratio - round(ratio)) < 1e-6 else 1
-        if self.layout.name == "smpl75":
-            features, turned = self._parameters(clip, motion, step), np.zeros(0)
+        if raw:
+            features = self._parameters(clip, figure, step)
         else:
-            joints = self._joints(clip, motion, step)
-            if clip.mirror_of is not None:
+            joints = self._posed(clip, figure, step)
+            if clip.entry.mirror_of is not None:
                 joints = mirror(joints, self.layout.skeleton)
             features = features_of(joints, clip.fps / step, self.layout, same_bones=self.config.retarget)
-            turned = np.ptp(motion.rotations[:, BODY_JOINTS:], axis=0)
+        turned = np.ptp(figure.rotations[:, BODY_JOINTS:], axis=0)
+        hands = not raw and float(turned.max(initial=0.0)) > FINGERS_MOVE
         meta = self.meta(
-            clip,
-            features,
-            source=clip.file.label,
-            licence=self.config.licence or LICENCE,
-            hands=bool(turned.size) and float(turned.max()) > FINGERS_MOVE,
-            mirror_of=clip.mirror_of,
-        )
-        return Sample(meta, features, texts=list(clip.texts))
+            clip, features, source=clip.entry.file, licence=clip.licence, hands=hands,
+            mirror_of=clip.entry.mirror_of,
+        )  # fmt: skip
+        return Sample(meta, features, texts=list(clip.entry.texts))
 
-    def _parameters(self, clip: AmassClip, motion: SmplMotion, step: int) -> NDArray[np.float32]:
+    def _body(self, clip: ReleaseClip) -> BodyModel:
+        return self.bodies.get(str(clip.entry.facts["gender"])) or self.bodies["neutral"]
+
+    def _parameters(self, clip: ReleaseClip, figure: Figure, step: int) -> NDArray[np.float32]:
         """Columns of `smpl75` [T', 75]."""
-        body = self.bodies.get(clip.header.gender) or self.bodies["neutral"]
-        poses, trans = motion.rotations[::step], motion.trans[::step]
+        assert figure.rotations is not None and figure.trans is not None
+        body, poses, trans = self._body(clip), figure.rotations[::step], figure.trans[::step]
         if self.config.up == "z":
             poses, trans = upright(poses, trans, body)
-        if clip.mirror_of is not None:
+        if clip.entry.mirror_of is not None:
             poses, trans = mirrored(poses, trans, body)
         require_human(smpl_joints(poses[:, :BODY_JOINTS], trans, body), clip.fps / step)
         return canonical_smpl75(poses, trans, body, clip.fps / step, self.layout.fps)
 
-    def _read(self, clip: AmassClip, palms: bool = False) -> SmplMotion:
-        fingers = self.layout.num_joints > BODY_JOINTS
-        frames = slice(clip.first, clip.last)
-        return read_motion(clip.file.path, clip.file.label, hands=fingers, palms=palms, frames=frames)
-
-    def _joints(self, clip: AmassClip, motion: SmplMotion, step: int) -> NDArray[np.float64]:
+    def _posed(self, clip: ReleaseClip, figure: Figure, step: int) -> NDArray[np.float64]:
         """World joints [T, N, 3], Y up, of every `step`-th frame."""
-        body = self.bodies.get(clip.header.gender) or self.bodies["neutral"]
-        joints = smpl_joints(motion.rotations[::step], motion.trans[::step], body, motion.betas)
+        assert figure.rotations is not None and figure.trans is not None
+        body, count = self._body(clip), self.layout.num_joints
+        rotations = figure.rotations[::step, : BODY_JOINTS if self.layout.name == "smpl75" else count]
+        joints = smpl_joints(rotations, figure.trans[::step], body, figure.betas)
         if self.config.up == "z":
             joints = joints[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
         return np.asarray(joints, dtype=np.float64)
+
+
+def list_files(source: Path, draft: ConversionPlan[ReleaseClip]) -> list[str]:
+    """Paths of the motion files in the source, in name order; what cannot be opened goes to `draft.broken`.
+
+    Files that hold the shape of a subject without motion (`shape.npz`, `..._stagei.npz`) are none.
+    """
+    labels: list[str] = []
+    for folder, folders, names in os.walk(source):
+        links = [name for name in folders if (Path(folder) / name).is_symlink()]
+        for name in (*names, *links):
+            relative = (Path(folder) / name).relative_to(source).as_posix()
+            label = relative.encode("utf-8", "backslashreplace").decode()  # names may be any bytes
+            try:
+                if name in links:
+                    raise UserError("a link to a folder, which is not followed; put the folder in its place")
+                if name.endswith(SUFFIX) and name != "shape.npz" and not name.endswith("_stagei.npz"):
+                    check_id(relative, label)
+                    inside(source, relative).stat()
+                    labels.append(label)
+            except (UserError, OSError) as error:
+                note_broken(draft, label, error)
+    if not labels:
+        raise UserError(f"{source}: no {SUFFIX} file with motion in it")
+    draft.broken.sort(key=lambda drop: drop.source)
+    return sorted(labels)

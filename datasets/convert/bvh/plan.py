@@ -19,7 +19,7 @@ from pydantic import BeforeValidator, Field
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
-from motionloom.datasets.convert.captions.options import CaptionConfig, CaptionedPlan, settle_captions
+from motionloom.datasets.convert.captions.options import CaptionConfig, settle_captions
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.facts import Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
@@ -328,7 +328,7 @@ def _decide(
         [file.path for _, file in found], [file.path for _, file in found if not file.problem]
     )
     broken = [scan.problem for scan in scans if scan.problem is not None]
-    draft = CaptionedPlan[BvhClip](config, broken=broken, notes=listing.notes, stated=stated)
+    draft = ConversionPlan[BvhClip](config, broken=broken, notes=listing.notes, stated=stated)
     contents: dict[str, str] = {}
     other_rate = 0
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
@@ -356,7 +356,8 @@ def _decide(
         texts = listing.texts_of(clip.path)
         split, about = listing.split_of(clip.path), config.about(clip.path)
         planned = BvhClip(batches[number], clip, clip_id, split, texts, frames, fps, about)
-        draft.decide(planned, texts, reason)
+        keep = config.uncaptioned == "keep"
+        draft.decide(planned, reason, captioned=bool(texts), wanted=config.has_captions, keep=keep)
     if other_rate:
         draft.notes.append(
             f"{other_rate} captions state another frame rate than their file; the file's counts"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -215,31 +215,7 @@ def digest_of(path: Path) -> dict[str, str]:
     return {"file": path.name, "sha256": sha256_of(path)}
 
 
-@dataclass
-class CaptionedPlan(ConversionPlan[C]):
-    """The plan of a converter whose clips may have captions of the user's."""
-
-    bare_clips: list[str] = field(default_factory=list)
-    """Clips that lack nothing but captions."""
-    captioned: int = 0
-    """Clips that have them, and nothing against them."""
-
-    def decide(self, clip: C, texts: Sequence[Caption], reason: str) -> None:
-        """Take a clip or leave it out: for `reason`, or for want of captions where some were given."""
-        assert isinstance(self.config, CaptionConfig)
-        reason = self.repeated(clip) or reason
-        keep = self.config.uncaptioned == "keep"
-        if self.config.has_captions and not texts:
-            self.uncaptioned.append(clip.label())
-            if not reason:
-                self.bare_clips.append(clip.label())
-                reason = "" if keep else "no captions"
-        elif texts and not reason:
-            self.captioned += 1
-        self._settle(clip, reason)
-
-
-def settle_captions(config: CaptionConfig, draft: CaptionedPlan[C], found: Listing) -> None:
+def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: Listing) -> None:
     """Note in the plan what is listed but missing and how captions and clips fit; `draft.stop` is the reason
     that the conversion must not start yet.
     """

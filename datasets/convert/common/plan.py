@@ -61,6 +61,10 @@ class ConversionPlan(Generic[C]):
     """Listed by captions or split files, but not in the source."""
     uncaptioned: list[str] = field(default_factory=list)
     """In the source, without captions."""
+    bare_clips: list[str] = field(default_factory=list)
+    """Clips that lack nothing but captions."""
+    captioned: int = 0
+    """Clips that have them, and nothing against them."""
     dropped: list[Dropped] = field(default_factory=list)
     """In the source and readable, but left out."""
     rejected: list[Dropped] = field(default_factory=list)
@@ -101,9 +105,23 @@ class ConversionPlan(Generic[C]):
 
     def settle(self, clip: C, reason: str) -> None:
         """Take a clip or leave it out, for `reason` or because another has its id; and count it."""
-        self._settle(clip, self.repeated(clip) or reason)
+        self._settle(clip, self._repeated(clip) or reason)
 
-    def repeated(self, clip: C) -> str:
+    def decide(self, clip: C, reason: str, *, captioned: bool, wanted: bool, keep: bool) -> None:
+        """Settle a clip that may have captions: without any, where some are `wanted`, it is left out unless
+        `keep`.
+        """
+        reason = self._repeated(clip) or reason
+        if wanted and not captioned:
+            self.uncaptioned.append(clip.label())
+            if not reason:
+                self.bare_clips.append(clip.label())
+                reason = "" if keep else "no usable caption"
+        elif captioned and not reason:
+            self.captioned += 1
+        self._settle(clip, reason)
+
+    def _repeated(self, clip: C) -> str:
         """Return the reason to leave out a clip whose id an earlier one has; asked once for each clip."""
         if clip.id in self.ids:
             return f"second file for clip id '{clip.id}'; the first is {self.ids[clip.id]}"

@@ -31,6 +31,7 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.motionx.files import (
     HUMANML,
@@ -55,7 +56,6 @@ from motionloom.datasets.convert.motionx.parameters import (
     value_limits,
     with_face,
 )
-from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import Caption, Dropped, Split, UserError

@@ -18,9 +18,9 @@ from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.convert.common.tables import captions_of, read_csv
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
-from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.schema import Caption, Split, UserError

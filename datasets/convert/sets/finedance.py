@@ -15,10 +15,10 @@ import numpy as np
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.body import SOURCE_FPS, BodyConfig, BodyRelease
-from motionloom.datasets.convert.sets.shared.release import Entry, Figure, ReleaseClip, note_broken
 from motionloom.datasets.convert.sets.shared.vectors import rotvecs_of_rows
 from motionloom.datasets.schema import Split, UserError
 

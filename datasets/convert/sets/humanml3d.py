@@ -27,8 +27,7 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.files import check_id, inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.splits import original_of
-from motionloom.datasets.convert.sets.shared.release import (
+from motionloom.datasets.convert.common.release import (
     Entry,
     Figure,
     Release,
@@ -36,6 +35,7 @@ from motionloom.datasets.convert.sets.shared.release import (
     ReleaseConfig,
     note_broken,
 )
+from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.features.h3d import encode_h3d

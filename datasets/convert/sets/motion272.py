@@ -27,9 +27,7 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.splits import original_of
-from motionloom.datasets.convert.common.tables import captions_of
-from motionloom.datasets.convert.sets.shared.release import (
+from motionloom.datasets.convert.common.release import (
     Entry,
     Figure,
     Release,
@@ -37,6 +35,8 @@ from motionloom.datasets.convert.sets.shared.release import (
     ReleaseConfig,
     note_broken,
 )
+from motionloom.datasets.convert.common.splits import original_of
+from motionloom.datasets.convert.common.tables import captions_of
 from motionloom.datasets.convert.sets.shared.vectors import walked
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import SPLITS, Caption, Split, UserError

@@ -16,10 +16,10 @@ from dataclasses import replace
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import inside, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.release import Entry, ReleaseClip, note_broken
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
-from motionloom.datasets.convert.sets.shared.release import Entry, ReleaseClip, note_broken
 from motionloom.datasets.schema import Caption, Split, UserError
 
 TASKS = ("text_motion", "music_dance", "speech_gesture", "two_person_interaction")

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
-from motionloom.datasets.convert.sets.shared.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.sets.shared.vectors import walked
 from motionloom.datasets.schema import UserError
 

@@ -72,14 +72,14 @@ def test_humanml_index_cuts_names_mirrors_and_captions(amass: ModuleType, humanm
     late = amass.expected_joints(20.0, seconds=8.0)[70:120]  # HDM05's first three seconds are not counted
     np.testing.assert_allclose(decode(made["000002"], layout), canonicalize(late), atol=1e-5)
     wanted = {
-        "humanact12/humanact12/P11G01.npy": "'000004' of the index: HumanAct12",
-        "KIT/3/gone_poses.npy": "'000005' of the index",
+        "humanact12/humanact12/P11G01.npy": "clip '000004' is listed",
+        "KIT/3/gone_poses.npy": "clip '000005' is listed",
         "CMU/01/unused_poses.npz": "in no row",
         "KIT/3/walk_left_poses.npz (000006)": "601 frames",
         "KIT/3/walk_left_poses.npz (M000006)": "601 frames",
-        "KIT/3/walk_left_poses.npz (M000001)": "no captions",
-        "HDM05/bk/HDM_bk 01_stageii.npz (M000002)": "no captions",
-        "MoSh/50020/odd_poses.npz (M000003)": "no captions",
+        "KIT/3/walk_left_poses.npz (M000001)": "no usable caption",
+        "HDM05/bk/HDM_bk 01_stageii.npz (M000002)": "no usable caption",
+        "MoSh/50020/odd_poses.npz (M000003)": "no usable caption",
     }
     found = amass.reasons(manifest)
     assert found.keys() == wanted.keys() and all(part in found[file] for file, part in wanted.items())
@@ -104,7 +104,7 @@ def test_humanml_index_with_splits(amass: ModuleType, humanml: Path) -> None:
     options = {"humanml_index": humanml / "index.csv", "splits": splits, "mirror": True}
     manifest = amass.make(humanml / "amass", humanml / "out", **options)
     assert sorted(amass.features(humanml / "out")) == ["000000", "000002", "M000000"]
-    assert amass.reasons(manifest)["009999"].endswith("not in the index")
+    assert amass.reasons(manifest)["009999"].endswith("not in the source")
     assert amass.reasons(manifest)["KIT/3/walk_left_poses.npz (000001)"] == "in no split file"
     (splits / "test.txt").write_text("000002\nM000002\n")
     (splits / "val.txt").write_text("M000001\n")

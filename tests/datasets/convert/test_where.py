@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from motionloom.datasets.convert.amass.plan import AmassConfig
+from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.common.facts import parse_where, require_known
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.schema import UserError

@@ -31,7 +31,7 @@ from motionloom.datasets.convert.common.features import (
 )
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.sets.shared.release import (
+from motionloom.datasets.convert.common.release import (
     Entry,
     Figure,
     Release,

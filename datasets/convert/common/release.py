@@ -46,10 +46,15 @@ class ReleaseConfig(ConvertConfig):
     fps: float = 20.0
     splits: Path | None = None
     """Folder of train.txt, val.txt, test.txt with clip ids; else the set's own lists."""
-    uncaptioned: Literal["drop", "keep"] = "keep"
+    uncaptioned: Literal["stop", "drop", "keep"] = "keep"
     """Leave out or keep clips that have no usable caption."""
     retarget: bool = False
     """Give every clip the bone lengths of the layout's skeleton (the h3d layouts always do)."""
+
+    @property
+    def has_captions(self) -> bool:
+        """Whether the source has captions that a clip may lack."""
+        return True
 
 
 @dataclass(frozen=True)
@@ -190,10 +195,12 @@ class Release(Converter[Cfg, ReleaseClip]):
                 draft.miss(entry.file, f"clip '{entry.id}' is listed, but its file is not in the source")
             elif not isinstance(state, UserError):
                 clip, problem = self._clip(entry, state, draft)
-                draft.settle(clip, entry.problem or reason or problem)
+                reason = clip.entry.problem or reason or problem
+                captioned, keep = bool(clip.entry.texts), config.uncaptioned == "keep"
+                draft.decide(clip, reason, captioned=captioned, wanted=config.has_captions, keep=keep)
         draft.limit(lambda clip: clip.id)
         return draft.finish(
-            found=repeated + sum(state is not None for state in scanned.values()),
+            found=draft.found or repeated + sum(state is not None for state in scanned.values()),
             frames=self.frames,
             licence=lambda clip: clip.licence,
         )
@@ -228,6 +235,10 @@ class Release(Converter[Cfg, ReleaseClip]):
         """The entries as their sound allows, and why one must be left out; sets without sound have none."""
         return ((entry, "") for entry in entries)
 
+    def fitted(self, entry: Entry, frames: int, fps: float, draft: ConversionPlan[ReleaseClip]) -> Entry:
+        """Return an entry as the length and frame rate of its file, which lists do not know, make it."""
+        return entry
+
     def cut_to_sound(self, entry: Entry, last: int, fps: float) -> tuple[int, str]:
         """The last frame before the sound ends, and why the clip is left out if it ends too early."""
         return last, ""
@@ -247,6 +258,7 @@ class Release(Converter[Cfg, ReleaseClip]):
     ) -> tuple[ReleaseClip, str]:
         """The clip of an entry whose file is there, and why it is left out."""
         config, (frames, fps, size) = self.config, state
+        entry = self.fitted(entry, frames, fps, draft)
         last, mute = self.cut_to_sound(entry, min(frames if entry.last is None else entry.last, frames), fps)
         seconds = max(last - entry.first, 0) / fps
         texts = []
@@ -262,12 +274,9 @@ class Release(Converter[Cfg, ReleaseClip]):
         split = listed.get(entry.id) or entry.split or hash_split(entry.group or entry.id)
         licence = config.licence or entry.licence or self.terms
         clip = ReleaseClip(entry, split, min(entry.first, last), last, fps, licence, size)
-        if not texts:
-            draft.uncaptioned.append(clip.label())
         reason = (
             mute
             or ("" if entry.id in listed else "in no split file")
-            or ("" if texts or config.uncaptioned == "keep" else "no usable caption")
             or config.licence_problem(licence)
             or config.length_problem(clip.seconds)
         )
@@ -310,6 +319,6 @@ class Release(Converter[Cfg, ReleaseClip]):
         )
 
 
-def note_broken(draft: ConversionPlan[ReleaseClip], label: str, error: UserError) -> None:
+def note_broken(draft: ConversionPlan[ReleaseClip], label: str, error: Exception) -> None:
     """A list, caption or sound file that cannot be read: what needs it goes without."""
     draft.broken.append(drop(label, error))
