@@ -54,7 +54,6 @@ class Conversion(Generic[C]):
         return self.converter.options() | {"source_sha256": sha256_of_json(content)}
 
     def facts(self) -> DatasetFacts:
-        audio = self.converter.audio()
         return DatasetFacts(
             name=self.config.name,
             layout=self.converter.layout,
@@ -64,7 +63,7 @@ class Conversion(Generic[C]):
             options=self.options,
             motion_type=self.config.motion_type,
             licences=self.plan.licences,
-            audio=audio.dump() if audio else None,
+            audio=self.converter.audio(),
             dropped=self.plan.left_out(),
             notes=self.plan.notes,
         )

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +24,6 @@ from motionloom.datasets.convert.common.plan import C, ConversionPlan, facts_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import ClipMeta
 from motionloom.datasets.shards.sample import Sample
-
-if TYPE_CHECKING:
-    from motionloom.datasets.audio.features import AudioSettings
 
 Cfg = TypeVar("Cfg", bound=ConvertConfig)
 
@@ -93,8 +90,8 @@ class Converter(ABC, Generic[Cfg, C]):
         """Return all that samples depend on beside the source: options, and facts of the files they name."""
         return self.config.options()
 
-    def audio(self) -> AudioSettings | None:
-        """Settings of the audio features in the samples; None without any."""
+    def audio(self) -> dict[str, object] | None:
+        """Settings of the audio features in the samples, as plain JSON; None without any."""
         return None
 
     def subset(self, clip: C) -> str:

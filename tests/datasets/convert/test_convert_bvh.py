@@ -286,7 +286,11 @@ def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> Non
     assert [d.source for d in plan.missing] == ["dataset-1/dataset-1_bow_active_001.bvh"]
     assert plan.uncaptioned == ["again.bvh", "unknown.bvh"]
     told = Counter(d.reason.split(",")[0] for d in plan.dropped)
-    assert told == {"same bytes as dataset-1/dataset-1_bow_angry_001.bvh": 1, "no usable caption": 1, "0.67 s": 1}
+    assert told == {
+        "same bytes as dataset-1/dataset-1_bow_angry_001.bvh": 1,
+        "no usable caption": 1,
+        "0.67 s": 1,
+    }
     assert "8" in {str(cell) for column in plan.table().columns for cell in column.cells}
     kept = prepare(config(copy, captions=None)).plan
     assert any("same bytes as" in d.reason for d in kept.dropped)

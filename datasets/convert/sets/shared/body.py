@@ -129,8 +129,8 @@ class BodyRelease(Release[Cfg]):
         version = VERSION if self._audio else None
         return super().options() | {"body_model": self.body.statement, "audio_version": version}
 
-    def audio(self) -> AudioSettings | None:
-        return self._audio
+    def audio(self) -> dict[str, object] | None:
+        return self._audio.dump() if self._audio else None
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[ReleaseClip]:
         plan = super().plan(settings)
