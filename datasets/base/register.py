@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from importlib.util import find_spec, resolve_name
+from importlib.util import resolve_name
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -105,56 +105,40 @@ def distribution_of(module: str) -> str:
 def code_of(modules: Iterable[str]) -> dict[str, str]:
     """sha256 of the code of those modules that are neither motionloom's nor Python's, by their names.
 
-    A module's code is its file, and those of its own package that it imports, by others or within functions
-    too. What a notebook or a prompt defines has none.
+    A module's code is its file, and those of its package that it imports, by others or within functions too.
+    What a notebook or a prompt defines has none.
     """
-    foreign = {
-        name for name in modules if name.partition(".")[0] not in {"motionloom", *sys.stdlib_module_names}
-    }
-    sources = {name: _sources(name) for name in sorted(foreign)}
-    return {
-        name: sha256_of_json({one: sha256_of(file) for one, file in files.items()})
-        for name, files in sources.items()
-        if files
-    }
+    out = {}
+    for name in sorted(set(modules)):
+        if name.partition(".")[0] not in {"motionloom", *sys.stdlib_module_names} and (files := _files(name)):
+            out[name] = sha256_of_json({module: sha256_of(file) for module, file in files.items()})
+    return out
 
 
-def _sources(name: str) -> dict[str, Path]:
+def _files(name: str) -> dict[str, Path]:
     """The files of a module and of what it imports of its package, by the names of the modules."""
+    top = name.partition(".")[0]
+    package = sys.modules.get(top)
+    folders = [Path(folder) for folder in getattr(package, "__path__", ())]
+    if not folders:
+        file = getattr(package, "__file__", None)
+        return {} if file is None else {name: Path(file)}
     found: dict[str, Path] = {}
     todo = [name]
     while todo:
         module = todo.pop()
-        file = None if module in found else _source(module)
-        if file is None:
+        bases = [folder.joinpath(*module.split(".")[1:]) for folder in folders]
+        places = [place for base in bases for place in (base / "__init__.py", base.with_suffix(".py"))]
+        place = next((place for place in places if place.is_file()), None)
+        if module in found or place is None:  # None: what is imported from a module is no module
             continue
-        found[module] = file
-        package = module if file.name == "__init__.py" else module.rpartition(".")[0]
-        for node in ast.walk(ast.parse(file.read_bytes(), str(file))):
+        found[module] = place
+        inside = module if place.name == "__init__.py" else module.rpartition(".")[0]
+        for node in ast.walk(ast.parse(place.read_bytes(), str(place))):
             if isinstance(node, ast.Import):
-                names = [one.name for one in node.names]
+                todo += [one.name for one in node.names if one.name.partition(".")[0] == top]
             elif isinstance(node, ast.ImportFrom):
-                base = resolve_name("." * node.level + (node.module or ""), package)
-                names = [base, *(f"{base}.{one.name}" for one in node.names)]
-            else:
-                continue
-            todo += [one for one in names if one.partition(".")[0] == name.partition(".")[0]]
+                base = resolve_name("." * node.level + (node.module or ""), inside)
+                if base.partition(".")[0] == top:
+                    todo += [base, *(f"{base}.{one.name}" for one in node.names)]
     return found
-
-
-def _source(module: str) -> Path | None:
-    """The file of a module, which need not be imported yet; None where it has none, or is no module."""
-    loaded, parent = sys.modules.get(module), module.rpartition(".")[0]
-    file = getattr(loaded, "__file__", None)
-    if loaded is None and (not parent or _is_package(parent)):
-        spec = find_spec(module)
-        file = None if spec is None else spec.origin
-    return Path(file) if file is not None and file.endswith(".py") else None
-
-
-def _is_package(module: str) -> bool:
-    """Whether modules may lie in it; a module that is not imported stays so."""
-    if module in sys.modules:
-        return hasattr(sys.modules[module], "__path__")
-    file = _source(module)
-    return file is not None and file.name == "__init__.py"

@@ -2,8 +2,8 @@
 
 A record names the shard members it reads, makes `Condition`s of them for training and of prompts for
 generation, and says whether it needs statistics. Batches, drop-out, guidance, stages and prompts take the
-names from the table (`table.py`), so a new modality is its record and a line there. Importing a record brings
-in neither torch nor audio libraries: the shard format asks for member names only.
+names from the table (`table.py`), so a new modality is its record, given to `register`. Importing a record
+brings in neither torch nor audio libraries: the shard format asks for member names only.
 
 Legend: B rows of a batch, L positions, T frames of motion, E features.
 """
@@ -148,11 +148,15 @@ class Modality(ABC):
 
     @abstractmethod
     def batch(self, reader: object, dataset: Clips, rows: Rows) -> Condition:
-        """The condition of a training batch: [B, L, E], empty in rows that lack the modality."""
+        """The condition of a training batch, normalised: features [B, L, E], mask [B, L] false in rows that
+        lack it. `UserError` names a clip whose features do not fit its motion.
+        """
 
     @abstractmethod
     def encode(self, prepared: object, values: Sequence[object | None], fps: float) -> Condition:
-        """The condition of what people give, one entry a row, None without; not normalised yet."""
+        """The condition [B, L, E] of what people give for motion at `fps`, one entry a row, None without;
+        not normalised yet. `UserError` for what cannot be used.
+        """
 
     def normalise(self, prepared: object, condition: Condition) -> Condition:
         """An encoded condition as training saw it."""
@@ -160,7 +164,7 @@ class Modality(ABC):
 
     @abstractmethod
     def example(self, batch: int, frames: int, width: int) -> Condition:
-        """A condition of the largest usual size, to measure memory with."""
+        """A condition of the largest usual size, [batch, L, width], to measure memory with."""
 
     def seconds(self, value: object) -> float | None:
         """Length of what a person gives; None where it has none."""

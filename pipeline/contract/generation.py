@@ -248,4 +248,7 @@ class MotionGenerator(Protocol):
         """Its abilities besides `generate`."""
 
     def generate(self, request: GenerationRequest) -> list[Motion]:
-        """Features of the part in their own units, [T, C] each, in the order of the rows."""
+        """Features of the part in their own units, metres and radians, [T, C] each, in the order of the rows.
+
+        A row depends on its own seed and conditions alone. `UserError` for a request that it cannot meet.
+        """

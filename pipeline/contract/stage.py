@@ -162,6 +162,7 @@ class StageContext:
     """Name of the recipe, for people."""
     config: Any
     folder: Path
+    """Where it writes; a stage that trains finds its checkpoints there when it goes on."""
     inputs: Mapping[str, CompletedStage]
     seed: int
     hardware: Hardware
@@ -186,9 +187,11 @@ class StageContext:
 
     @property
     def given(self) -> Inputs:
+        """The inputs by role, each loaded when it is first read."""
         return self.stage_cache.given(self.inputs)
 
     def input(self, role: str) -> Path:
+        """The folder of the stage in a role."""
         return self.inputs[role].folder
 
     def every(self, role: str) -> list[CompletedStage]:
@@ -197,13 +200,18 @@ class StageContext:
 
 
 class StageKind(ABC, Generic[C]):
-    """Base of stage kinds. Subclasses set the attributes and override what applies to them."""
+    """Base of stage kinds. Subclasses set the attributes and override what applies to them.
+
+    `config` is the stage's own, `given` its loaded inputs by role. Where a method cannot go on it raises a
+    `UserError` of one sentence that says what to change.
+    """
 
     name: str
     """In recipes: `kind: name`."""
     summary: str
     """A few words for people."""
     config: type[C]
+    """Its fields are the keys of the stage in a recipe."""
     takes: tuple[str | Every, ...] = ()
     """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`. A role called
     otherwise than what fills it tells that behind a colon: "face_tokenizer?: tokenizer"."""
@@ -212,6 +220,7 @@ class StageKind(ABC, Generic[C]):
     version: int = 1
     """Raised when the same config makes something else than before."""
     trains: bool = False
+    """Whether `run` is a training, in which all processes of a run take part."""
     curves: tuple[Curve, ...] = ()
     """Columns of its training log that the report draws."""
     shares: bool = False
@@ -245,7 +254,7 @@ class StageKind(ABC, Generic[C]):
 
     @abstractmethod
     def run(self, context: StageContext) -> None:
-        """Make the stage's outputs in `context.folder`."""
+        """Make the stage's outputs in `context.folder`; later its files are compared with their sha256."""
 
     def settle(self, config: C, folder: Path) -> None:
         """Put RUNTIME settings into the folder of a finished stage, for the stages that read it."""
@@ -257,7 +266,7 @@ class StageKind(ABC, Generic[C]):
         return None
 
     def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> object:
-        """Return the completed stage's output, for the stages that take it."""
+        """Return the completed stage's output, for the stages that take it; tensors on `device`."""
         return stage.folder
 
     def preview_of_finished(self, stage: CompletedStage, given: Inputs) -> object:
@@ -281,7 +290,7 @@ class StageKind(ABC, Generic[C]):
         return config
 
     def export(self, stage: CompletedStage, target: Path) -> None:
-        """Copy what loading needs into `target`, an empty folder."""
+        """Copy what `load` and `generator` need into the folder `target`, which may have to be made."""
         raise UserError(f"{stage.folder}: a stage of kind {self.name} cannot be exported")
 
     # What a dry run and the report say of it.
@@ -301,7 +310,7 @@ class StageKind(ABC, Generic[C]):
 
 @dataclass
 class FunctionStage(StageKind):
-    """A kind that is one function; for stages that train nothing."""
+    """A kind that is one function; for stages that train nothing. Its output is `context.folder`."""
 
     name: str
     summary: str

@@ -109,8 +109,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     # In the recipe's order, since a fingerprint needs those of the inputs.
     for stage in recipe.stages:
         require_elsewhere(run, stage, recipe.outside)
-        code = code_of(stage.kind.modules(stage.config))
-        facts, folder = _facts(recipe, stage, rows, code), stage_folder(run, stage.name)
+        facts, folder = _facts(recipe, stage, rows), stage_folder(run, stage.name)
         before, again = Started.find(folder), request if stage.name in forced else None
         started = Started(
             fingerprint=fingerprint_of(facts),
@@ -122,7 +121,7 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
         if again is not None and stage.name not in done:
             action, reason = _decide_again(started, before, select)
         else:
-            action, reason = _decide(recipe, stage, started, before, folder, rows, forced, code)
+            action, reason = _decide(recipe, stage, started, before, folder, rows, forced)
         if before is not None and action == "resume":
             lengthened = before.lengthened
         # More steps of the same training are no other training: its checkpoints are a beginning of it.
@@ -135,7 +134,9 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
             action, reason = "leave", "not selected"
         started = started.model_copy(update={"lengthened": lengthened})
         identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
-        rows[stage.name] = PlannedStage(stage, action, reason, started, again, identities, code)
+        rows[stage.name] = PlannedStage(
+            stage, action, reason, started, again, identities, facts.get("code", {})
+        )
     return list(rows.values())
 
 
@@ -165,7 +166,7 @@ def selected(recipe: Recipe, select: Selection) -> set[str]:
     return needed if until is not None else {stage.name for stage in recipe.stages}
 
 
-def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage], code: Mapping[str, str]) -> Tree:
+def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
     """The facts that a stage's fingerprint is the digest of."""
     facts = {
         "kind": stage.kind.name,
@@ -177,7 +178,7 @@ def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage], code: Ma
     }
     if any(isinstance(role, Every) for role in stage.kind.roles()):
         facts["order"] = list(stage.inputs)  # the first of several generators is the default
-    if code:
+    if code := code_of(stage.kind.modules(stage.config)):
         facts["code"] = code
     return facts
 
@@ -221,14 +222,13 @@ def _decide(
     folder: Path,
     rows: Mapping[str, PlannedStage],
     forced: set[str],
-    code: Mapping[str, str],
 ) -> tuple[Action, str]:
     artifact = Artifact.find(folder)
     if artifact is None or artifact.fingerprint != started.fingerprint:
         if before is not None and before.fingerprint == started.fingerprint:
             return "resume", "started earlier, not finished"
         if artifact is not None:
-            return "run", _difference(recipe, artifact, stage, rows, code)
+            return "run", _difference(recipe, artifact, stage, rows)
         return "run", "never run" if before is None else "settings changed before it finished"
     gone = artifact.missing(folder)
     if gone:
@@ -239,13 +239,7 @@ def _decide(
     return "skip", "finished"
 
 
-def _difference(
-    recipe: Recipe,
-    artifact: Artifact,
-    stage: Stage,
-    rows: Mapping[str, PlannedStage],
-    code: Mapping[str, str],
-) -> str:
+def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[str, PlannedStage]) -> str:
     if artifact.kind != stage.kind.name or artifact.version != stage.kind.version:
         return f"{artifact.kind} v{artifact.version} is now {stage.kind.name} v{stage.kind.version}"
     old_fields, fields = flatten(artifact.config), flatten(stage.config.dump())
@@ -257,9 +251,9 @@ def _difference(
     if changes:
         more = f" (+{len(changes) - 1} more)" if len(changes) > 1 else ""
         return f"changed: {changes[0]}{more}"
-    modules = [name for name, _ in sorted(code.items() ^ artifact.code.items())]
-    if modules:
-        return f"code of {' and '.join(dict.fromkeys(modules))} changed"
+    code = code_of(stage.kind.modules(stage.config))
+    if edited := sorted({name for name, _ in code.items() ^ artifact.code.items()}):
+        return f"code of {' and '.join(edited)} changed"
     for role, name in stage.inputs.items():
         old = artifact.inputs.get(role)
         if old is None or old.fingerprint != _fingerprint(recipe, name, rows):

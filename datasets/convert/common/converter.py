@@ -1,7 +1,7 @@
 """`Converter`: what a source must answer; the same few questions for every kind of source.
 
-A new kind is a folder with a `convert.py` that holds one subclass. Command line, recipes and clusters find it
-there (`convert/registry.py`).
+Ours are a folder with a `convert.py` each, another package's class is given to `register`. Command line,
+recipes and clusters find both by name (`convert/registry.py`).
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ class Converter(ABC, Generic[Cfg, C]):
     example: ClassVar[str]
     """Words behind `motionloom data convert NAME` in the example of the help."""
     config_class: ClassVar[type[ConvertConfig]]
+    """Options of the command line and of a recipe's stage; the docstrings of its fields are their help."""
     published: ClassVar[str] = ""
     """Numbers that the makers of a set state, and where; a note of the plan says what is found of them."""
     version: ClassVar[int] = 1
@@ -62,19 +63,28 @@ class Converter(ABC, Generic[Cfg, C]):
 
     @cached_property
     def layout(self) -> MotionLayout:
+        """The layout of the shards, at their frame rate."""
         return self.config.motion_layout()
 
     @abstractmethod
     def plan(self, settings: PlanSettings) -> ConversionPlan[C]:
-        """Look at the whole source and decide what becomes of every file, without converting anything."""
+        """Look at the whole source and decide what becomes of every file, without converting anything.
+
+        `ConversionPlan.take` or `leave_out` each, then `finish`. `UserError` for a source of another kind.
+        """
 
     @abstractmethod
     def convert(self, clip: C) -> Sample | list[Sample]:
-        """The sample of one clip. `UserError` or `DropClip` for what cannot be a person's motion."""
+        """The sample of one clip, or several: motion [T, D] of `layout`, `meta`, captions, sound.
+
+        `UserError` or `DropClip` for what cannot be a person's motion: the clip is left out, with the reason.
+        """
 
     @abstractmethod
     def joints(self, clip: C) -> SourceJoints:
-        """The joints of one clip as they are read, for the look at a source before it is converted."""
+        """The joints of one clip as they are read, metres [T, N, 3] at the source's frame rate, for the look
+        at a source before it is converted. `UserError` for a file that cannot be read.
+        """
 
     @abstractmethod
     def depends_on(self, clip: C) -> list[object]:
@@ -116,6 +126,9 @@ class Converter(ABC, Generic[Cfg, C]):
         licence: str | None = None,
         mirror_of: str | None = None,
     ) -> ClipMeta:
+        """The facts of a sample: `motion` [T, D], whether hands and face were recorded, and the id of the
+        clip whose mirror image it is.
+        """
         return self.layout.clip_meta(
             clip.id,
             source=source or clip.label(),
