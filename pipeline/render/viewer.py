@@ -142,8 +142,11 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
         raise UserError("a viewer needs at least one motion")
     skeletons: list[SkeletonData] = []
     clips: list[ClipData] = []
+    scores: list[ScoreData] = []
+    chosen: list[int | None] = []
     for number, motion in enumerate(motions):
-        joints = _checked(motion, number)
+        where = f"motion {number} ('{motion.label or motion.caption}')"
+        joints = _checked(motion, where)
         human = human_skeleton(motion.parents)
         skeleton = _skeleton(motion.parents, human, joints)
         if skeleton not in skeletons:  # motions of one skeleton share it
@@ -169,6 +172,17 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
                 "pose": None if human is None else pose_data(posing_of(joints, human, motion.figure)),
             }
         )
+        score = score_data(motion.beats, motion.segments, len(joints) / motion.fps, where)
+        if any(score.values()) and score not in scores:
+            scores.append(score)
+        chosen.append(scores.index(score) if any(score.values()) else None)
+    # Each sound is carried once, however many motions play it.
+    sounds, playing = embed_sounds((motion.sound, len(motion.joints) / motion.fps) for motion in motions)
+    for clip, sound_number, score_number in zip(clips, playing, chosen, strict=True):
+        if sound_number is not None:
+            clip["sound"] = sound_number
+        if score_number is not None:
+            clip["score"] = score_number
     out: ViewerData = {
         "title": title,
         "note": note,
@@ -177,7 +191,10 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
         "skeletons": skeletons,
         "motions": clips,
     }
-    _add_tracks(out, motions)
+    if sounds:
+        out["sounds"] = sounds
+    if scores:
+        out["scores"] = scores
     return out
 
 
@@ -200,28 +217,6 @@ def has_bodies(data: ViewerData) -> bool:
 def media_policy(sounding: bool) -> str:
     """The part of a page's content policy for sound: media made by its own script, from no address."""
     return "; media-src blob:" if sounding else ""
-
-
-def _add_tracks(data: ViewerData, motions: Sequence[ViewerMotion]) -> None:
-    """Put in distinct `sounds` and `scores`, where there are any; clips get the numbers of their own."""
-    names = [_name(motion, number) for number, motion in enumerate(motions)]
-    lengths = [len(motion.joints) / motion.fps for motion in motions]
-    sounds, playing = embed_sounds(zip([motion.sound for motion in motions], lengths, strict=True))
-    scores: list[ScoreData] = []
-    for motion, clip, name, length, sound in zip(
-        motions, data["motions"], names, lengths, playing, strict=True
-    ):
-        if sound is not None:
-            clip["sound"] = sound
-        score = score_data(motion.beats, motion.segments, length, name)
-        if any(score.values()):
-            if score not in scores:
-                scores.append(score)
-            clip["score"] = scores.index(score)
-    if sounds:
-        data["sounds"] = sounds
-    if scores:
-        data["scores"] = scores
 
 
 def quantise(
@@ -263,8 +258,7 @@ def resource(name: str) -> str:
     return (resources.files("motionloom.pipeline.render") / "web" / name).read_text(encoding="utf-8")
 
 
-def _checked(motion: ViewerMotion, number: int) -> NDArray[np.float64]:
-    where = _name(motion, number)
+def _checked(motion: ViewerMotion, where: str) -> NDArray[np.float64]:
     joints = np.asarray(motion.joints, np.float64)
     if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
         raise UserError(f"{where}: joints must be [T, N, 3] with T > 0, got {list(joints.shape)}")
@@ -281,7 +275,3 @@ def _checked(motion: ViewerMotion, number: int) -> NDArray[np.float64]:
                 f"{where}: face_controls must be finite [T={len(joints)}, 5], got {list(face.shape)}"
             )
     return joints
-
-
-def _name(motion: ViewerMotion, number: int) -> str:
-    return f"motion {number} ('{motion.label or motion.caption}')"
