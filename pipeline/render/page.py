@@ -59,8 +59,7 @@ class Page:
         self._blocks: list[str] = []
         self._contents: list[tuple[str, str]] = []
         self._viewers = 0
-        self._sounding = False
-        self._bodies = False
+        self._shown: list[ViewerMotion] = []
         self._choosing = False
 
     def add_heading(self, text: str) -> Page:
@@ -172,10 +171,8 @@ class Page:
         name = f"viewer-{self._viewers}"
         if note:
             self.add_text(note)
-        content = viewer_data(motions)
-        self._sounding |= "sounds" in content
-        self._bodies |= has_bodies(content)
-        data = safe_json(content)
+        self._shown += motions
+        data = safe_json(viewer_data(motions))
         self._blocks.append(
             f'<div class="mlv viewer" id="{name}"></div>'
             f'<script type="application/json" id="{name}-data">{data}</script>'
@@ -203,11 +200,11 @@ class Page:
         contents = f'<nav aria-label="Sections">{links}</nav>' if len(self._contents) > 1 else ""
         return fill(
             resource("report/page.html"),
-            MEDIA=media_policy(self._sounding),
+            MEDIA=media_policy(self._shown),
             TITLE=escape(self.title),
             SUBTITLE=f"<p>{escape(self.subtitle)}</p>" if self.subtitle else "",
             STYLE=resource("report/page.css") + (resource("viewer/viewer.css") if self._viewers else ""),
-            SCRIPT=(viewer_script(self._bodies) if self._viewers else "")
+            SCRIPT=(viewer_script(has_bodies(self._shown)) if self._viewers else "")
             + (resource("report/choices.js") if self._choosing else ""),
             CONTENTS=contents,
             BODY="\n".join(self._blocks),

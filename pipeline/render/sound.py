@@ -15,7 +15,7 @@ import hashlib
 import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypedDict, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,15 +30,9 @@ BIT_RATE = 96_000
 _BLOCK = 2**16
 
 
-class SoundData(TypedDict):
-    """A compressed sound as a page carries it: a file in base64."""
-
-    mime: str
-    seconds: float
-    data: str
-
-
-def embed_sounds(uses: Iterable[tuple[Sound | None, float]]) -> tuple[list[SoundData], list[int | None]]:
+def embed_sounds(
+    uses: Iterable[tuple[Sound | None, float]],
+) -> tuple[list[dict[str, object]], list[int | None]]:
     """Each distinct sound once, as long as the longest motion that plays it; and which one each use plays.
 
     `uses` are motions: what each plays, and its seconds.
@@ -58,7 +52,7 @@ def embed_sounds(uses: Iterable[tuple[Sound | None, float]]) -> tuple[list[Sound
         samples, longest = distinct[number]
         distinct[number] = (samples, max(longest, seconds))
         chosen.append(number)
-    sounds: list[SoundData] = []
+    sounds: list[dict[str, object]] = []
     for samples, seconds in distinct:
         part = samples[: round(seconds * RATE)]
         data = base64.b64encode(_mp3(part)).decode("ascii")
@@ -135,15 +129,11 @@ class Score:
     segments: Segments = ()
 
 
-class ScoreData(TypedDict):
-    """Beats in seconds; segments [start, end, label, kind]."""
+def score_data(beats: Sequence[float], segments: Segments, seconds: float, where: str) -> dict[str, object]:
+    """`beats` in seconds and `segments` [start, end, label, kind] as plain JSON types, up to `seconds`.
 
-    beats: list[float]
-    segments: list[tuple[float, float, str, str]]
-
-
-def score_data(beats: Sequence[float], segments: Segments, seconds: float, where: str) -> ScoreData:
-    """Beats and segments as plain JSON types, those past `seconds` left out; `UserError` names `where`."""
+    `UserError` names `where`.
+    """
     times = np.asarray(beats, np.float64)
     if times.ndim != 1 or not np.isfinite(times).all():
         raise UserError(f"{where}: beats must be a list of finite seconds, got shape {list(times.shape)}")

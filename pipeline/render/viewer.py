@@ -17,7 +17,6 @@ from functools import cache
 from html import escape
 from importlib import resources
 from pathlib import Path
-from typing import NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +26,10 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.embed import PoseData, mesh_data, packed, pose_data
+from motionloom.pipeline.render.body.embed import mesh_data, packed, pose_data
 from motionloom.pipeline.render.body.face import FACE_CONTROLS, FACE_NEUTRAL
 from motionloom.pipeline.render.body.mesh import human_skeleton, posing_of
-from motionloom.pipeline.render.sound import ScoreData, Segments, SoundData, embed_sounds, score_data
+from motionloom.pipeline.render.sound import Segments, embed_sounds, score_data
 
 SCRIPTS = [
     "space",
@@ -50,48 +49,6 @@ SCRIPTS = [
 """The files of `web/viewer`, in the order that they need each other."""
 FACE_STEP = 1e-3
 """Step of the integers that carry face controls."""
-
-
-class SkeletonData(TypedDict):
-    """A tree of joints that sticks can be drawn of."""
-
-    parents: list[int]
-    sides: list[int]
-    """0 the middle, 1 left, 2 right."""
-    head: int
-    """Joint of the head; -1 where it is not known."""
-
-
-class ClipData(TypedDict):
-    """One motion; arrays are base64."""
-
-    label: str
-    caption: str
-    group: str
-    fps: float
-    frames: int
-    joints: int
-    skeleton: int
-    low: list[float]
-    step: list[float]
-    positions: str
-    face: str | None
-    pose: PoseData | None
-    sound: NotRequired[int]
-    score: NotRequired[int]
-
-
-class ViewerData(TypedDict):
-    """Everything that the viewer's script needs."""
-
-    title: str
-    note: str
-    faceNeutral: list[float]
-    faceStep: float
-    skeletons: list[SkeletonData]
-    motions: list[ClipData]
-    sounds: NotRequired[list[SoundData]]
-    scores: NotRequired[list[ScoreData]]
 
 
 @dataclass(frozen=True)
@@ -128,21 +85,21 @@ def viewer_page(motions: Sequence[ViewerMotion], title: str, note: str = "") -> 
     data = viewer_data(motions, title, note)
     return fill(
         resource("viewer/viewer.html"),
-        MEDIA=media_policy("sounds" in data),
+        MEDIA=media_policy(motions),
         TITLE=escape(title),
         STYLE=resource("viewer/viewer.css"),
         DATA=safe_json(data),
-        SCRIPT=viewer_script(has_bodies(data)),
+        SCRIPT=viewer_script(has_bodies(motions)),
     )
 
 
-def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = "") -> ViewerData:
-    """Everything the viewer's script needs, as plain JSON types."""
+def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = "") -> dict[str, object]:
+    """Everything the viewer's script needs, as plain JSON types; arrays are base64."""
     if not motions:
         raise UserError("a viewer needs at least one motion")
-    skeletons: list[SkeletonData] = []
-    clips: list[ClipData] = []
-    scores: list[ScoreData] = []
+    skeletons: list[dict[str, object]] = []
+    clips: list[dict[str, object]] = []
+    scores: list[dict[str, object]] = []
     chosen: list[int | None] = []
     for number, motion in enumerate(motions):
         where = f"motion {number} ('{motion.label or motion.caption}')"
@@ -183,7 +140,7 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
             clip["sound"] = sound_number
         if score_number is not None:
             clip["score"] = score_number
-    out: ViewerData = {
+    out: dict[str, object] = {
         "title": title,
         "note": note,
         "faceNeutral": list(FACE_NEUTRAL),
@@ -198,8 +155,12 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
     return out
 
 
-def _skeleton(parents: Sequence[int], human: Skeleton | None, joints: NDArray[np.float64]) -> SkeletonData:
-    """The tree of a motion; sides by the names of a person's joints, else by places in the first pose."""
+def _skeleton(
+    parents: Sequence[int], human: Skeleton | None, joints: NDArray[np.float64]
+) -> dict[str, object]:
+    """The tree of a motion: `sides` (0 middle, 1 left, 2 right) and `head` (-1 where it is not known) by the
+    names of a person's joints, else sides by places in the first pose.
+    """
     own = [int(parent) for parent in parents]
     if human is not None:
         sides = [{"left": 1, "right": 2}.get(name.split("_")[0], 0) for name in human.joints]
@@ -209,14 +170,14 @@ def _skeleton(parents: Sequence[int], human: Skeleton | None, joints: NDArray[np
     return {"parents": own, "sides": sides, "head": -1}
 
 
-def has_bodies(data: ViewerData) -> bool:
-    """Whether any of `viewer_data`'s motions is one that the body can be posed by."""
-    return any(clip["pose"] is not None for clip in data["motions"])
+def has_bodies(motions: Sequence[ViewerMotion]) -> bool:
+    """Whether any of the motions is one that the body can be posed by."""
+    return any(human_skeleton(motion.parents) is not None for motion in motions)
 
 
-def media_policy(sounding: bool) -> str:
+def media_policy(motions: Sequence[ViewerMotion]) -> str:
     """The part of a page's content policy for sound: media made by its own script, from no address."""
-    return "; media-src blob:" if sounding else ""
+    return "; media-src blob:" if any(motion.sound is not None for motion in motions) else ""
 
 
 def quantise(

@@ -52,15 +52,6 @@ def encode_exact(
     return out
 
 
-def decode_exact(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:
-    """Features [..., T, D] -> joints [..., T, N, 3]; starts at heading +Z with the root above the origin."""
-    yaw = np.asarray(features[..., layout.slice("root_yaw_velocity")][..., 0], dtype=np.float64)
-    xz = np.asarray(features[..., layout.slice("root_xz_velocity")], dtype=np.float64)
-    turn = np.exp(1j * _from_zero(yaw))
-    root = _from_zero((xz[..., 1] + 1j * xz[..., 0]) * turn)
-    return place(features, layout, turn, root)
-
-
 def place(
     features: NDArray[np.floating], layout: MotionLayout, turn: NDArray[np.inexact], root: NDArray[np.inexact]
 ) -> NDArray[np.float64]:
@@ -76,13 +67,6 @@ def place(
     joints[..., 1:, 0], joints[..., 1:, 2] = plane.imag, plane.real
     joints[..., 1:, 1] = local[..., 1]
     return joints
-
-
-def _from_zero(steps: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Sum of the steps before each frame, along the last axis."""
-    out = np.zeros_like(steps)
-    np.cumsum(steps[..., :-1], axis=-1, out=out[..., 1:])
-    return out
 
 
 def _put(columns: NDArray[np.float32], plane: NDArray[np.complex128], height: NDArray[np.floating]) -> None:

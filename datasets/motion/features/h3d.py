@@ -35,7 +35,6 @@ from motionloom.datasets.motion.canonical import (
     ground,
     retarget,
 )
-from motionloom.datasets.motion.features.exact import place
 from motionloom.datasets.motion.kinematics import multiply, swing
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -91,17 +90,6 @@ def encode_h3d(
         square = step[feet].real ** 2 + step[feet].imag ** 2 + rise[feet] ** 2
         rows[layout.slice("foot_contacts")] = square < CONTACT_STEP
     return np.ascontiguousarray(np.moveaxis(rows, 0, -1))
-
-
-def decode_h3d(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:
-    """Features [..., T, D] -> joints [..., T, N, 3] from root and local positions (`recover_from_ric`)."""
-    yaw = np.zeros(features.shape[:-1])
-    yaw[..., 1:] = features[..., :-1, layout.slice("root_yaw_velocity")][..., 0]
-    turn = np.exp(-2j * np.cumsum(yaw, axis=-1))
-    xz = features[..., :-1, layout.slice("root_xz_velocity")]
-    root = np.zeros(features.shape[:-1], dtype=np.complex128)
-    root[..., 1:] = (xz[..., 1] + 1j * xz[..., 0]) * turn[..., 1:]
-    return place(features, layout, turn, np.cumsum(root, axis=-1))
 
 
 def uniform_joints(

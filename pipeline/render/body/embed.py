@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import base64
 from functools import cache
-from typing import TypedDict
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -21,17 +20,6 @@ from motionloom.pipeline.render.body.mesh import Posing, asset, figure_size, hum
 
 _TURN_STEPS = 1022
 _STILL = 1e-5
-
-
-class PoseData(TypedDict):
-    """Bones and rotations that the page needs beside joint positions; arrays are base64."""
-
-    turning: list[int]
-    """Joints that turn by themselves."""
-    turns: str
-    rest: str
-    stretch: str
-    size: float
 
 
 @cache
@@ -68,8 +56,8 @@ def _detail(name: str) -> dict[str, object]:
     }
 
 
-def pose_data(posing: Posing) -> PoseData:
-    """The bones, and rotations of joints that turn by themselves."""
+def pose_data(posing: Posing) -> dict[str, object]:
+    """The bones, and rotations of the joints that turn by themselves (`turning`); arrays are base64."""
     skeleton, parents = posing.skeleton, np.asarray(posing.skeleton.parents)
     known = human_skeleton(skeleton.parents)
     assert known is not None  # only bodies are posed

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import canonicalize, ground, retarget, turn
 from motionloom.datasets.motion.features.codec import decode, encode, face_of
-from motionloom.datasets.motion.features.h3d import decode_h3d, encode_h3d, uniform_joints
+from motionloom.datasets.motion.features.h3d import encode_h3d, uniform_joints
 from motionloom.datasets.motion.features.joints import JointFlow, joints_of, local_joints_of
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import UserError
@@ -156,7 +156,7 @@ def test_joints_and_columns_equal_the_published_ones(golden: tuple[dict[str, NDA
         np.testing.assert_allclose(
             ours[:, columns], want[:, columns], rtol=0, atol=ATOL.get(field, 5e-5), err_msg=field
         )
-    np.testing.assert_allclose(decode_h3d(want, layout), arrays["recovered"], atol=5e-6)
+    np.testing.assert_allclose(decode(want, layout), arrays["recovered"], atol=5e-6)
 
 
 def test_paper_representations_are_slices(golden: tuple[dict[str, NDArray], MotionLayout]) -> None:

@@ -42,7 +42,7 @@ from motionloom.pipeline.render.body.mesh import (
     single_bones,
 )
 from motionloom.pipeline.render.scene import Actor
-from motionloom.pipeline.render.viewer import ViewerMotion, has_bodies, viewer_data, viewer_script
+from motionloom.pipeline.render.viewer import ViewerMotion, has_bodies, viewer_script
 
 SMPLX = Skeleton.named("smplx52")
 Walk = Callable[..., NDArray[np.float64]]
@@ -220,7 +220,7 @@ def test_turns_travel_in_32_bits(walk: Walk) -> None:
 def test_pages_carry_the_body_only_where_someone_has_one(walk: Walk) -> None:
     chain = ViewerMotion(np.zeros((1, 3, 3)), 30, [-1, 0, 1])
     person = ViewerMotion(walk(2), 20, SMPLX.parents)
-    assert not has_bodies(viewer_data([chain])) and has_bodies(viewer_data([chain, person]))
+    assert not has_bodies([chain]) and has_bodies([chain, person])
     assert (
         len(viewer_script()) - len(viewer_script(False)) > 400_000 and len(json.dumps(mesh_data())) < 580_000
     )
