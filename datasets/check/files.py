@@ -8,7 +8,7 @@
 | `.pkl` | an AIST++ annotation, through the restricted unpickler |
 | `.bvh`, `.amc` | BVH; AMC with its ASF beside it; the frame rate is judged by falls and steps |
 | `.wav`, `.flac`, `.ogg`, `.mp3` | sound |
-| `.txt` | captions of HumanML3D's grammar, plain lines, or a list of ids |
+| `.txt` | ids, by the name of file or folder; captions in HumanML3D's grammar or, without any `#`, plain |
 
 Nothing is written, run or extracted, whatever a file holds.
 """
@@ -41,9 +41,6 @@ from motionloom.datasets.schema import SPLITS, Config, UserError
 from motionloom.datasets.shards.tar import npy_from_bytes, scan_tar
 from motionloom.datasets.text.clean import usable_caption
 
-TEXTS = ("auto", "humanml", "plain", "ids")
-"""Ways to read `.txt` files. `auto`: ids by the name of the file or its folder, else HumanML3D's grammar."""
-
 JOINTS = {"joints22": (22, 3), "joints52": (52, 3)}
 """Further names for `layout`: joint positions [T, N, 3] in metres."""
 
@@ -58,14 +55,10 @@ class FileRules(Config):
     """Layout of arrays. None: `.npy` files are Motion-X's `smplx322`, shards may hold any width."""
     fps: float | None = None
     """Frame rate, for the ranges of speeds; None = the layout's usual one."""
-    texts: str = "auto"
-    """How `.txt` files are read, one of `TEXTS`."""
     seconds: float | None = None
     """Length of the clips that captions belong to; None leaves their ends unchecked."""
 
     def model_post_init(self, _: object) -> None:
-        if self.texts not in TEXTS:
-            raise UserError(f"texts '{self.texts}': choose one of {', '.join(TEXTS)}")
         if self.layout not in (None, *JOINTS, *LAYOUTS):
             raise UserError(f"no motion layout '{self.layout}'; known: {', '.join((*LAYOUTS, *JOINTS))}")
 
@@ -232,33 +225,23 @@ def _check_sound(path: Path, rules: FileRules) -> Verdict:
 
 
 def _check_text(path: Path, rules: FileRules) -> Verdict:
-    kind = rules.texts
-    if kind == "auto":
-        named = path.stem.lower() in _SPLIT_NAMES or path.parent.name.lower() in _SPLIT_FOLDERS
-        kind = "ids" if named else "humanml"
-    if kind == "ids":
-        return _check_ids(path)
-    if kind == "humanml":
+    if path.stem.lower() in _SPLIT_NAMES or path.parent.name.lower() in _SPLIT_FOLDERS:
+        ids, notes = read_ids(path)
+        return Verdict(path, f"{len(ids)} ids", [] if ids else ["no ids"], notes)
+    lines = [line for line in read_text_file(path).split("\n") if line.strip()]
+    if any("#" in line for line in lines):
         captions, problems = read_humanml_captions(path, seconds=rules.seconds)
         count = len(captions)
     else:
-        lines = [line for line in read_text_file(path).split("\n") if line.strip()]
         problems = [
             f"line {number}: no usable caption"
             for number, line in enumerate(lines, 1)
             if not usable_caption(line)
         ]
         count = len(lines) - len(problems)
-    if not count and not problems:
-        problems = ["no usable text"]
-    elif not count:
-        problems = [*problems, "no usable text is left"]
+    if not count:
+        problems = [*problems, "no usable text is left"] if problems else ["no usable text"]
     return Verdict(path, f"{count} captions", problems)
-
-
-def _check_ids(path: Path) -> Verdict:
-    ids, notes = read_ids(path)
-    return Verdict(path, f"{len(ids)} ids", [] if ids else ["no ids"], notes)
 
 
 _READERS: dict[str, Callable[[Path, FileRules], Verdict]] = {

@@ -71,8 +71,7 @@ def check(
         list[str] | None,
         set_option(
             "Of files: layout of .npy arrays, or joints22, joints52 (default smplx322, Motion-X's); fps; "
-            "texts, how .txt is read: auto, humanml, plain (a caption a line) or ids; seconds, the length of "
-            "the clips of captions."
+            "seconds, the length of the clips of captions."
         ),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Warnings count as problems.")] = False,

@@ -323,7 +323,6 @@ def _decide(
     config: BvhConfig, batches: list[Batch], scans: list[BatchScan], stated: str
 ) -> ConversionPlan[BvhClip]:
     found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
-    refused = config.licence_problem(config.licence) if config.licence else ""
     listing = config.listing(
         [file.path for _, file in found], [file.path for _, file in found if not file.problem]
     )
@@ -350,14 +349,13 @@ def _decide(
             (f"same bytes as {same}" if same != clip.label else "")
             or config.unfit(clip.path)
             or listing.problem(clip.path)
-            or refused
             or config.length_problem(frames / fps)
         )
         texts = listing.texts_of(clip.path)
         split, about = listing.split_of(clip.path), config.about(clip.path)
         planned = BvhClip(batches[number], clip, clip_id, split, texts, frames, fps, about)
         keep = config.uncaptioned == "keep"
-        draft.decide(planned, reason, captioned=bool(texts), wanted=config.has_captions, keep=keep)
+        draft.take(planned, reason, captioned=bool(texts), wanted=config.has_captions, keep=keep)
     if other_rate:
         draft.notes.append(
             f"{other_rate} captions state another frame rate than their file; the file's counts"

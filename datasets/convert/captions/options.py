@@ -8,17 +8,16 @@ with (`/data/mocap/walks/walk.bvh`). A name that two files fit is an error.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.base.files import sha256_of, sha256_of_json
-from motionloom.datasets.convert.captions.names import label_words, subject_splits
 from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, read_captions
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
-from motionloom.datasets.convert.common.splits import hash_split, read_split_files
+from motionloom.datasets.convert.common.splits import hash_split, read_split_files, subject_splits
 from motionloom.datasets.schema import Caption, Split, UserError
 
 
@@ -151,8 +150,8 @@ def _stem(name: str) -> str:
     return bare(name).rsplit("/", 1)[-1].lower()
 
 
-BY_NAMES, BY_SUBJECTS = "names", "subjects"
-"""Words in place of a file of captions, and of a folder of splits."""
+BY_SUBJECTS = "subjects"
+"""Word in place of a folder of splits."""
 
 _SHOWN = 3
 """Names that a sentence lists."""
@@ -163,8 +162,7 @@ class CaptionConfig(ConvertConfig):
 
     captions: Path | None = None
     """Captions by the clips' names: JSON lines, JSON, CSV, TSV, CMU's or KIT-ML's lists, or a folder of .txt
-    files or of such lists (docs/sources.md); `names` for the words of the files' names. Without it clips
-    have no captions.
+    files or of such lists (docs/sources.md). Without it clips have no captions.
     """
     splits: Path | None = None
     """Folder of train.txt, val.txt, test.txt, or `subjects` for all clips of a person in one split; else the
@@ -187,23 +185,12 @@ class CaptionConfig(ConvertConfig):
         """Return the captions and splits of motion files, by their paths in the source; subjects are split by
         those that are readable.
         """
-        rows: Iterable[CaptionRow] = ()
-        if str(self.captions) == BY_NAMES and not Path(BY_NAMES).exists():
-            rows = _rows_of_names(paths)
-        elif self.captions is not None:
-            rows = read_captions(self.captions).values()
+        rows = () if self.captions is None else read_captions(self.captions).values()
         if str(self.splits) == BY_SUBJECTS and not Path(BY_SUBJECTS).exists():
             splits, notes = subject_splits(paths if readable is None else readable)
             return replace(list_clips(paths, rows, None, notes), splits=splits)
         listed, notes = read_split_files(self.splits) if self.splits else (None, [])
         return list_clips(paths, rows, listed, notes)
-
-
-def _rows_of_names(paths: Sequence[str]) -> Iterator[CaptionRow]:
-    for path in paths:
-        if words := label_words(path):
-            texts = (Caption(text=words, source="file name"),)
-            yield CaptionRow(bare(path), texts, path, None, None, path)
 
 
 def digest_of(path: Path) -> dict[str, str]:

@@ -32,8 +32,6 @@ class ConvertConfig(Config):
     """Frame rate of the shards; clips are resampled by time."""
     licence: str | None = None
     """Overrides the licence the converter states for the source."""
-    allow_licence: tuple[str, ...] = ()
-    """Convert only clips under these licences; empty means all."""
     min_seconds: float = Field(default=1.0, ge=0)
     """Shorter clips are left out."""
     max_seconds: float | None = Field(default=None, gt=0)
@@ -92,12 +90,6 @@ class ConvertConfig(Config):
         fields = type(self).model_fields
         kept = {name for name, field in fields.items() if not _is_local(field)}
         return {key: value for key, value in self.dump().items() if key in kept}
-
-    def licence_problem(self, licence: str) -> str:
-        """Return the reason to leave out a clip under `licence`; empty when it may come."""
-        if not self.allow_licence or licence in self.allow_licence:
-            return ""
-        return f"licence '{licence}' is not allowed (allow_licence: {', '.join(self.allow_licence)})"
 
     def length_problem(self, seconds: float) -> str:
         """Return the reason to leave out a clip of this length; empty when it may come."""

@@ -99,19 +99,16 @@ class ConversionPlan(Generic[C]):
     def name(self) -> str:
         return f"{self.config.source.name} -> {self.config.name}"
 
-    def take(self, clip: C) -> None:
-        """This one becomes a sample, unless `config.where` asks for others."""
-        self.settle(clip, "")
-
-    def settle(self, clip: C, reason: str) -> None:
-        """Take a clip or leave it out, for `reason` or because another has its id; and count it."""
-        self._settle(clip, self._repeated(clip) or reason)
-
-    def decide(self, clip: C, reason: str, *, captioned: bool, wanted: bool, keep: bool) -> None:
-        """Settle a clip that may have captions: without any, where some are `wanted`, it is left out unless
-        `keep`.
+    def take(
+        self, clip: C, reason: str = "", *, captioned: bool = False, wanted: bool = False, keep: bool = True
+    ) -> None:
+        """Take a clip, or leave it out: for `reason`, because another has its id, because `config.where` asks
+        for others, or, where captions are `wanted` and those without any not to `keep`, for want of them.
         """
-        reason = self._repeated(clip) or reason
+        if clip.id in self.ids:
+            reason = f"second file for clip id '{clip.id}'; the first is {self.ids[clip.id]}"
+        else:
+            self.ids[clip.id] = clip.label()
         if wanted and not captioned:
             self.uncaptioned.append(clip.label())
             if not reason:
@@ -119,22 +116,12 @@ class ConversionPlan(Generic[C]):
                 reason = "" if keep else "no usable caption"
         elif captioned and not reason:
             self.captioned += 1
-        self._settle(clip, reason)
-
-    def _repeated(self, clip: C) -> str:
-        """Return the reason to leave out a clip whose id an earlier one has; asked once for each clip."""
-        if clip.id in self.ids:
-            return f"second file for clip id '{clip.id}'; the first is {self.ids[clip.id]}"
-        self.ids[clip.id] = clip.label()
-        return ""
-
-    def _settle(self, clip: C, reason: str) -> None:
         facts = facts_of(clip)
         self.known.update(facts)
-        if not reason and not all(one.holds(facts) for one in parse_where(self.config.where)):
-            reason = f"not where {self.config.where.strip()}"
         self.clips += 1
         self.hours += float(str(facts.get("seconds", 0.0))) / 3600
+        if not reason and not all(one.holds(facts) for one in parse_where(self.config.where)):
+            reason = f"not where {self.config.where.strip()}"
         if reason:
             self.leave_out(clip.label(), reason)
         else:

@@ -103,7 +103,8 @@ class ReleaseClip:
 
     @property
     def facts(self) -> dict[str, Fact]:
-        return {**self.entry.facts, "seconds": self.seconds, "captions": float(len(self.entry.texts))}
+        captions = float(len(self.entry.texts))
+        return {**self.entry.facts, "seconds": self.seconds, "captions": captions, "licence": self.licence}
 
     def label(self) -> str:
         whole = self.entry.last is None and not self.entry.first
@@ -197,7 +198,7 @@ class Release(Converter[Cfg, ReleaseClip]):
                 clip, problem = self._clip(entry, state, draft)
                 reason = clip.entry.problem or reason or problem
                 captioned, keep = bool(clip.entry.texts), config.uncaptioned == "keep"
-                draft.decide(clip, reason, captioned=captioned, wanted=config.has_captions, keep=keep)
+                draft.take(clip, reason, captioned=captioned, wanted=config.has_captions, keep=keep)
         draft.limit(lambda clip: clip.id)
         return draft.finish(
             found=draft.found or repeated + sum(state is not None for state in scanned.values()),
@@ -275,10 +276,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         licence = config.licence or entry.licence or self.terms
         clip = ReleaseClip(entry, split, min(entry.first, last), last, fps, licence, size)
         reason = (
-            mute
-            or ("" if entry.id in listed else "in no split file")
-            or config.licence_problem(licence)
-            or config.length_problem(clip.seconds)
+            mute or ("" if entry.id in listed else "in no split file") or config.length_problem(clip.seconds)
         )
         return clip, reason
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
@@ -40,8 +39,6 @@ class Beat2Config(BodyConfig):
     layout: str = "wholebody363"
     """`wholebody363` with fingers and face, or one without."""
     fps: float = 30.0
-    additional: Literal["train", "drop"] = "train"
-    """Train on the takes that the list calls `additional`, or leave them out."""
     pause: float = 0.5
     """Seconds of silence that end a phrase; what is said becomes a caption a phrase, with source `speech`."""
 
@@ -98,8 +95,6 @@ class Beat2(BodyRelease[Beat2Config]):
         problem = ""
         if has_list and kind is None:
             problem = f"not in {LISTS}"
-        elif kind == "additional" and self.config.additional == "drop":
-            problem = "additional (--set additional=train keeps it)"
         split: Split | None = "train" if kind == "additional" else _SPLITS.get(kind or "")
         sound, texts = f"{below}{SPEECH}/{name}.wav", tuple(self._words(below, name, draft))
         return Entry(

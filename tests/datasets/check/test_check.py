@@ -318,9 +318,8 @@ def test_files_that_nothing_reads(tmp_path: Path) -> None:
     assert "not a plain file" in str(check_file(tmp_path / "folder.npy"))
     assert "no such file" in str(check_file(tmp_path / "none.npy"))
     assert list(check_folder(tmp_path)) == []
-    for wrong in ({"texts": "verse"}, {"layout": "smpl76"}):
-        with pytest.raises(UserError, match=r"humanml|smplx322"):
-            FileRules(**wrong)
+    with pytest.raises(UserError, match="smplx322"):
+        FileRules(layout="smpl76")
 
 
 class Clips:

@@ -149,7 +149,7 @@ def test_subsets_frames_limit_and_licences(fixture: Path) -> None:
     assert {clip.id for _, clip in plan.items} == {MUG, DANCE}
     assert not plan.missing
     assert len(prepare(config(fixture, limit=3)).plan.items) == 3
-    plan = prepare(config(fixture, allow_licence=("GRAB-noncommercial",))).plan
+    plan = prepare(config(fixture, where="licence=GRAB-noncommercial")).plan
     assert {clip.id for _, clip in plan.items} == {MUG}
     assert {clip.licence for _, clip in prepare(config(fixture, licence="mine")).plan.items} == {"mine"}
     assert prepare(config(fixture, licence="mine")).facts().licence == "mine"
