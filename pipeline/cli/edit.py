@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.cli.generate import formats_of, open_model, print_note, write_files
+from motionloom.pipeline.cli.generate import formats_of, print_note, write_files
 from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
 from motionloom.pipeline.inference.writers import formats_help
 from motionloom.pipeline.launch.console import make_console, say
@@ -56,6 +56,7 @@ def edit(
     """
     from motionloom.pipeline.contract.editing import EditTask
     from motionloom.pipeline.contract.sampling import SamplingConfig
+    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.outputs import page_note
     from motionloom.pipeline.inference.shown import FigureOptions
     from motionloom.pipeline.store.yaml import read_yaml
@@ -76,7 +77,7 @@ def edit(
     wanted, posing = formats_of(formats), FigureOptions.parse(figure, "--set")
     require_folder(out)
     aside = make_console(aside=True)  # standard output is the list of files
-    model = open_model(run_folder, device, aside)
+    model = MotionModel(run_folder, device)
     drawn = SamplingConfig.parse(sampling, "--set")
     motions = model.edit(clip, edits, samples=samples, seed=seed, sampling=drawn)
     remarks = motions[0].remarks

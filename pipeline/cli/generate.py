@@ -23,7 +23,6 @@ from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
     from motionloom.pipeline.contract.sampling import SamplingConfig
-    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.motion import GeneratedMotion
 
 STREAM = "jsonl"
@@ -137,6 +136,7 @@ def _generate_files(
 ) -> None:
     from motionloom.datasets.audio.sound import Excerpt
     from motionloom.pipeline.inference.edits.clip_file import read_seed_motion
+    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.outputs import page_note, page_title
     from motionloom.pipeline.inference.requests import remarks_of
     from motionloom.pipeline.inference.script import Script, read_music
@@ -158,7 +158,7 @@ def _generate_files(
         return [value for value in values or () for _ in range(samples)] or None
 
     with threads_for(samples * max(len(asked.captions), len(sounds), 1)):
-        bundle = open_model(asked.model, asked.device, aside).bundle
+        bundle = MotionModel(asked.model, asked.device).bundle
         if segments is not None:
             motions = bundle.perform(segments, samples=samples, seed=asked.seed, sampling=sampling)
         else:
@@ -213,17 +213,6 @@ def formats_of(formats: str | None) -> list[str]:
     return wanted
 
 
-def open_model(folder: str, device: str, console: Console) -> MotionModel:
-    """A model; says which is taken, where a name could mean a folder or one that comes with the package."""
-    from motionloom.pipeline.inference.model import MotionModel
-    from motionloom.pipeline.inference.shipped_models import say_model
-
-    model = MotionModel(folder, device)
-    if (taken := say_model(folder)) is not None:
-        say(console, taken)
-    return model
-
-
 def print_note(console: Console, note: object) -> None:
     """Print what a person should know of a motion, in yellow."""
     say(console, f"note: {note}", "yellow")
@@ -257,6 +246,7 @@ def _stream(asked: _Request, out: Path | None) -> None:
 
     Ends with the last segment or Ctrl-C.
     """
+    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.stream import MotionStream, segments_of
     from motionloom.pipeline.inference.writers import frame_lines, heading
@@ -272,7 +262,7 @@ def _stream(asked: _Request, out: Path | None) -> None:
     aside, face = make_console(aside=True), faces[0] if faces else ""
     segments = None if asked.script is None else Script.read(asked.script)
     sound = read_music(songs[0]) if songs else None
-    bundle = open_model(asked.model, asked.device, aside).bundle
+    bundle = MotionModel(asked.model, asked.device).bundle
     said = texts if len(texts) > 1 else texts[0] if texts else None
     driver = segments or segments_of(bundle, said, face=face, sound=sound, seconds=asked.seconds)
     stream = MotionStream(

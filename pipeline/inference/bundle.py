@@ -46,7 +46,7 @@ from motionloom.pipeline.inference.requests import (
     ticks_of,
 )
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
-from motionloom.pipeline.inference.shipped_models import find_model, say_model
+from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.known_captions import Unknown
@@ -89,10 +89,8 @@ class Bundle:
             found = open_exported(folder), StageCache(device), exported_sampling(folder)
             return Bundle._of(folder, (*found, open_exported(folder, CAPTIONER)))
         if not (folder / "recipe.yaml").is_file():
-            shipped = say_model(name)
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no {BUNDLE_FILE})"
-                + ("" if shipped is None else "; the model of this name is taken where no such folder is")
             )
         return Bundle.from_run(folder, device)
 

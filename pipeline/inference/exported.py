@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterable
 from itertools import chain, count
 from pathlib import Path
 
 from motionloom.datasets.base.register import code_of, distribution_of
-from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.lookup import FORMAT, BundleFile
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage
@@ -72,7 +70,15 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
         config = stage.kind.exported_config(stage.config).dump()
         changes = {"stage": name, "config": config, "inputs": inputs}
         made[name] = artifact.model_copy(update=changes).finish(out / name)
-    write_json(out / "skeleton.json", _plain(skeleton))
+    write_json(
+        out / "skeleton.json",
+        {
+            "name": skeleton.name,
+            "joints": skeleton.joints,
+            "parents": skeleton.parents,
+            "offsets": skeleton.rest,
+        },
+    )
     modules = {name for stage in needed.values() for name in stage.kind.modules(stage.config)}
     facts = BundleFile(
         format=FORMAT,
@@ -104,13 +110,3 @@ def _names(stages: Iterable[CompletedStage]) -> dict[Path, str]:
         free = chain([own], (f"{own}-{number}" for number in count(2)))
         out[stage.folder] = next(name for name in free if name not in out.values())
     return out
-
-
-def _plain(skeleton: Skeleton) -> dict[str, object]:
-    made = {
-        "name": skeleton.name,
-        "joints": skeleton.joints,
-        "parents": skeleton.parents,
-        "offsets": skeleton.rest,
-    }
-    return dict(json.loads(json.dumps(made)))

@@ -60,12 +60,9 @@ class MotionModel(
         # The mixin would write our argument, a local path, into the config.json that the hub wants.
         self._hub_mixin_config = dict(HUB_CONFIG)
 
-    @property
-    def _stages(self) -> tuple[CompletedStage, ...]:
-        return (*self.bundle.stages, *self.bundle.captioners)
-
     def __repr__(self) -> str:
-        makers = ", ".join(f"{stage.name} ({stage.kind.name})" for stage in self._stages)
+        stages = (*self.bundle.stages, *self.bundle.captioners)
+        makers = ", ".join(f"{stage.name} ({stage.kind.name})" for stage in stages)
         layout = self.bundle.layout
         return f"MotionModel({str(self.folder)!r}: {makers}; {layout.name}, {layout.fps:g} frames/s)"
 

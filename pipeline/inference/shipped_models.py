@@ -89,16 +89,6 @@ def find_model(name: Path | str, **options: Any) -> Path:
         ) from None
 
 
-def say_model(name: Path | str) -> str | None:
-    """One line on which model is taken, of a name that is a shipped model's; None of any other."""
-    if str(name) not in shipped_models():
-        return None
-    if Path(name).exists():
-        place = Path(name).resolve()
-        return f"{name}: the folder {place}, not the model of this name that comes with motionloom"
-    return f"{name}: the model that comes with motionloom"
-
-
 def no_such_model(name: Path | str) -> str:
     """One sentence about a model that is not there, with the nearest folder or the shipped models."""
     said, shipped = no_such_folder(Path(name)), list(shipped_models())

@@ -71,7 +71,7 @@ def run_recipe(
         raise
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:
-        require_fit(todo, loaded.hardware)  # before the estimate, which takes seconds
+        require_fit((row.stage for row in todo), loaded.hardware)  # before the estimate, which takes seconds
         say_estimate(loaded, console, run, todo)
         console.print(plan_table(loaded, plan))
     replaced = replaced_stages(run, plan)

@@ -144,7 +144,7 @@ def plan_record(
     run = out or Path("runs") / loaded.name
     plan = make_plan(loaded, run, select)
     todo = [row for row in plan if row.action in {"run", "resume"}]
-    require_fit(todo, loaded.hardware)  # before the estimate, which takes seconds
+    require_fit((row.stage for row in todo), loaded.hardware)  # before the estimate, which takes seconds
     cards = estimate(loaded, {row.stage.name for row in todo})
     times = training_times(run, todo)
     return {

@@ -32,7 +32,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     """
     todo = [row for row in plan if row.action in {"run", "resume"}]
     joint = [row for row in todo if row.stage.kind.trains or row.stage.kind.shares]
-    require_fit(todo, recipe.hardware)
+    require_fit((row.stage for row in todo), recipe.hardware)
     if joint:
         recipe.hardware.require_devices()
     leads = process_rank() == 0

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
-from rich.table import Table
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import Stage
+from motionloom.pipeline.runs.plan import require_fit
 from motionloom.pipeline.runs.recipe import Recipe
 
 Need = Literal["cpu", "gpu", "all"]
@@ -120,15 +120,12 @@ class Group:
 
     name: str
     """A word of lower-case letters, digits and dashes; the first character is a digit."""
-    need: Need
     stages: tuple[str, ...]
     last: tuple[str, ...]
     """Stages that no other stage of the group reads."""
     machines: Machines
     settings: tuple[str, ...]
     """Settings of `hardware`, as `--set` takes them."""
-    after: str | None = None
-    """Name of the group that must be done before."""
 
 
 @dataclass(frozen=True)
@@ -163,15 +160,15 @@ class LaunchPlan:
             *sets,
         ]
 
-    def table(self) -> Table:
-        table = Table(title=f"{self.recipe.name}: {len(self.groups)} groups", title_justify="left")
-        for column in ("group", "stages", "machines", "limit", "after"):
-            table.add_column(column, overflow="fold")
+    def lines(self) -> list[str]:
+        """A line for each group: its stages, its machines and their time limit."""
+        out = []
         for group in self.groups:
-            limit = f"{group.machines.minutes} min"
+            at = group.machines
+            each = f"{at.processes} processes, {at.gpus} GPUs, {at.cpus} cores"
             stages = ", ".join(group.stages)
-            table.add_row(group.name, stages, _say_machines(group), limit, group.after or "")
-        return table
+            out.append(f"{group.name}: {stages}; {at.nodes} x ({each}), at most {at.minutes} min")
+        return out
 
 
 def make_launch_plan(
@@ -199,15 +196,16 @@ def make_launch_plan(
         groups.append(
             Group(
                 name=f"{len(groups) + 1}-{label}",
-                need=need,
                 stages=names,
                 last=tuple(name for name in names if name not in read),
                 machines=machines,
                 settings=_settings(options, need, machines),
-                after=groups[-1].name if groups else None,
             )
         )
-    _require_fit(recipe, groups)
+    for group in groups:
+        # What is installed here says nothing of the cluster, so loggers are not asked after.
+        there = {"nodes": group.machines.nodes, "devices": group.machines.processes, "loggers": ()}
+        require_fit(map(recipe.stage, group.stages), recipe.hardware.model_copy(update=there))
     word = options.name or _word(recipe.name, 30)
     name = word if word[:1].isalpha() else f"run-{word}"
     return LaunchPlan(name, recipe, shipped, tuple(overrides), str(out), tuple(groups))
@@ -267,28 +265,5 @@ def _needs(recipe: Recipe, gpus: int) -> dict[str, Need]:
     return needs
 
 
-def _require_fit(recipe: Recipe, groups: Sequence[Group]) -> None:
-    """Refuse before anything waits in a queue what its group's processes could not run."""
-    for group in groups:
-        hardware = recipe.hardware.model_copy(
-            # What is installed here says nothing of the cluster, so loggers are not asked after.
-            update={"nodes": group.machines.nodes, "devices": group.machines.processes, "loggers": ()}
-        )
-        for name in group.stages:
-            try:
-                recipe.stage(name).config.require_fit(hardware)
-            except UserError as error:
-                raise UserError(f"stage {name}: {error}") from None
-
-
 def _word(text: str, longest: int) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:longest].strip("-")
-
-
-def _say_machines(group: Group) -> str:
-    machines = group.machines
-    if group.need == "all" and machines.gpus:
-        return f"{machines.nodes} x {machines.gpus} GPUs"
-    if group.need == "all":
-        return f"{machines.nodes} x 1 process"
-    return f"{machines.cpus} cores" + (", 1 GPU" if machines.gpus else "")

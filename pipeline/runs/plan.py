@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -140,13 +140,13 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
     return list(rows.values())
 
 
-def require_fit(rows: Sequence[PlannedStage], hardware: Hardware) -> None:
+def require_fit(stages: Iterable[Stage], hardware: Hardware) -> None:
     """Refuse, before anything runs, stages whose settings cannot run on this hardware."""
-    for row in rows:
+    for stage in stages:
         try:
-            row.stage.config.require_fit(hardware)
+            stage.config.require_fit(hardware)
         except UserError as error:
-            raise UserError(f"stage {row.stage.name}: {error}") from None
+            raise UserError(f"stage {stage.name}: {error}") from None
 
 
 def selected(recipe: Recipe, select: Selection) -> set[str]:

@@ -146,7 +146,8 @@ def launch_recipe(
         nodes=nodes,
         gpus_per_node=gpus_per_node,
     )
-    console.print(plan.table())
+    for line in plan.lines():
+        console.print(line, soft_wrap=True, markup=False)
     try:
         planned = [row for row in make_plan(loaded, run) if row.action in {"run", "resume"}]
     except UserError as error:

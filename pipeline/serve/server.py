@@ -15,7 +15,7 @@ from rich.console import Console
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.inference.shipped_models import find_model, say_model
+from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.serve.app import Site
 from motionloom.pipeline.serve.guard import HEADERS, is_loopback
 from motionloom.pipeline.serve.requests import ServeConfig
@@ -31,8 +31,6 @@ def serve(folder: Path | str, config: ServeConfig, *, device: str = "auto", cons
     # The address is taken before the model is loaded, so that a taken port is reported at once.
     with closing(listen(config)) as listener:
         model = MotionModel.from_pretrained(place, device=device)
-        if (shipped := say_model(folder)) is not None:
-            console.print(shipped, markup=False, highlight=False, soft_wrap=True)
         warm(model)
         worker, name = Worker(config.waiting), Path(folder).resolve().name
         server = server_of(Site(model, config, worker, name), worker)

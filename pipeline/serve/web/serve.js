@@ -126,42 +126,34 @@ async function keep(format) {
   }
 }
 
-const bytes = (path, file) => ask(path, { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file });
-
-/* A motion file, to be changed. */
-async function takeClip(file) {
-  if (file.size > info.limits.clip_bytes) {
-    say(`${file.name} is too large: at most ${Math.round(info.limits.clip_bytes / 2 ** 20)} MB`, true);
-    return;
+/* What the server answers to a file; null where it is too large, or refused. */
+async function send(path, file, most, words) {
+  if (file.size > most) {
+    say(`${file.name} is too large: at most ${Math.round(most / 2 ** 20)} MB`, true);
+    return null;
   }
-  const mine = ++turn;
-  say(`Reading ${file.name}…`);
+  say(words);
   try {
-    const answer = await (await bytes("/api/clips", file)).json();
-    if (mine !== turn) return;
-    current = { ref: answer.clip, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, face: "", name: file.name };
-    note(answer.notes, []);
-    say(`${file.name}: ${answer.seconds.toFixed(1)} s of motion`);
-    editor.open(current);
+    return await (await ask(path, { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file })).json();
   } catch (error) {
-    if (mine === turn) say(error.message, true);
+    say(error.message, true);
+    return null;
   }
 }
 
+/* A motion file, to be changed. */
+async function takeClip(file) {
+  const mine = ++turn, answer = await send("/api/clips", file, info.limits.clip_bytes, `Reading ${file.name}…`);
+  if (!answer || mine !== turn) return;
+  current = { ref: answer.clip, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, face: "", name: file.name };
+  note(answer.notes, []);
+  say(`${file.name}: ${answer.seconds.toFixed(1)} s of motion`);
+  editor.open(current);
+}
+
 async function take(file) {
-  music = null;
-  if (!file) return;
-  if (file.size > info.limits.sound_bytes) {
-    say(`${file.name} is too large: at most ${Math.round(info.limits.sound_bytes / 2 ** 20)} MB`, true);
-    return;
-  }
-  say(`Sending ${file.name}…`);
-  try {
-    music = await (await bytes("/api/sounds", file)).json();
-    say(`${file.name}: ${music.seconds.toFixed(1)} s of music`);
-  } catch (error) {
-    say(error.message, true);
-  }
+  music = file ? await send("/api/sounds", file, info.limits.sound_bytes, `Sending ${file.name}…`) : null;
+  if (music) say(`${file.name}: ${music.seconds.toFixed(1)} s of music`);
 }
 
 form.addEventListener("submit", (event) => { event.preventDefault(); generate(); });
