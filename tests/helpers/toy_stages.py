@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import pytest
 
+from motionloom.datasets.text.encoder import EncodedText
 from motionloom.pipeline.contract import stage as registry
 from motionloom.pipeline.contract.stage import StageKind
 
@@ -35,3 +38,15 @@ class MadeStage(StageKind):
     def generator(self, *_: Any) -> Any:
         """The same object, of one that generates."""
         return self.made
+
+
+class FixedEncoder:
+    """Fixed random sentences of eight numbers."""
+
+    name, dim = "fixed", 8
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        """Sentences by the lengths of the captions."""
+        rows = [np.random.default_rng(len(c)).standard_normal(8) for c in captions]
+        sentence = np.stack(rows).astype(np.float32)
+        return EncodedText(sentence, sentence[:, None], np.ones((len(captions), 1), dtype=np.bool_))

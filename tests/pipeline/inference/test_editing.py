@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from toy_stages import MadeStage
+from toy_stages import FixedEncoder, MadeStage
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.loading.statistics import FeatureStats
@@ -20,7 +20,6 @@ from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.encoder import EncodedText
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Capabilities
@@ -41,17 +40,6 @@ FEW = SamplingConfig(denoising_steps=3)
 ENDS = [{"end": 1.0}, {"start": 2.0}]
 
 
-class Encoder:
-    """Fixed random sentences of eight numbers."""
-
-    name, dim = "fixed", 8
-
-    def encode(self, captions: Sequence[str]) -> EncodedText:
-        rows = [np.random.default_rng(len(c)).standard_normal(8) for c in captions]
-        sentence = np.stack(rows).astype(np.float32)
-        return EncodedText(sentence, sentence[:, None], np.ones((len(captions), 1), dtype=np.bool_))
-
-
 def stage(made: Any) -> CompletedStage:
     return CompletedStage("stage", MadeStage(made), None, Path(f"stage-{made.part}"), {})
 
@@ -63,7 +51,7 @@ def editor(name: str = "wholebody363", face: bool = False) -> Bundle:
     # Statistics of somebody who stands: an untrained network then strays from that by centimetres.
     rest = canonicalize(np.repeat(layout.skeleton.rest_joints[None], 9, axis=0))
     stats = FeatureStats(encode(rest, layout)[0], np.full(layout.dim, 0.02, np.float32), layout)
-    given = {"stats": stats, "text": SimpleNamespace(encoder=Encoder(), spelled=lambda text: text)}
+    given = {"stats": stats, "text": SimpleNamespace(encoder=FixedEncoder(), spelled=lambda text: text)}
     config = InBetweenConfig(dim=16, ff=16, layers=1, heads=2)
     made: list[Any] = []
     for part in ("bodyhand", "face") if face else ("all",):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
-from toy_stages import MadeStage
+from toy_stages import FixedEncoder, MadeStage
 
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.encoder import EncodedText
 from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.tokenizer.body_hand import H2VQConfig
@@ -49,17 +48,6 @@ DENOISER = TextDenoiserConfig(dim=16, ff=16, layers=1, heads=2)
 CAPTIONS = ["a person walks", "jump", "a person sits"]
 
 
-class Encoder:
-    """Fixed random sentences of eight numbers."""
-
-    name, dim = "fixed", 8
-
-    def encode(self, captions: Sequence[str]) -> EncodedText:
-        rows = [np.random.default_rng(len(c)).standard_normal(8) for c in captions]
-        sentence = np.stack(rows).astype(np.float32)
-        return EncodedText(sentence, sentence[:, None], np.ones((len(captions), 1), dtype=np.bool_))
-
-
 def opinionated(gpt: InterleavedGPT) -> InterleavedGPT:
     """An untrained GPT whose next token depends on the text."""
     gpt.eval().requires_grad_(False)
@@ -76,7 +64,7 @@ def bundle(
     torch.manual_seed(0)
     layout = MotionLayout.named("wholebody363", fps=fps)
     stats = FeatureStats(np.zeros(363, np.float32), np.ones(363, np.float32), layout)
-    given = {"stats": stats, "text": SimpleNamespace(encoder=Encoder())}
+    given = {"stats": stats, "text": SimpleNamespace(encoder=FixedEncoder())}
     small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
     tokenizer = H2VQConfig(**small).build(layout).freeze()
     gpt = opinionated(InterleavedGPT(config, tokenizer.streams, tokenizer.pattern, 8))
@@ -194,6 +182,9 @@ WRONG_ASKS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
     "steps of no face": ((), {"sampling": {"denoising_steps": 9}}, "denoising_steps: no generator"),
     "sampler of a GPT": (("gpt",), {"sampling": {"sampler": "ddim"}}, "sampler: no generator"),
     "guidance of a VAE": (("vae",), {"sampling": {"face_cfg_scale": 2.0}}, "face_cfg_scale: no generator"),
+    "guidance of a VAE beside a GPT": (
+        ("vae", "gpt"), {"sampling": {"face_cfg_scale": 2.0, "face_model": "vae"}}, "face_model to gpt"
+    ),
     "steps beside a diffusion model": (
         ("gpt", "diffusion"), {"sampling": {"denoising_steps": 9}}, "set face_model to diffusion"
     ),
@@ -207,13 +198,6 @@ def test_what_has_no_sense_or_no_effect_is_refused(name: str) -> None:
     with pytest.raises(UserError, match=says):
         asked["sampling"] = SamplingConfig.of(given.get("sampling"))
         bundle(faces=faces).generate(**asked)
-
-
-def test_a_face_by_a_vae_takes_no_guidance() -> None:
-    both = bundle(faces=("vae", "gpt"))
-    assert list(both.faces) == ["gpt", "vae"]
-    with pytest.raises(UserError, match=r"face_cfg_scale: .*face_model to gpt"):
-        both.require_used(CAPTIONS, SamplingConfig(face_cfg_scale=2.0, face_model="vae"))
 
 
 def test_a_face_is_chosen_by_its_method_or_its_stage() -> None:

@@ -87,29 +87,6 @@ def test_a_second_run_does_nothing_and_says_so(
     assert {p: p.stat().st_mtime_ns for p in run.rglob("*")} == before
 
 
-@pytest.mark.parametrize(
-    ("change", "below"),
-    [
-        ("tma.optim.lr=0.001", {"tma", "gpt", "generate", "evaluate", "report"}),
-        ("face_gpt.optim.lr=0.002", {"face_gpt", "generate", "evaluate", "report"}),
-        ("evaluate.repeats=2", {"evaluate", "report"}),
-        ("gpt.train.checkpoint_every=7", set()),
-        ("hardware.threads=2", set()),
-    ],
-)
-def test_a_change_reruns_that_stage_and_those_below(
-    change: str, below: set[str], small_run: Any, call: Callable[..., Any]
-) -> None:
-    plan = call("run", small_run.recipe, "--out", small_run.folder, "--set", change, "--dry-run")
-    assert plan.code == 0
-    rows = dict(re.findall(r"^│ (\w+) +│ \w+ +│ (\w+) +│", plan.out, re.MULTILINE))
-    assert list(rows) == STAGES
-    assert {name for name, action in rows.items() if action != "skip"} == below
-    assert f"{len(below)} of {len(STAGES)} stages would run" in plan.out
-    if below:
-        assert f"changed: {change.split('.', 1)[1].split('=')[0]}" in plan.out
-
-
 def test_npz_says_what_it_holds(motions: Path) -> None:
     stored = arrays(only(motions, ".npz"))
     facts = json.loads(str(stored["metadata"]))
