@@ -325,25 +325,23 @@ def _check_header(path: Path, name: str) -> None:
     with path.open("rb") as file:
         head = file.read(12)
         if head[:4] in (b"RIFF", b"RF64") and head[8:] == b"WAVE":
-            _check_wave_chunks(file, name, size)
-        elif path.suffix.lower() in _WAV_SUFFIXES:
+            # Chunks are walked up to the samples, of which there must be as many bytes as the file states.
+            while len(chunk := file.read(8)) == 8:
+                kind, length = struct.unpack("<4sI", chunk)
+                start = file.tell()
+                if kind == b"data":
+                    # RF64 files, and those that were written into a pipe, state no length here.
+                    if length != _UNSTATED and length > size - start:
+                        raise UserError(
+                            f"{name}: cut short: {size - start} bytes of sound, {length} expected"
+                        )
+                    return
+                file.seek(start + length + length % 2)  # chunks lie at even places
+            raise UserError(f"{name}: no data chunk, or cut short before it")
+        if path.suffix.lower() in _WAV_SUFFIXES:
             raise UserError(f"{name}: not a WAV file (it does not begin with RIFF ... WAVE)")
-        elif (missing := _missing_mp3_bytes(file, head, size)) > 0:
+        if (missing := _missing_mp3_bytes(file, head, size)) > 0:
             raise UserError(f"{name}: cut short: {missing} bytes of the MP3 are missing")
-
-
-def _check_wave_chunks(file: BinaryIO, name: str, size: int) -> None:
-    """Walk the chunks up to the samples, of which there must be as many bytes as the file states."""
-    while len(head := file.read(8)) == 8:
-        kind, length = struct.unpack("<4sI", head)
-        start = file.tell()
-        if kind == b"data":
-            # RF64 files, and those that were written into a pipe, state no length here.
-            if length != _UNSTATED and length > size - start:
-                raise UserError(f"{name}: cut short: {size - start} bytes of sound, {length} expected")
-            return
-        file.seek(start + length + length % 2)  # chunks lie at even places
-    raise UserError(f"{name}: no data chunk, or cut short before it")
 
 
 def _missing_mp3_bytes(file: BinaryIO, head: bytes, size: int) -> int:

@@ -131,8 +131,6 @@ class NpzFile:
                 yield stream
         except UserError:
             raise
-        except (NotImplementedError, RuntimeError) as error:  # encrypted, or an unknown compression
-            raise UserError(f"{self.label}: array '{name}' cannot be unpacked ({error})") from None
         except Exception as error:  # zip, zlib and numpy's header parser fail in many ways on broken bytes
             reason = " ".join(str(error).split())[:120]
             raise UserError(f"{self.label}: array '{name}' is damaged ({reason})") from None

@@ -137,31 +137,22 @@ def read_values(data: bytes, start: int, frames: int, width: int, where: str) ->
         )
     if len(counts) != frames:
         raise UserError(f"{where}: the header says {frames} frames, {len(counts)} found")
-    values = _parse_numbers(body)
-    if len(values) != frames * width or not (np.abs(values) <= LARGEST).all():  # false for NaN
-        raise _bad_word(body, lines, width, where)
-    return values.reshape(frames, width)
-
-
-def _parse_numbers(body: bytes) -> Floats:
-    """Any numbers in text, by numpy's reader; fewer than there are when one is not a number."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # numpy only warns when it stops at a bad word
         try:
-            return np.fromstring(body, dtype=np.float64, sep=" ")
+            values = np.fromstring(body, dtype=np.float64, sep=" ")
         except (ValueError, DeprecationWarning):
-            return np.empty(0)
-
-
-def _bad_word(body: bytes, lines: NDArray[np.int64], width: int, where: str) -> UserError:
+            values = np.empty(0)
+    if len(values) == frames * width and (np.abs(values) <= LARGEST).all():  # false for NaN
+        return values.reshape(frames, width)
     for at, word in enumerate(body.split()):
         if not _NUMBER.fullmatch(word) or not abs(float(word)) <= LARGEST:
             row, column = divmod(at, width)
-            return UserError(
+            raise UserError(
                 f"{where}: line {lines[row]}: frame {row}, channel {column} (from 0): "
                 f"'{_shown(word)}' is not a finite number up to {LARGEST:g}"
             )
-    return UserError(f"{where}: the motion block holds characters that are not numbers")
+    raise UserError(f"{where}: the motion block holds characters that are not numbers")
 
 
 def _shown(text: bytes) -> str:
@@ -205,7 +196,14 @@ class _HierarchyParser:
     def parse(self, text: bytes) -> Hierarchy:
         started = False
         for self.line, raw in enumerate(text.split(b"\n"), start=1):
-            for piece in re.findall(r"[{}]|[^{}]+", self._decode(raw)):
+            try:
+                line = raw.decode("utf-8")
+            except UnicodeDecodeError as error:
+                raise self._error(
+                    f"'{_shown(raw.strip())}' is not UTF-8 text (byte {error.start + 1} of the line); "
+                    "rename the joint or save the file as UTF-8"
+                ) from None
+            for piece in re.findall(r"[{}]|[^{}]+", line):
                 words = piece.split()
                 if not words:
                     continue
@@ -262,15 +260,6 @@ class _HierarchyParser:
 
     def _error(self, reason: str) -> UserError:
         return UserError(f"line {self.line}: {reason}")
-
-    def _decode(self, raw: bytes) -> str:
-        try:
-            return raw.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise self._error(
-                f"'{_shown(raw.strip())}' is not UTF-8 text (byte {error.start + 1} of the line); "
-                "rename the joint or save the file as UTF-8"
-            ) from None
 
     def _add(self, piece: str, parent: int) -> int:
         name = piece.split(None, 1)[1].strip()  # a name may hold spaces

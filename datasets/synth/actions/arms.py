@@ -33,6 +33,15 @@ def play(track: Track, side: int, holds: Sequence[Hold]) -> None:
     arm.reach = arm.reach - rest_reach + reach[index] + weight * (reach[index + 1] - reach[index])
 
 
+def hold(
+    track: Track, side: int, times: tuple[float, float, float, float], to: Vec, reach: float, bend: Vec
+) -> None:
+    """Move a hanging arm to a pose between the first two times, and back between the others."""
+    first, there, until, last = times
+    pose = (to, reach, bend)
+    play(track, side, [(first, None, 0.0, None), (there, *pose), (until, *pose), (last, None, 0.0, None)])
+
+
 def slerp(a: Array, b: Array, weight: Array) -> Array:
     """Great-circle interpolation of unit vectors a, b [T, 3] by weight [T]."""
     angle = np.arccos(np.clip((a * b).sum(-1), -0.9999, 0.9999))
@@ -80,8 +89,7 @@ def punch(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     mine += [(end, guard, near, GUARD_BEND), (end + 0.5, None, 0.0, None)]
     play(track, hand, mine)
     if rng.random() < 0.6:
-        holds: list[Hold] = [(begin - 0.5, None, 0.0, None), (begin - 0.05, guard, near, GUARD_BEND)]
-        play(track, 1 - hand, [*holds, (end, guard, near, GUARD_BEND), (end + 0.5, None, 0.0, None)])
+        hold(track, 1 - hand, (begin - 0.5, begin - 0.05, end, end + 0.5), guard, near, GUARD_BEND)
     push = keys(track.t, times, effort)
     ready = ease((track.t - begin + 0.5) / 0.45) * ease((end + 0.5 - track.t) / 0.45)
     track.arms[hand].roll += 1.1 * np.clip(push, 0, 1)
@@ -111,16 +119,7 @@ def wave(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
             continue
         beside: Vec = (wide, high, rng.uniform(0.35, 0.5))
         bend: Vec = (-0.75, 0.75, 0.1)
-        play(
-            track,
-            side,
-            [
-                (begin, None, 0.0, None),
-                (begin + up, beside, 0.66, bend),
-                (down, beside, 0.66, bend),
-                (down + up, None, 0.0, None),
-            ],
-        )
+        hold(track, side, (begin, begin + up, down, down + up), beside, 0.66, bend)
         arm = track.arms[side]
         on = ease((track.t - begin - 0.6 * up) / (0.5 * up)) * ease((down + 0.2 * up - track.t) / (0.4 * up))
         swing = np.sin(2 * np.pi * rate * (track.t - begin - up)) * on

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from motionloom.datasets.synth.actions.arms import Hold, Vec, play
+from motionloom.datasets.synth.actions.arms import Hold, Vec, hold, play
 from motionloom.datasets.synth.actions.maths import Array, ease, keys
 from motionloom.datasets.synth.actions.pose import BALL, Track
 from motionloom.datasets.synth.actions.truth import Span, Truth
@@ -95,18 +95,18 @@ def squat(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     count = truth.count or 1
     low, high = {"slowly": (1.1, 1.4), None: (0.65, 0.8), "quickly": (0.36, 0.46)}[truth.speed or None]
     down = rng.uniform(low, high)
-    hold, gap = rng.uniform(0.05, 0.25) * down / 0.6, rng.uniform(0.05, 0.25)
-    period = 2 * down + hold + gap
+    pause, gap = rng.uniform(0.05, 0.25) * down / 0.6, rng.uniform(0.05, 0.25)
+    period = 2 * down + pause + gap
     seconds = span.pick(rng, at_least=count * period + 0.3, at_most=count * period + 1.6)
     period = min(period, (seconds - 0.2) / count)
-    squeeze = period / (2 * down + hold + gap)
+    squeeze = period / (2 * down + pause + gap)
     begin = rng.uniform(0.1, max(0.11, seconds - count * period - 0.1))
     track = Track.standing(seconds, fps, rng, width=rng.uniform(0.03, 0.08))
     depth = rng.uniform(0.3, 0.42)
     bent = np.zeros(len(track.t))
     for k in range(count):
         at = begin + k * period
-        bent += _bump(track.t, at, down * squeeze, hold * squeeze)
+        bent += _bump(track.t, at, down * squeeze, pause * squeeze)
     back, pitch = rng.uniform(0.1, 0.15), rng.uniform(0.5, 0.7)
     track.root[:, 1] -= depth * bent
     track.root[:, 2] -= back * bent
@@ -117,16 +117,8 @@ def squat(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     end = begin + count * period - gap * squeeze
     out = (rng.uniform(0.0, 0.15), rng.uniform(-0.15, 0.05), 1.0)
     for side in (0, 1):
-        play(
-            track,
-            side,
-            [
-                (begin, None, 0.0, None),
-                (begin + down * squeeze, out, 0.95, (0.0, 1.0, 0.0)),
-                (end - down * squeeze, out, 0.95, (0.0, 1.0, 0.0)),
-                (end, None, 0.0, None),
-            ],
-        )
+        times = (begin, begin + down * squeeze, end - down * squeeze, end)
+        hold(track, side, times, out, 0.95, (0.0, 1.0, 0.0))
         # Arms stay level while the chest leans.
         track.arms[side].direction[:, 1] += 0.4 * bent
     track.lower_to_reach()
@@ -206,18 +198,10 @@ def kick(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     guard = rng.random() < 0.6
     for side in (0, 1):
         wide = (0.45, -0.5, 0.65 if side != leg else -0.2)
-        hold: Hold = (
-            (begin - 0.05, (-0.05, 0.0, 0.85), 0.6, (-0.4, 1.0, 0.2))
-            if guard
-            else (begin + 0.4 * unit_time, wide, 0.85, (0.0, 0.5, 1.0))
-        )
-        holds: list[Hold] = [
-            (max(begin - 0.5, -0.2), None, 0.0, None),
-            hold,
-            (finish - 0.15, *hold[1:]),
-            (finish + 0.5, None, 0.0, None),
-        ]
-        play(track, side, holds)
+        there, pose = begin + 0.4 * unit_time, (wide, 0.85, (0.0, 0.5, 1.0))
+        if guard:
+            there, pose = begin - 0.05, ((-0.05, 0.0, 0.85), 0.6, (-0.4, 1.0, 0.2))
+        hold(track, side, (max(begin - 0.5, -0.2), there, finish - 0.15, finish + 0.5), *pose)
     track.lower_to_reach()
     return track
 
@@ -228,10 +212,10 @@ def bow(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track
     down = rng.uniform(low, high)
     seconds = span.pick(rng, at_least=2 * down + 0.6)
     down = min(down, 0.44 * seconds)
-    hold = rng.uniform(0.1, max(0.11, min(1.2, seconds - 2 * down - 0.3)))
-    begin = rng.uniform(0.05, max(0.06, seconds - 2 * down - hold - 0.1))
+    pause = rng.uniform(0.1, max(0.11, min(1.2, seconds - 2 * down - 0.3)))
+    begin = rng.uniform(0.05, max(0.06, seconds - 2 * down - pause - 0.1))
     track = Track.standing(seconds, fps, rng, width=rng.uniform(-0.03, 0.0))
-    bent = _bump(track.t, begin, down, hold)
+    bent = _bump(track.t, begin, down, pause)
     deep = rng.uniform(0.85, 1.35)
     track.pelvis[:, 0] += 0.62 * deep * bent
     track.spine[:, 0] += 0.38 * deep * bent

@@ -141,7 +141,7 @@ class _Scene:
         self.gltf.materials = [Material(name="figure", pbrMetallicRoughness=colour)]
 
     def _mesh(self, name: str, body: Body, chosen: NDArray[np.bool_], *, expressions: bool) -> None:
-        from pygltflib import Attributes, Mesh, Primitive
+        from pygltflib import Accessor, Attributes, Mesh, Primitive
 
         number = np.cumsum(chosen) - 1
         triangles = number[body.triangles[chosen[body.triangles[:, 0]]]]
@@ -159,9 +159,15 @@ class _Scene:
         mesh = Mesh(name=name, primitives=[primitive])
         if expressions:
             moves = body.shapes
-            # Shapes that move nothing share one accessor of zeros.
             at_rest = [not move.any() for move in moves.values()]
-            still = self._zeros(int(chosen.sum())) if any(at_rest) else 0
+            still, zero = len(self.gltf.accessors), [0.0, 0.0, 0.0]
+            if any(at_rest):  # shapes that move nothing share one accessor of zeros, which takes no room
+                count = int(chosen.sum())
+                self.gltf.accessors.append(
+                    Accessor(
+                        byteOffset=None, componentType=_FLOAT, count=count, type="VEC3", min=zero, max=zero
+                    )
+                )
             primitive.targets = [
                 {"POSITION": still if rest else self._add(move[chosen], target=_VERTICES, bounds=True)}
                 for rest, move in zip(at_rest, moves.values(), strict=True)
@@ -218,16 +224,6 @@ class _Scene:
             accessor.min = [float(value) for value in data.min(axis=0)]
             accessor.max = [float(value) for value in data.max(axis=0)]
         self.gltf.accessors.append(accessor)
-        return len(self.gltf.accessors) - 1
-
-    def _zeros(self, count: int) -> int:
-        """Number of an accessor of `count` vectors of zeros, which takes no room in the file."""
-        from pygltflib import Accessor
-
-        zero = [0.0, 0.0, 0.0]
-        self.gltf.accessors.append(
-            Accessor(byteOffset=None, componentType=_FLOAT, count=count, type="VEC3", min=zero, max=zero)
-        )
         return len(self.gltf.accessors) - 1
 
     def _view(self, data: bytes, target: int | None) -> int:
