@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from motionloom.datasets.base.places import hub_is_away, means_folder, no_such_f
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.cli.info import info
+from motionloom.pipeline.cli.main import _exit_code
 from motionloom.pipeline.inference import shipped_models as module
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.model import MotionModel
@@ -187,3 +189,16 @@ def test_a_hub_that_cannot_be_reached_is_not_asked(here: Path, monkeypatch: pyte
         load_text_encoder("runs/minilm")
     monkeypatch.setenv("https_proxy", "http://proxy:3128")  # which may know the hub
     assert not hub_is_away()
+
+
+@pytest.mark.parametrize(
+    "words", [["generate", "a walk"], ["edit", "a.bvh"], ["caption", "a.bvh"], ["serve"]], ids=" ".join
+)
+def test_the_commands_take_names_of_the_hub(
+    words: list[str], here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["motionloom", words[0], "me/none", *words[1:]])
+    assert _exit_code() == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: me/none: no such folder, no model of that name comes with motionloom")
+    assert len(said.splitlines()) == 1
