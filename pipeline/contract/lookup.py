@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -35,29 +35,21 @@ from motionloom.pipeline.store.run_state import RunReader, StageRecord, finished
 from motionloom.pipeline.store.weights import LayoutFacts
 
 
-def preview_of(stage: Stage, others: Mapping[str, Stage | CompletedStage]) -> object:
-    """Return the preview of a recipe's stage, as far as it is known before it has run."""
-    return stage.kind.preview(stage.config, previews(stage, others))
+def preview_of(
+    stage: Stage | CompletedStage, others: Mapping[str, Stage | CompletedStage] | None = None
+) -> object:
+    """Return the preview of a recipe's stage, as far as it is known before it has run; of a finished one its
+    output without what only running it needs.
+    """
+    if isinstance(stage, CompletedStage):
+        makers = {role: partial(preview_of, source) for role, source in stage.inputs.items()}
+        return stage.kind.preview_of_finished(stage, Inputs(makers))
+    return stage.kind.preview(stage.config, previews(stage, others or {}))
 
 
 def previews(stage: Stage, others: Mapping[str, Stage | CompletedStage]) -> Inputs:
     """Previews of a stage's inputs, by role; `others` are those of its recipe, and finished ones outside."""
-
-    def maker(name: str) -> Callable[[], object]:
-        found = others[name]
-        if isinstance(found, CompletedStage):
-            return partial(preview_of_finished, found)
-        return partial(preview_of, found, others)
-
-    return Inputs({role: maker(name) for role, name in stage.inputs.items()})
-
-
-def preview_of_finished(stage: CompletedStage) -> object:
-    """Return a completed stage's output, without what only running it needs."""
-    makers: dict[str, Callable[[], object]] = {}
-    for role, source in stage.inputs.items():
-        makers[role] = partial(preview_of_finished, source)
-    return stage.kind.preview_of_finished(stage, Inputs(makers))
+    return Inputs({role: partial(preview_of, others[name], others) for role, name in stage.inputs.items()})
 
 
 def stages_giving(run: Path, what: str) -> list[str]:

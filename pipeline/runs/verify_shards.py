@@ -21,7 +21,7 @@ from motionloom.pipeline.launch.hardware import usable_cores
 from motionloom.pipeline.launch.process import JointError
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.store.artifact import NOTE, Compared, ComparedFile, State
-from motionloom.pipeline.store.data import local_shards
+from motionloom.pipeline.store.data import Data
 
 _THREADS = 4
 """At most, in a process: more read no disk faster."""
@@ -40,7 +40,7 @@ def verify_shards(context: StageContext, team: Team, run: Path) -> None:
     if how != "never" and context.again is None:
         for stage in context.inputs.values():
             if stage.gives("data") and not stage.exported:
-                shards += local_shards(stage.folder)
+                shards += Data(stage.folder).local_shards()
     shards = list({shard.path: shard for shard in shards}.values())
     if not shards:
         return

@@ -62,78 +62,6 @@ class Mix(Config):
         return [mix.parent / part.stage if part.folder is None else mix / part.folder for part in self.parts]
 
 
-def open_split(folder: Path, split: str, *, training: bool = False) -> ClipDataset:
-    """One split of a data stage.
-
-    `training` says that batches are drawn from it by a plan: only then does the streaming reader serve, as
-    the other stages visit clips in orders of their own.
-    """
-    if _is_plain(folder):
-        return ShardDataset.open(folder / SHARDS, split)
-    if (folder / MIX).is_file():
-        mix = Mix.load_json(folder / MIX)
-        pairs = zip(mix.folders(folder), mix.parts, strict=True)
-        holding = [(place, part.weight) for place, part in pairs if split in splits_of(place)]
-        opened = [(open_split(place, split, training=training), weight) for place, weight in holding]
-        return opened[0][0] if len(opened) == 1 else MixedDataset(opened)
-    reference = Reference.load_json(folder / REFERENCE)
-    reader = Reader.load_json(folder / READER)
-    reading = Reading(
-        mode=reader.mode if training else "indexed",
-        order=reference.order,
-        shards_per_group=reference.shards_per_group,
-        cache=reader.cache,
-    )
-    return ShardDataset.open(reference.path, split, reading=reading)
-
-
-def _is_plain(folder: Path) -> bool:
-    """Whether a data stage has shards of its own, and only those."""
-    return not (folder / REFERENCE).is_file() and not (folder / MIX).is_file()
-
-
-def splits_of(folder: Path) -> list[str]:
-    """Splits that hold at least one clip, of any data set."""
-    shards = [shard for _, manifest in _sources(folder) for shard in manifest.shards]
-    filled = {shard.split for shard in shards if shard.samples}
-    return [split for split in ("train", "val", "test") if split in filled]
-
-
-def held_out(folder: Path, *, prefer: str = "val") -> str:
-    """A split for validation: the preferred one, else the other held-out one, else train."""
-    splits = splits_of(folder)
-    other = "test" if prefer == "val" else "val"
-    return next(split for split in (prefer, other, "train") if split in splits)
-
-
-def local_shards(folder: Path) -> list[LocalShard]:
-    """All shards of a data stage that lie in folders of this machine; a server's are compared on arrival.
-
-    None of a kind that is not ours and keeps its data in another way.
-    """
-    if _is_plain(folder) and not (folder / SHARDS).is_dir():
-        return []
-    return [
-        LocalShard(store.root / shard.name, shard)
-        for store, manifest in _sources(folder)
-        if isinstance(store, LocalStore)
-        for shard in manifest.shards
-    ]
-
-
-def _sources(folder: Path) -> list[tuple[Store, Manifest]]:
-    if (folder / MIX).is_file():
-        places = Mix.load_json(folder / MIX).folders(folder)
-        return [source for place in places for source in _sources(place)]
-    if _is_plain(folder):
-        store = open_store(folder / SHARDS)
-    else:
-        store = open_store(
-            Reference.load_json(folder / REFERENCE).path, Reader.load_json(folder / READER).cache
-        )
-    return [(store, read_manifest(store)[0])]
-
-
 @dataclass(frozen=True)
 class DataPreview:
     """A data stage that has not run yet."""
@@ -143,25 +71,83 @@ class DataPreview:
 
 @dataclass(frozen=True)
 class Data:
-    """The splits of a data stage."""
+    """The splits of a data stage: its own shards, those that it points to, or a mix of other stages."""
 
     folder: Path
 
     @cached_property
     def layout(self) -> MotionLayout:
-        return self.split(splits_of(self.folder)[0]).layout
+        return self.split(self.splits[0]).layout
 
     def split(self, name: str, *, training: bool = False) -> ClipDataset:
-        return open_split(self.folder, name, training=training)
+        """One split.
+
+        `training` says that batches are drawn from it by a plan: only then does the streaming reader serve,
+        as the other stages visit clips in orders of their own.
+        """
+        if self._mixed:
+            parts = [(data, weight) for data, weight in self._mixed if name in data.splits]
+            opened = [(data.split(name, training=training), weight) for data, weight in parts]
+            return opened[0][0] if len(opened) == 1 else MixedDataset(opened)
+        if not (self.folder / REFERENCE).is_file():
+            return ShardDataset.open(self.folder / SHARDS, name)
+        reference, reader = self._elsewhere
+        reading = Reading(
+            mode=reader.mode if training else "indexed",
+            order=reference.order,
+            shards_per_group=reference.shards_per_group,
+            cache=reader.cache,
+        )
+        return ShardDataset.open(reference.path, name, reading=reading)
 
     def held_out(self, *, prefer: str = "val") -> ClipDataset:
-        """A split that is not trained on, where there is one."""
-        return self.split(held_out(self.folder, prefer=prefer))
+        """A split for validation: the preferred one, else the other held-out one, else train."""
+        splits, other = self.splits, "test" if prefer == "val" else "val"
+        return self.split(next(split for split in (prefer, other, "train") if split in splits))
 
     @property
     def splits(self) -> list[str]:
-        """Splits that hold at least one clip."""
-        return splits_of(self.folder)
+        """Splits that hold at least one clip, of any data set."""
+        shards = [shard for _, manifest in self._sources() for shard in manifest.shards]
+        filled = {shard.split for shard in shards if shard.samples}
+        return [split for split in ("train", "val", "test") if split in filled]
+
+    def local_shards(self) -> list[LocalShard]:
+        """All shards that lie in folders of this machine; a server's are compared on arrival.
+
+        None of a kind that is not ours and keeps its data in another way.
+        """
+        if not any((self.folder / name).exists() for name in (SHARDS, REFERENCE, MIX)):
+            return []
+        return [
+            LocalShard(store.root / shard.name, shard)
+            for store, manifest in self._sources()
+            if isinstance(store, LocalStore)
+            for shard in manifest.shards
+        ]
+
+    @cached_property
+    def _mixed(self) -> list[tuple[Data, float]]:
+        """The stages of a mix, and their weights."""
+        if not (self.folder / MIX).is_file():
+            return []
+        mix = Mix.load_json(self.folder / MIX)
+        pairs = zip(mix.folders(self.folder), mix.parts, strict=True)
+        return [(Data(place), part.weight) for place, part in pairs]
+
+    @property
+    def _elsewhere(self) -> tuple[Reference, Reader]:
+        return Reference.load_json(self.folder / REFERENCE), Reader.load_json(self.folder / READER)
+
+    def _sources(self) -> list[tuple[Store, Manifest]]:
+        if self._mixed:
+            return [source for data, _ in self._mixed for source in data._sources()]
+        if (self.folder / REFERENCE).is_file():
+            reference, reader = self._elsewhere
+            store = open_store(reference.path, reader.cache)
+        else:
+            store = open_store(self.folder / SHARDS)
+        return [(store, read_manifest(store)[0])]
 
 
 def captions_of(dataset: ClipDataset, index: int, *, face: bool) -> list[Caption]:

@@ -172,7 +172,7 @@ def test_processes_look_when_all_are_here(
         def meet(self) -> None:
             there.extend(shards)
 
-    monkeypatch.setattr(sound, "local_shards", lambda folder: list(there))
+    monkeypatch.setattr(sound.Data, "local_shards", lambda data: list(there))
     data = SimpleNamespace(gives=lambda what: what == "data", exported=False, folder=tmp_path)
     context: Any = SimpleNamespace(hardware=Hardware(), again=None, inputs={"data": data}, console=QUIET)
     flip(shards[1].path, 5)

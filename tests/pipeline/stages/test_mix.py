@@ -16,7 +16,7 @@ from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.contract.lookup import preview_of
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.store.data import Data, open_split
+from motionloom.pipeline.store.data import Data
 
 RECIPE = """
 name: mixed
@@ -64,8 +64,8 @@ def test_it_is_the_clips_of_both(run: Path) -> None:
 
 def test_training_draws_by_weight(run: Path) -> None:
     """A quarter of what an epoch draws is text clips, whatever their number (its places divide by four)."""
-    dataset = open_split(stage(run, "data"), "train", training=True)
-    texts = len(open_split(stage(run, "texts"), "train"))
+    dataset = Data(stage(run, "data")).split("train", training=True)
+    texts = len(Data(stage(run, "texts")).split("train"))
     sources = dataset.sources()
     assert [source.weight for source in sources] == [1.0, 3.0]
     plan = BatchPlan(len(dataset), 4, sources=sources, seed=0)
@@ -84,8 +84,8 @@ stages:
 """
     shutil.copytree(run, tmp_path / "run")
     made = run_recipe(write(tmp_path, text), tmp_path / "more", console=Console(quiet=True))
-    dataset = open_split(stage(made, "data"), "train")
-    own, dances = (open_split(folder, "train") for folder in (stage(made, "own"), stage(run, "dances")))
+    dataset = Data(stage(made, "data")).split("train")
+    own, dances = (Data(folder).split("train") for folder in (stage(made, "own"), stage(run, "dances")))
     assert [source.weight for source in dataset.sources()] == [1.0, 3.0]
     wanted = clips(own) + clips(dances)
     assert all(np.array_equal(a, b) for a, b in zip(clips(dataset), wanted, strict=True))
@@ -96,7 +96,7 @@ stages:
     (tmp_path / "both").mkdir()
     for name in ("run", "more"):
         (tmp_path / name).rename(tmp_path / "both" / name)
-    assert len(open_split(stage(tmp_path / "both/more", "data"), "train")) == len(wanted)
+    assert len(Data(stage(tmp_path / "both/more", "data")).split("train")) == len(wanted)
 
 
 def test_its_layout_is_known_before_it_runs(tmp_path: Path) -> None:
