@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from ude_training import draws_of_all
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import PIECES, MotionLayout
@@ -126,21 +127,11 @@ def gpt() -> tuple[StageModule, Batches]:
     )  # fmt: skip
 
     def batch(step: int) -> dict[str, Tensor]:
-        generator = torch.Generator().manual_seed(step)
-        codes = {
-            "body": torch.randint(9, (BATCH, 10), generator=generator),
-            "hand": torch.randint(9, (BATCH, 5), generator=generator),
-        }
-        groups = torch.tensor([5, 5, 4, 1, 2, 1])
-        tokens, kinds, _ = interleave(codes, book.pattern, ends=net.num_codes, groups=groups)
+        tokens, generator = _interleaved(step)
         text = torch.randn(BATCH, 16, generator=generator, dtype=torch.float64)
-        # One clip without hands on the first rank, two on the other.
-        handless = torch.tensor([False, False, True, False, True, True])
         present = torch.ones(BATCH, LAYOUT.dim, dtype=torch.bool)
-        present[handless.nonzero(), torch.from_numpy(LAYOUT.part("hand"))] = False
-        known = ~(handless[:, None] & (kinds == 1)) | (tokens == 9)
-        told = {"similarity": captions(step)["similarity"], "known": known, "present": present}
-        return {"tokens": tokens, "kinds": kinds, "text": text, **told}
+        present[HANDLESS.nonzero(), torch.from_numpy(LAYOUT.part("hand"))] = False
+        return tokens | {"text": text, "similarity": captions(step)["similarity"], "present": present}
 
     return module.eval(), batch
 
@@ -177,7 +168,7 @@ class UndrawnGpt(GptModule):
 
 def mdm() -> tuple[StageModule, Batches]:
     net = Mdm(TextDenoiserConfig(dim=16, ff=16, layers=1, heads=2), 20, TEXT)
-    module = UndrawnMdm(net, OPTIM, seed=0, max_steps=STEPS)
+    module = undrawn(TextDenoiserModule)(net, OPTIM, seed=0, max_steps=STEPS)
     return module.eval(), lambda step: motion(step, 20) | captions(step)
 
 
@@ -191,7 +182,7 @@ def inbetweener() -> tuple[StageModule, Batches]:
     config = InBetweenConfig(dim=16, ff=16, layers=1, heads=2, frames_per_token=1)
     net = InBetweener(config, 133, TEXT)
     observations = EndsObserved(layout, columns, Recovery(layout, columns, BODY["mean"], BODY["std"]), 1.0)
-    module = UndrawnInBetweener(net, OPTIM, seed=0, max_steps=STEPS, observations=observations)
+    module = undrawn(InBetweenModule)(net, OPTIM, seed=0, max_steps=STEPS, observations=observations)
     return module.eval(), lambda step: motion(step, 133) | captions(step)
 
 
@@ -204,7 +195,7 @@ def motion_vae() -> tuple[StageModule, Batches]:
 def latent_diffusion() -> tuple[StageModule, Batches]:
     vae = MotionVae(MotionVaeConfig(dim=16, ff=16, layers=1, heads=2), 20).double()
     net = LatentDenoiser(LatentDiffusionConfig(dim=16, ff=16, layers=1, heads=2), 1, TEXT)
-    module = UndrawnLatents(net, OPTIM, seed=0, max_steps=STEPS, vae=vae)
+    module = undrawn(LatentDiffusionModule)(net, OPTIM, seed=0, max_steps=STEPS, vae=vae)
     return module.eval(), lambda step: motion(step, 20) | captions(step)
 
 
@@ -217,7 +208,7 @@ def motionclip() -> tuple[StageModule, Batches]:
 def motiondiffuse() -> tuple[StageModule, Batches]:
     caption = CaptionConfig(dim=8, ff=8, layers=1, heads=2)
     config = MotionDiffuseConfig(dim=16, ff=16, layers=1, heads=2, caption=caption)
-    module = UndrawnMotionDiffuse(MotionDiffuse(config, 20, TEXT), OPTIM, seed=0, max_steps=STEPS)
+    module = undrawn(DenoiserModule)(MotionDiffuse(config, 20, TEXT), OPTIM, seed=0, max_steps=STEPS)
     return module.eval(), lambda step: motion(step, 20) | captions(step)
 
 
@@ -226,34 +217,14 @@ class Undrawn(StageModule):
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """As the base class, with the draws replaced."""
-        whole = BATCH
-
-        def part(values: Tensor) -> Tensor:
-            size = whole // world_size()
-            return values[rank() * size : (rank() + 1) * size]
-
-        randint, randn_like = torch.randint, torch.randn_like
-        generator = torch.Generator().manual_seed(0)
-        try:
-            torch.randint = lambda low, high, size, **_: part(  # type: ignore[assignment]
-                randint(low, high, (whole,), generator=generator)
-            )
-            torch.randn_like = (
-                lambda x: part(  # type: ignore[assignment]
-                    torch.randn(whole, *x.shape[1:], generator=generator, dtype=x.dtype)
-                )
-            )
+        torch.manual_seed(0)
+        with draws_of_all():
             return super().losses(batch)
-        finally:
-            torch.randint, torch.randn_like = randint, randn_like
 
 
-class UndrawnMdm(Undrawn, TextDenoiserModule):
-    """MDM."""
-
-
-class UndrawnInBetweener(Undrawn, InBetweenModule):
-    """The in-betweener."""
+def undrawn(kind: type[StageModule]) -> Any:
+    """A kind of module whose losses draw for the whole batch."""
+    return type(f"Undrawn{kind.__name__}", (Undrawn, kind), {})
 
 
 class EndsObserved(Observations):
@@ -264,14 +235,6 @@ class EndsObserved(Observations):
         inside, gap = at < length[:, None], (at >= 2) & (at < 6)
         pieces = (inside & ~gap)[..., None].expand(-1, -1, len(PIECES))
         return pieces, inside & gap & (length % 2 == 1)[:, None]
-
-
-class UndrawnLatents(Undrawn, LatentDiffusionModule):
-    """MLD's second stage."""
-
-
-class UndrawnMotionDiffuse(Undrawn, DenoiserModule):
-    """MotionDiffuse's."""
 
 
 class Pairs(EvaluatorModule):
@@ -300,11 +263,11 @@ def _interleaved(step: int) -> tuple[dict[str, Tensor], torch.Generator]:
     }
     groups = torch.tensor([5, 5, 4, 1, 2, 1])
     tokens, kinds, _ = interleave(codes, ("body", "body", "hand"), ends={"body": 9, "hand": 9}, groups=groups)
-    handless = torch.tensor([False, False, True, False, True, True])
-    known = ~(handless[:, None] & (kinds == 1)) | (tokens == 9)
+    known = ~(HANDLESS[:, None] & (kinds == 1)) | (tokens == 9)
     return {"tokens": tokens, "kinds": kinds, "known": known}, generator
 
 
+HANDLESS = torch.tensor([False, False, True, False, True, True])
 _STREAMS = (Stream("body", 9, 2), Stream("hand", 9, 1))
 _PATTERN = ("body", "body", "hand")
 _SAID = torch.tensor([[4, 5, 6, 2], [5, 2, 0, 0], [6, 6, 2, 0], [4, 2, 0, 0], [2, 0, 0, 0], [5, 4, 5, 2]])

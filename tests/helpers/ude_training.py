@@ -7,6 +7,8 @@ rank takes its rows. So two ranks and one process can be compared.
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -54,9 +56,11 @@ class Clips(Dataset[dict[str, Any]]):
     """Item k is this rank's rows of batch k: motion, text and music; lengths differ."""
 
     def __init__(
-        self, batch: int, rank: int = 0, world: int = 1, *, size: int = 10**6, dtype: Any, dies_at: int | None
-    ) -> None:
-        self.batch, self.size, self.dtype, self.dies_at = batch, size, dtype, dies_at
+        self, batch: int, rank: int = 0, world: int = 1, *, size: int = 10**6, dtype: Any = torch.float32,
+        parts: int = 1, dies_at: int | None = None, signalled: dict[int, signal.Signals] | None = None,
+    ) -> None:  # fmt: skip
+        self.batch, self.size, self.dtype = batch, size, dtype
+        self.parts, self.dies_at, self.signalled = parts, dies_at, signalled or {}
         self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
 
     def __len__(self) -> int:
@@ -65,8 +69,11 @@ class Clips(Dataset[dict[str, Any]]):
     def __getitem__(self, k: int) -> dict[str, Any]:
         if k >= self.size:
             raise IndexError(k)
-        if k == self.dies_at:
+        step, part = divmod(k, self.parts)
+        if step == self.dies_at:
             raise ConnectionResetError("killed")
+        if part == 0 and step in self.signalled:
+            os.kill(os.getpid(), self.signalled[step])
         generator = torch.Generator().manual_seed(k)
 
         def numbers(*shape: int) -> Tensor:
@@ -102,12 +109,12 @@ class SharedNoise(DmdModule):
 
     def losses(self, batch: dict[str, Any]) -> dict[str, Tensor]:
         """As the base class."""
-        with _draws_of_all():
+        with draws_of_all():
             return super().losses(batch)
 
 
 @contextmanager
-def _draws_of_all() -> Iterator[None]:
+def draws_of_all() -> Iterator[None]:
     randint, randn = torch.randint, torch.randn
     number, world = (rank(), world_size()) if torch.is_grad_enabled() else (0, 1)
 
@@ -197,10 +204,13 @@ def train(
     dtype: torch.dtype = torch.float32,
     devices: int = 1,
     dies_at: int | None = None,
+    signalled: dict[int, signal.Signals] | None = None,
     dropout: float = 0.0,
     **settings: Any,
 ) -> StageModule:
-    """Train one network in `folder`, from its newest checkpoint; `dies_at` a step all ends with an error."""
+    """Train one network in `folder`, from its newest checkpoint; `dies_at` a step all ends with an error, and
+    while a step of `signalled` is taken, that signal comes.
+    """
     given: dict[str, Any] = {"steps": 16, "batch_size": 8, "checkpoint_every": 4, "validate_every": 8}
     config = TrainConfig(**{**given, **settings})
     module = module_of(name, config.steps, dropout=dropout).to(dtype)
@@ -211,7 +221,9 @@ def train(
         context(folder, Console(quiet=True), devices=devices),
         module,
         config,
-        lambda batch, number, world: Clips(batch, number, world, dtype=dtype, dies_at=dies_at),
-        lambda: Clips(8, size=2, dtype=dtype, dies_at=None),
+        lambda batch, number, world: Clips(
+            batch, number, world, dtype=dtype, parts=config.accumulate, dies_at=dies_at, signalled=signalled
+        ),
+        lambda: Clips(8, size=2, dtype=dtype),
     )
     return module

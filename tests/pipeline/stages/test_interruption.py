@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -15,76 +14,31 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from rich.console import Console
 from same_stage import assert_same_stage
-from tiny_adversaries import context, train
+from tiny_adversaries import train
 from torch import Tensor
-from torch.utils.data import Dataset
+from ude_training import train as train_dances
 
-from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.tokenizer.body_hand import H2VQConfig
-from motionloom.models.tokenizer.module import TokenizerModule
-from motionloom.models.training.optim import OptimConfig
-from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.cli import main as program
 from motionloom.pipeline.launch.process import SAVED, Interrupted
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.training import preemption as interruption
-from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.preemption import SIGNALS, Agreement, Signals, unsignalled
-from motionloom.pipeline.training.trainer import fit
 
 # Rows end with every tenth step, so none of these borders and interruptions lies where a row does.
 FULL: dict[str, Any] = {"ema": 0.9, "accumulate": 2, "checkpoint_every": 7, "validate_every": 7}
 TERM, USR1, USR2 = signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2
 
 
-class Waves(Dataset[dict[str, Tensor]]):
-    """Item k is batch k; while a step of `signalled` is taken, a signal comes."""
-
-    def __init__(self, width: int, parts: int, signalled: dict[int, signal.Signals], size: int) -> None:
-        self.width, self.parts, self.signalled, self.size = width, parts, signalled, size
-
-    def __len__(self) -> int:
-        return self.size
-
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
-        if index >= self.size:
-            raise IndexError(index)
-        if index % self.parts == 0 and index // self.parts in self.signalled:
-            os.kill(os.getpid(), self.signalled[index // self.parts])
-        generator = torch.Generator().manual_seed(index)
-        motion = torch.randn(4, 16, self.width, generator=generator)
-        return {"motion": motion, "length": torch.tensor([16, 12, 16, 8])}
-
-
-def train_tokenizer(
-    folder: Path, *, signalled: dict[int, signal.Signals] | None = None, **settings: Any
-) -> StageModule:
-    """A tokenizer with learnt codebooks, whose idle codes are drawn anew."""
-    given: dict[str, Any] = {"steps": 24, "batch_size": 8, **settings}
-    config = TrainConfig(**given)
-    torch.manual_seed(5)
-    kind = H2VQConfig(width=8, depth=1, code_dim=8, velocity_weight=0.5)
-    net = kind.build(MotionLayout.named("wholebody313"))
-    optim = OptimConfig(lr=1e-3, warmup_steps=5, schedule="cosine", grad_clip=0.5)
-    module = TokenizerModule(net, optim, seed=5, max_steps=config.steps)
-    parts = config.accumulate
-    fit(
-        context(folder, Console(quiet=True)),
-        module,
-        config,
-        lambda *_: Waves(net.dim, parts, signalled or {}, 10**6),
-        lambda: Waves(net.dim, 1, {}, 2),
-    )
-    return module
+def train_codes(folder: Path, **settings: Any) -> Any:
+    """Learnt codebooks, whose idle codes are drawn anew."""
+    return train_dances("dance_vq", folder, **{"steps": 24, **settings})
 
 
 Train = Callable[..., Any]
 
 
-@pytest.mark.parametrize("training", [train, train_tokenizer], ids=["two optimizers", "codebooks"])
+@pytest.mark.parametrize("training", [train, train_codes], ids=["two optimizers", "codebooks"])
 def test_interrupted_equals_undisturbed(training: Train, tmp_path: Path) -> None:
     """In the middle of chunks, of rows of the log, and where the last chunk is cut short."""
     whole = training(tmp_path / "whole", **FULL)
@@ -102,7 +56,7 @@ def test_interrupted_equals_undisturbed(training: Train, tmp_path: Path) -> None
     assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
 
 
-@pytest.mark.parametrize("training", [train, train_tokenizer], ids=["two optimizers", "codebooks"])
+@pytest.mark.parametrize("training", [train, train_codes], ids=["two optimizers", "codebooks"])
 def test_a_validation_is_cut_short_and_made_up_for(training: Train, tmp_path: Path) -> None:
     """Behind its current batch, at the ends of chunks and of the training."""
     whole = training(tmp_path / "whole", **FULL | {"steps": 21})

@@ -1,4 +1,4 @@
-"""Bailando: masks, losses, rewards and the way on against slow versions; what it learns."""
+"""Bailando: masks, losses, rewards and the way on against slow versions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from motionloom.datasets.conditions import Condition
 from motionloom.models.metrics.dance_beats import motion_beats
@@ -16,7 +16,6 @@ from motionloom.pipeline.baselines.bailando.codes import DanceVq, DanceVqConfig
 from motionloom.pipeline.baselines.bailando.module import (
     ActorCriticModule,
     CrossGptModule,
-    DanceVqModule,
     beat_rewards,
     codes_of,
     moving_error,
@@ -28,7 +27,6 @@ from motionloom.pipeline.baselines.bailando.network import (
     CrossGptConfig,
     RewardConfig,
     music_of_codes,
-    tiled_causal,
 )
 
 OPTIM = OptimConfig(optimizer="adam", lr=3e-3)
@@ -70,31 +68,6 @@ def test_errors_of_places_steps_and_steps_of_steps() -> None:
     rate = [np.abs(np.diff((made - true).float().numpy(), n=n, axis=1)).mean() for n in range(3)]
     found = moving_error(made, true, 2.0, 3.0)
     assert float(found) == pytest.approx(rate[0] + 2 * rate[1] + 3 * rate[2], rel=1e-5)
-
-
-def test_the_mask_against_an_obvious_one() -> None:
-    mask = tiled_causal(4, torch.device("cpu"))[0]
-    for query in range(12):
-        for key in range(12):
-            assert bool(mask[query, key]) == (key % 4 <= query % 4)
-
-
-def test_a_code_knows_its_own_music_and_nothing_later() -> None:
-    gpt = small_gpt()
-    codes, music = torch.randint(12, (1, 5, 2)), torch.randn(1, 5, 3)
-    before = gpt(codes, music)
-    for half in range(2):
-        other = codes.clone()
-        other[0, 3, half] = (other[0, 3, half] + 1) % 12
-        after = gpt(other, music)
-        torch.testing.assert_close(after[:, :3], before[:, :3])
-        assert not torch.allclose(after[:, 3, 0], before[:, 3, 0]) and not torch.allclose(
-            after[:, 3, 1], before[:, 3, 1]
-        )
-    louder = music.clone()
-    louder[0, 3] += 1
-    torch.testing.assert_close(gpt(codes, louder)[:, :3], before[:, :3])
-    assert not torch.allclose(gpt(codes, louder)[:, 3], before[:, 3])
 
 
 def test_dancing_slides_along() -> None:
@@ -167,69 +140,6 @@ def test_rewards_and_errors_of_the_critic_against_loops() -> None:
     error.sum().backward()
     slow = torch.tensor([-1.0, -0.1, -0.1, 0.9])[None, :, None].expand(2, 4, 2)
     torch.testing.assert_close(values.grad, slow)
-
-
-def steps(module: Any, group: str, nets: list[nn.Module], number: int, lr: float) -> list[dict[str, Tensor]]:
-    optimizer = torch.optim.Adam([weight for net in nets for weight in net.parameters()], lr=lr)
-    out = []
-    for step in range(number):
-        torch.manual_seed(step)
-        values = module.losses_of(group, dances(), {}) if group else module.losses(dances())
-        optimizer.zero_grad()
-        values["loss"].backward()
-        optimizer.step()
-        out.append(values)
-    return out
-
-
-def test_both_halves_and_the_root_are_learnt() -> None:
-    """Reconstruction below half of the error of the mean pose (measured 0.2), root steps likewise."""
-    torch.manual_seed(0)
-    vq = DanceVq(DanceVqConfig(**CODES, decay=0.8, reset_below=0.05), 22)
-    turns: dict[str, Any] = {"root_optim": OPTIM, "root_start": 1}
-    module = DanceVqModule(vq, OPTIM, seed=0, max_steps=1, **turns)
-    last = steps(module, "codes", [vq.up, vq.down], 120, 3e-3)[-1]
-    torch.manual_seed(200)
-    poses = vq.poses(dances()["motion"].unflatten(2, (-1, 3)))
-    for name, pose in poses.items():
-        assert float(last[f"recon_{name}"]) < 0.5 * float((pose - pose.mean((0, 1))).abs().mean())
-    before = {name: value.clone() for name, value in vq.state_dict().items() if not name.startswith("root")}
-    root = steps(module, "root", [vq.root], 60, 3e-3)[-1]
-    assert float(root["loss"]) < float(root["still"])
-    assert all(torch.equal(value, vq.state_dict()[name]) for name, value in before.items())
-
-
-class Puppet(DanceVq):
-    """A dancer whose every upper code below 3 holds still for a moment: its beats are in these codes."""
-
-    def decode(self, codes: Tensor) -> Tensor:
-        """One joint goes along, and stops."""
-        pace = torch.ones(*codes.shape[:2], 4)
-        pace[..., 1:3] = (codes[..., :1] >= 3).float()
-        way = pace.flatten(1).cumsum(1)
-        return way[..., None, None] * torch.tensor([1.0, 0, 0]).expand(1, 3)
-
-
-def test_rewards_rise() -> None:
-    """In turns of five steps the share of codes on the beat more than doubles; measured 0.15 to 0.43."""
-    torch.manual_seed(0)
-    vq, gpt = Puppet(DanceVqConfig(**CODES), 22).eval(), small_gpt()
-    module = ActorCriticModule(
-        ActorCritic(gpt, 1), OPTIM, seed=0, max_steps=1, vq=vq, fps=20.0, reward=RewardConfig(critic_layers=1)
-    )
-    groups = {name: torch.optim.Adam(net.parameters(), lr=5e-3) for name, net in
-               (("critic", module.net.critic), ("actor", gpt))}  # fmt: skip
-    rewards = []
-    for step in range(80):
-        torch.manual_seed(step)
-        group = ("critic", "actor")[step // 5 % 2]
-        values = module.losses_of(group, dances() | {"beats": torch.ones(8, 24, dtype=torch.bool)}, {})
-        groups[group].zero_grad()
-        values["loss"].backward()
-        groups[group].step()
-        rewards.append(float(values["reward"]))
-    share = [(np.mean(some) + 5) / 10 for some in (rewards[:5], rewards[-10:])]
-    assert share[0] < 0.4 and share[1] > 2 * share[0]
 
 
 def test_actor_and_critic_take_turns() -> None:
