@@ -7,12 +7,10 @@ never differ. The few fields of `config.everyday` have an option too. A converte
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import json
 import shlex
 import typing
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -87,8 +85,7 @@ def _command(name: str) -> Any:
             raise UserError("--json is for the plan: give --plan too")
         settings = {key: value for key, value in everyday.items() if value is not None}
         settings |= fields_of(sets, "--set")
-        _require_known(settings, config, f"data convert {name}")
-        fields = {"source": source, **settings}
+        fields = {**settings, "source": source}
         console = make_console(aside=as_json)
         convert_command(name, fields, out, plan=plan, workers=workers, console=console, as_json=as_json)
 
@@ -119,16 +116,6 @@ def _parameter(name: str, annotation: object, default: object = inspect.Paramete
 def _settings(config: type[ConvertConfig]) -> list[str]:
     """Fields without an argument or option of their own."""
     return [key for key in config.model_fields if key not in ("source", *config.everyday)]
-
-
-def _require_known(keys: Iterable[str], config: type[ConvertConfig], where: str) -> None:
-    """`UserError` with the nearest setting and its help, and all settings, for a key that is none."""
-    for key in keys:
-        if key == "source" or key not in config.model_fields:
-            known = sorted(_settings(config))
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f"did you mean '{near[0]}' ({_help(config, near[0]).rstrip('.')})? " if near else ""
-            raise UserError(f"{where}: unknown key '{key}'; {hint}settings: {', '.join(known)}")
 
 
 def _help(config: type[ConvertConfig], key: str) -> str:

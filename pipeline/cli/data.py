@@ -11,12 +11,11 @@ from rich.table import Table
 from rich.text import Text
 
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.schema import Dropped, Manifest, UserError
+from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import grouped
 from motionloom.pipeline.cli.convert import convert_app, say_manifest
 from motionloom.pipeline.cli.options import AsJson, Workers, fields_of, plain, print_json, set_option
 from motionloom.pipeline.launch.console import make_console, say
-from motionloom.pipeline.render.charts import label
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ _ALIKE = 5
 """Findings that say the same and are still listed one by one."""
 
 data_app = typer.Typer(
-    help="Shards: synthesise, convert, check, statistics.", no_args_is_help=True, rich_markup_mode="markdown"
+    help="Shards: synthesise, convert, check, describe.", no_args_is_help=True, rich_markup_mode="markdown"
 )
 data_app.add_typer(convert_app, name="convert")
 
@@ -250,42 +249,6 @@ def clean(
     say(console, f"{page}: {len(found)} suspects{f' ({kinds})' if kinds else ''}")
     if as_json:
         print_json({"path": root, "page": page, "suspects": list(found.values())})
-
-
-@data_app.command()
-def stats(
-    root: Root,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Also write a .safetensors file.")] = None,
-) -> None:
-    """Counts, lengths, and mean and deviation per kind of feature (training split).
-
-    Example: `motionloom data stats shards -o stats.safetensors`
-    """
-    import numpy as np
-
-    from motionloom.datasets.loading.statistics import compute
-    from motionloom.datasets.shards.reader import ShardDataset
-
-    console = make_console()
-    manifest = Manifest.load_json(root / "manifest.json")
-    if out is not None:
-        require_file_place(out)
-    say_manifest(manifest, root, console)
-    dataset = ShardDataset.open(root, "train")
-    lengths = np.asarray(dataset.frames) / dataset.layout.fps
-    low, middle, high = np.percentile(lengths, [5, 50, 95])
-    console.print(f"clip length: median {middle:.1f} s, 5 % below {low:.1f} s, 5 % above {high:.1f} s")
-    stats = compute(dataset)
-    table = Table("feature", "dims", "mean |mean|", "mean deviation", "largest deviation")
-    for name, size in dataset.layout.fields:
-        columns = dataset.layout.slice(name)
-        mean, std = np.abs(stats.mean[columns]).mean(), stats.std[columns]
-        table.add_row(label(name), str(size), f"{mean:.4f}", f"{std.mean():.4f}", f"{std.max():.4f}")
-    console.print(table)
-    if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        stats.save(out)
-        console.print(str(out), markup=False)
 
 
 def _holds_files(folder: Path) -> bool:

@@ -329,7 +329,6 @@ def _decide(
     broken = [scan.problem for scan in scans if scan.problem is not None]
     draft = ConversionPlan[BvhClip](config, broken=broken, notes=listing.notes, stated=stated)
     contents: dict[str, str] = {}
-    other_rate = 0
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
     for number, clip in sorted(found, key=lambda pair: pair[1].path not in listing.rows):
         clip_id = listing.id_of(clip.path)
@@ -340,8 +339,6 @@ def _decide(
         except UserError as error:
             draft.fail(clip.label, error)
             continue
-        listed = listing.rows[clip.path].fps if clip.path in listing.rows else None
-        other_rate += listed is not None and abs(listed - clip.fps) > 0.01 * clip.fps
         frames = len(range(clip.frames)[config.cut(clip.label)])
         fps = config.source_fps or clip.fps
         same = contents.setdefault(clip.sha256, clip.label)
@@ -356,9 +353,5 @@ def _decide(
         planned = BvhClip(batches[number], clip, clip_id, split, texts, frames, fps, about)
         keep = config.uncaptioned == "keep"
         draft.take(planned, reason, captioned=bool(texts), wanted=config.has_captions, keep=keep)
-    if other_rate:
-        draft.notes.append(
-            f"{other_rate} captions state another frame rate than their file; the file's counts"
-        )
     settle_captions(config, draft, listing)
     return draft

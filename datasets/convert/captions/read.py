@@ -48,7 +48,6 @@ class CaptionRow:
     file: str | None
     """Its path in the source, where the captions state one."""
     split: Split | None
-    fps: float | None
     where: str
     """`FILE:LINE`, or the file and which of its records."""
     catalogue: bool = False
@@ -63,7 +62,6 @@ class _Given(Config):
     id: str | None = Field(None, validation_alias=AliasChoices(*ID_KEYS))
     file: str | None = Field(None, validation_alias=AliasChoices(*FILE_KEYS))
     split: str | None = None
-    fps: FiniteFloat | None = Field(None, gt=0)
     start: FiniteFloat = Field(0.0, ge=0)
     end: FiniteFloat | None = None
 
@@ -114,7 +112,7 @@ def _row(where: str, values: dict[str, object]) -> tuple[CaptionRow, bool]:
     texts = [text for key in keys for text in _captions(f"{where}: '{key}'", values.get(key), shared)]
     stated = split_named(about.split, where) if about.split else None
     file = about.file and about.file.strip().replace("\\", "/").removeprefix("./")
-    row = CaptionRow(clip_id, tuple(texts), file, stated, about.fps, where)
+    row = CaptionRow(clip_id, tuple(texts), file, stated, where)
     return row, is_list
 
 
@@ -143,7 +141,7 @@ def _text_keys(keys: tuple[str, ...]) -> tuple[str, ...]:
 
 def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
     """One row of two records of the same clip."""
-    for what in ("file", "split", "fps"):
+    for what in ("file", "split"):
         old, new = getattr(before, what), getattr(row, what)
         if old is not None and new is not None and old != new:
             raise UserError(
@@ -154,7 +152,6 @@ def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
         texts=before.texts + tuple(text for text in row.texts if text not in before.texts),
         file=before.file or row.file,
         split=before.split or row.split,
-        fps=before.fps or row.fps,
     )
 
 

@@ -50,8 +50,6 @@ class ConvertConfig(Config):
     most_rejected: float = Field(default=0.5, ge=0, le=1, json_schema_extra={"runtime": True})
     """Share of the clips that may turn out unreadable or unfit; a conversion that loses more fails, although
     what is left of it is written."""
-    strict: bool = Field(default=False, json_schema_extra={"runtime": True})
-    """Stop when a clip is missing or cannot be read."""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: object) -> None:

@@ -121,13 +121,11 @@ def run_conversion(
     goes on at the first unfinished shard. With `part`, only that part is made, without a manifest (the one
     returned covers the part); the run without one then finds all parts and writes index and manifest.
     """
-    how = WriteOptions(workers, clips_per_shard, seed, conversion.config.strict, progress, part)
+    how = WriteOptions(workers, clips_per_shard, seed, progress=progress, part=part)
     plan = conversion.plan
     plan.require_settled()
     if plan.items and not conversion.converter.licence(plan):
         raise UserError(f"{plan.name}: say under which licence the clips are: --set licence=CC-BY-4.0")
-    if how.strict:
-        plan.require_whole()
     depends_on = conversion.converter.depends_on
     with dataset_writer(
         out, plan.items, conversion.facts(), how, describe=_label, depends_on=depends_on

@@ -230,12 +230,6 @@ class ConversionPlan(Generic[C]):
         if self.stop:
             raise UserError(self.stop)
 
-    def require_whole(self) -> None:
-        """`UserError` when anything is missing or broken (`strict`)."""
-        bad = [*self.broken, *self.missing]
-        if bad:
-            raise UserError(f"{bad[0].source}: {bad[0].reason} (strict: {len(bad)} missing or broken)")
-
 
 def facts_of(clip: PlannedClip) -> Facts:
     """Facts of a clip by name, for `where`: id, split, and the clip's own `facts`."""

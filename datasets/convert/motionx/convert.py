@@ -10,12 +10,11 @@ Choices, beside those of docs/sources.md:
   instance), so clips with nothing but zeros there have `has_face` or `has_hands` False.
 
 Only the motion is required: splits, captions, face motion and face texts are taken where they are. A plan
-reads headers and texts; motion data only of a few `aist/` clips, whose scale is examined.
+reads headers and texts.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -25,7 +24,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import body_of, features_of, require_human
@@ -50,7 +48,6 @@ from motionloom.datasets.convert.motionx.parameters import (
     HANDS,
     RAW,
     TRANS,
-    aist_scale,
     resample_parameters,
     scale_aist,
     value_limits,
@@ -79,9 +76,6 @@ LICENCES = {
 }
 """Our reading, on the careful side: motion that the user gets from its own site keeps that site's licence,
 all that Motion-X hands out needs its agreement as well, and both count where it has a first owner."""
-
-_LOOKED_AT = 8
-"""Clips of `aist/` that the plan reads to tell their scale."""
 
 
 class MotionXConfig(ReleaseConfig):
@@ -218,7 +212,7 @@ class MotionX(Release[MotionXConfig]):
         return entry, broken, problems
 
     def _subset_notes(self, entries: list[MotionXEntry]) -> list[str]:
-        """Notes on captions and faces that subsets lack, and on the scale of `aist/`."""
+        """Notes on captions and faces that subsets lack."""
         notes = []
         by_subset: dict[str, list[MotionXEntry]] = {}
         for entry in entries:
@@ -233,18 +227,6 @@ class MotionX(Release[MotionXConfig]):
             notes.append(
                 f"{faceless} of {len(mocap)} clips of {', '.join(MOCAP)} have no face motion file: unless "
                 f"their own columns hold an expression, their face is masked"
-            )
-        states: Counter[str] = Counter()
-        for entry in sorted(by_subset.get(AIST, []), key=lambda one: sha256_of_json(one.id))[:_LOOKED_AT]:
-            try:
-                states[aist_scale(self._load(entry.file))] += 1
-            except UserError:
-                states["broken"] += 1  # the conversion reports why
-        if states:
-            counts = ", ".join(f"{count} {state}" for state, count in sorted(states.items()))
-            notes.append(
-                f"aist/: of {states.total()} clips looked at, {counts}; raw ones are brought to metres once "
-                f"(/ 94, z negated), each judged by itself"
             )
         return notes
 

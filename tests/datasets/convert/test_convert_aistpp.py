@@ -22,7 +22,7 @@ from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.schema import Manifest
 from motionloom.datasets.shards.reader import ShardDataset
 
 REAL = "gBR_sBM_cAll_d04_mBR0_ch01"
@@ -158,8 +158,6 @@ def test_plan_of_the_fixture(fixture: Path) -> None:
     assert [d.source for d in plan.missing] == [LISTED]
     assert plan.broken == []
     assert plan.licences == {MUSIC_LICENCE: 2}
-    with pytest.raises(UserError, match="ch99"):
-        plan.require_whole()
 
 
 def test_official_lists_are_read_whole(fixture: Path) -> None:
@@ -257,5 +255,3 @@ def test_broken_music_is_named_and_its_dances_left_out(
     assert "no readable sound" in told[f"motions/{TEST}.pkl"]
     assert "wavs/mHO9.wav" in told
     assert str(tmp_path) not in str(told)
-    with pytest.raises(UserError, match=r"mHO9\.wav"):
-        convert(AistppConfig(source=copy, strict=True), tmp_path / "strict")

@@ -269,8 +269,6 @@ def test_broken_files_are_reported_and_skipped(copy: Path, shared: Path, tmp_pat
     assert not any(name in told for name in ("control_ok.bvh", "crlf_bom.bvh"))
     assert len(told) == 9
     assert all("broken/bvh" not in reason and str(copy) not in reason for reason in told.values())
-    with pytest.raises(UserError, match="strict"):
-        convert(given.model_copy(update={"strict": True}), tmp_path / "strict")
 
 
 def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> None:
@@ -294,8 +292,6 @@ def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> Non
     assert "8" in {str(cell) for column in plan.table().columns for cell in column.cells}
     kept = prepare(config(copy, captions=None)).plan
     assert any("same bytes as" in d.reason for d in kept.dropped)
-    with pytest.raises(UserError, match="strict"):
-        plan.require_whole()
 
 
 def test_archive_members_are_labels_never_paths(clips: Path, tmp_path: Path) -> None:
@@ -326,8 +322,6 @@ def test_damaged_archive_keeps_what_came_before(copy: Path, tmp_path: Path) -> N
     assert "damaged archive after" in told["part0.tar"]
     assert 0 < sum(s.samples for s in manifest.shards) < 6
     assert sum(" listed, " in r for r in told.values()) > 0
-    with pytest.raises(UserError, match="damaged archive"):
-        convert(config(copy, strict=True), tmp_path / "strict")
 
 
 def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:

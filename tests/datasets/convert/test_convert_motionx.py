@@ -195,8 +195,6 @@ def test_broken_face_file_leaves_the_clip(copy: Path) -> None:
     plan = prepare(config(copy)).plan
     assert [d.source for d in plan.broken] == [f"{FACES}/{HUMANML}.npy"]
     assert not sample(copy, HUMANML).meta.has_face
-    with pytest.raises(UserError, match=r"found \[72, 152\]"):
-        plan.require_whole()
 
 
 # aist
@@ -207,14 +205,12 @@ def test_dances_are_scaled_exactly_once(copy: Path) -> None:
     once = sample(copy, DANCE)
     joints = joints_of(once)
     assert 4.0 < joints[-1, 0, 2] < 4.4  # forward, in metres
-    assert any("1 raw" in note for note in prepare(config(copy)).plan.notes)
 
     def script(values: NDArray[Any]) -> None:
         values[:, 309:312] /= 94
         values[:, 311] *= -1
 
     rewrite(path, script)
-    assert any("1 scaled" in note for note in prepare(config(copy)).plan.notes)
     np.testing.assert_allclose(sample(copy, DANCE).motion, once.motion, atol=1e-5)
     values = np.load(path).astype(np.float64)
     np.testing.assert_array_equal(scale_aist(values), values)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import io
 import json
 import re
 import shlex
@@ -17,14 +18,14 @@ import typer
 from bvh_clips import write_clip, write_map
 from foreign_figures import build, write_figure
 from foreign_tools import FOREIGN
-from safetensors.numpy import load_file
+from rich.console import Console
 
-from motionloom.datasets.base.files import write_json
 from motionloom.datasets.check.files import FileRules
 from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.schema import Manifest
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.cli.convert import say_manifest
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.cli.options import plain
 from motionloom.pipeline.contract.editing import EditTask
@@ -174,26 +175,12 @@ def test_synth_writes_the_same_shards_as_the_function(shards: Path, tmp_path: Pa
     assert again.code == 0 and made == {path: path.read_bytes() for path in out.iterdir()}
 
 
-def test_stats_describes_and_writes(shards: Path, tmp_path: Path, call: Call) -> None:
-    out = tmp_path / "new/folder/stats.safetensors"
-    done = call("data", "stats", shards, "--out", out)
-    assert done.code == 0 and "clip length: median" in done.out and "root height" in done.out
-    first, stored = out.read_bytes(), load_file(out)
-    assert stored["mean"].shape == (363,) and (stored["std"] > 0).all()
-    call("data", "stats", shards, "--out", out)
-    assert out.read_bytes() == first, "equal statistics must be equal files"
-
-
-def test_text_of_a_manifest_adds_no_line_and_commands_no_terminal(
-    shards: Path, tmp_path: Path, call: Call
-) -> None:
-    shutil.copytree(shards, tmp_path / "set")
-    manifest = Manifest.load_json(tmp_path / "set/manifest.json").model_copy(
-        update={"licence": "CC0\nerror: \x1b[31m", "licences": {}}
-    )
-    write_json(tmp_path / "set/manifest.json", manifest.dump())
-    done = call("data", "stats", tmp_path / "set")
-    assert done.code == 0 and r"CC0\nerror: \x1b[31m" in done.out and "\x1b" not in done.out
+def test_text_of_a_manifest_adds_no_line_and_commands_no_terminal(shards: Path) -> None:
+    manifest = Manifest.load_json(shards / "manifest.json")
+    hostile = manifest.model_copy(update={"licence": "CC0\nerror: \x1b[31m", "licences": {}})
+    shown = Console(file=io.StringIO(), width=200)
+    say_manifest(hostile, shards, shown)
+    assert r"CC0\nerror: \x1b[31m" in shown.file.getvalue() and "\x1b" not in shown.file.getvalue()  # type: ignore[attr-defined]
 
 
 def test_a_wrong_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, call: Call) -> None:

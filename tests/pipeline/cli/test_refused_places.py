@@ -63,7 +63,6 @@ WRITING: dict[str, Sequence[str]] = {
         "--licence", "x", "--workers", "1",
     ),
     "data report": ("data", "report", "{root}/shards", "--out", "{out}/page.html"),
-    "data stats": ("data", "stats", "{root}/shards", "--out", "{out}/stats.safetensors"),
 }  # fmt: skip
 
 

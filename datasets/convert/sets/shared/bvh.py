@@ -55,7 +55,7 @@ class BvhSetConfig(BvhConfig):
             return super().listing(paths, readable)
         known, here = self.rows(), {stem(path): path for path in paths}
         rows = [
-            CaptionRow(name, row.texts, here[name], hash_split(row.group), None, name)
+            CaptionRow(name, row.texts, here[name], hash_split(row.group), name)
             for name, row in known.items()
             if name in here
         ]
