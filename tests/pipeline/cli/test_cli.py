@@ -332,8 +332,8 @@ def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:
     assert sum(plan["clips"].values()) == 1 and "frame_time_zero.bvh" in json.dumps(plan["unreadable"])
     refused = call(*words, "--json")
     assert refused.code == 2 and "give --plan too" in refused.err and not (tmp_path / "out").exists()
-    strict = call(*words, "--set", "strict=true")
-    assert strict.code == 2 and "frame_time_zero.bvh" in strict.err and "Frame Time" in strict.err
+    wrong = call(*words, "--set", "strict=true")
+    assert wrong.code == 2 and "'strict'" in wrong.err
 
 
 def test_info_the_version_and_a_table(call: Call) -> None:
