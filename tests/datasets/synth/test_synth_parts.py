@@ -137,18 +137,6 @@ def test_dances_without_music_have_their_tempo_and_style() -> None:
 KEPT = Path(__file__).resolve().parents[3] / "benchmarks" / "synthetic_wordings.json"
 
 
-def test_there_are_many_wordings_and_they_come_again_with_the_seed() -> None:
-    truth = Truth("wave", side="left")
-
-    def captions(wordings: Wordings) -> set[str]:
-        made = (body_captions(truth, np.random.default_rng(s), 3, wordings=wordings) for s in range(200))
-        return {text for texts in made for text in texts}
-
-    assert len(captions("many")) > 5 * len(captions("few"))
-    again = [body_captions(truth, np.random.default_rng(3), 3, wordings="many") for _ in range(2)]
-    assert again[0] == again[1] and len(set(again[0])) == 3
-
-
 @pytest.mark.parametrize("face", FACES)
 def test_verbs_are_written_right(face: str) -> None:
     rng = np.random.default_rng(1)
