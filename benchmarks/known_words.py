@@ -25,7 +25,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.multiclass import OneVsRestClassifier
 from torch.nn import functional as F
 
-from motionloom.datasets.actions.measure import actions_of, agrees, find_mismatch, measure
+from motionloom.datasets.actions.measure import action_of, actions_of, agrees, find_mismatch
 from motionloom.datasets.synth.generate import captions_of, split_of, truth_of
 from motionloom.datasets.synth.requests import attributes_of
 from motionloom.pipeline.inference.bundle import Bundle
@@ -67,7 +67,7 @@ def main() -> None:
     }  # fmt: skip
     for caption, motion, good, flag in zip(captions, motions, right, flags[PATTERNS], strict=True):
         if good == flag:
-            shows = measure(motion.joints, motion.fps).action
+            shows = action_of(motion.joints, motion.fps)
             console.print(f"{'noted, and right' if good else 'not noted, and wrong'}: '{caption}' ({shows})")
     flags |= others(bundle, model, captions, motions, right, int(flags[PATTERNS][right].sum()))
     facts = {"sentences": len(rows), "wrong": int((~right).sum()), "right": int(right.sum())}
@@ -113,7 +113,7 @@ def others(bundle, model, captions, motions, right: Flags, alarms: int) -> dict[
     chances = probe.fit(sentences(list(chosen)), wanted).predict_proba(embedded)
     likely, differs = [], []
     for text, motion, row in zip(read, motions, chances, strict=True):
-        shown = measure(motion.joints, motion.fps).action
+        shown = action_of(motion.joints, motion.fps)
         asked = [names[k] for k in np.flatnonzero(row > 0.5)]
         both = {"action": "then", "parts": [{"action": action} for action in asked]}
         if len(asked) == 2:

@@ -1,9 +1,9 @@
 """Recognise what a motion does from its joints alone, to prove captions true and to judge generated motion.
 
-`measure` recognises the action by a cascade of physical signs (who flies, who travels, who turns, who sinks,
-whose foot or hand leaves its place) and then reads direction, side, count and speed. `agrees` compares with a
-truth record, reading each attribute as the *claimed* action defines it, so one wrong action does not hide a
-right limb. `find_mismatch` compares with requests: truth records that state only what was asked for.
+`agrees` recognises the action by a cascade of physical signs (who flies, who travels, who turns, who sinks,
+whose foot or hand leaves its place) and compares with a truth record, reading each attribute as the *claimed*
+action defines it, so one wrong action does not hide a right limb. `find_mismatch` compares with requests:
+truth records that state only what was asked for.
 
 Thresholds were set between the measured values of the synthetic source's clips (`datasets/synth`), of which
 99 % are recognised in every attribute (`tests/datasets/synth/test_synth.py`).
@@ -12,7 +12,6 @@ Thresholds were set between the measured values of the synthetic source's clips 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,62 +31,15 @@ LYING = 0.62
 """Metres that the root falls of somebody who lies down, at least."""
 ASIDE = 0.22
 """Lean (radians) to a side from which somebody stretches there."""
-STILL = 0.5
-"""Metres per second below which every joint is of somebody who stands still."""
 UPRIGHT = 0.055
 """Change of lean to the side (radians) below which somebody stands upright all the time; twice forward."""
 _NOUNS = {"lie": "lying down", "sit": "sitting"}
 _ATTRIBUTES = ("direction", "side", "count", "speed", "bpm")
 
 
-@dataclass(frozen=True)
-class Measured:
-    """The action of a motion and its attributes; those that the action does not have are None."""
-
-    action: str
-    direction: str | None
-    side: str | None
-    count: int | None
-    speed: str | None
-    bpm: float | None
-    left_hand: str | None
-    right_hand: str | None
-    heading_change: float
-    """Net turn in radians, positive to the left."""
-    travel: float
-    """Metres along the heading, negative backwards."""
-    pace: float
-    """Typical speed of travel, metres per second."""
-    jump_height: float
-    """Rise of the root above standing, metres."""
-    squat_depth: float
-    """Fall of the root below standing, metres."""
-
-
-def measure(joints: NDArray[np.floating], fps: float) -> Measured:
-    """Return the action of joints [T, 22 or 52, 3] (metres, Y up) and its attributes."""
-    signals = signals_of(joints, fps)
-    action = _action(signals)
-    if action != "dance" and _in_turn(joints, signals):
-        action = "then"
-    found = _attributes(signals, action)
-    hands = [hand_shape(joints, side, fps) if joints.shape[1] >= 52 else None for side in (0, 1)]
-    return Measured(
-        action=action,
-        **{name: found.get(name) for name in _ATTRIBUTES},
-        left_hand=hands[0],
-        right_hand=hands[1],
-        heading_change=_turned(signals),
-        travel=float(signals.travel[-1]),
-        pace=_pace(signals),
-        jump_height=float(max(-signals.drop.min(), 0.0)),
-        squat_depth=float(max(signals.drop.max(), 0.0)),
-    )
-
-
-def described(joints: NDArray[np.floating], fps: float, action: str) -> Record:
-    """Return direction, side, count and speed of joints [T, N >= 22, 3], as `action` defines them."""
-    return _attributes(signals_of(joints, fps), action)
+def action_of(joints: NDArray[np.floating], fps: float) -> str:
+    """Return the action that joints [T, N >= 22, 3] (metres, Y up) show, taken as a single one."""
+    return _action(signals_of(joints, fps))
 
 
 def agrees(
@@ -150,7 +102,7 @@ def find_mismatch(requests: Sequence[Record], joints: NDArray[np.floating], fps:
         return f"the motion shows no {' nor '.join(wanted)}"
     if len(actions_of(shown[0])) > 1:
         return None  # which part of two shows a side or a count is not known
-    seen = described(joints, fps, shown[0]["action"])
+    seen = _attributes(signals_of(joints, fps), shown[0]["action"])
     for name, wanted in shown[0].items():
         if name != "action" and seen.get(name) != wanted:
             return f"the {name} is {seen.get(name) or 'another'}, not {wanted}"
@@ -214,23 +166,6 @@ def _action(s: Signals) -> str:
     if s.trunk.max() > 0.5:
         return "bow"
     return _arm_action(s)
-
-
-def _in_turn(joints: NDArray[np.floating], s: Signals) -> bool:
-    """Whether somebody stands still, arms down, between two different actions."""
-    from scipy.signal import find_peaks
-
-    speed = np.linalg.norm(np.gradient(s.joints[:, :22], 1 / s.fps, axis=0), axis=-1).max(1)
-    rests = (s.wrists[:, :, 1].max(0) < -0.75) & (s.drop < 0.08) & (s.balls.max(0) < 0.08) & (speed < STILL)
-    for cut in find_peaks(-speed)[0]:
-        if not rests[cut] or min(cut, len(speed) - cut) < 0.9 * s.fps:
-            continue
-        halves = slice(cut), slice(cut, None)
-        if all(speed[half].max() > 1.2 for half in halves):
-            first, second = (_action(signals_of(joints[half], s.fps)) for half in halves)
-            if first != second:
-                return True
-    return False
 
 
 def _arm_action(s: Signals) -> str:

@@ -100,14 +100,6 @@ def canonicalize(joints: NDArray[Float]) -> NDArray[Float]:
     return out.astype(kind, copy=False)
 
 
-def turn(joints: NDArray[Float], angle: float) -> NDArray[Float]:
-    """Turn points [..., 3] left about the Y axis by `angle` radians."""
-    out = np.array(joints, dtype=np.result_type(joints, np.float32))
-    plane = ground(out) * np.exp(1j * angle)
-    out[..., 2], out[..., 0] = plane.real, plane.imag
-    return out
-
-
 def mirror(joints: NDArray[Float], skeleton: Skeleton) -> NDArray[Float]:
     """Mirror image of joints [..., N, 3]: left and right swapped, x negated."""
     skeleton.require_joints(joints)

@@ -20,7 +20,6 @@ from motionloom.datasets.motion.canonical import (
     resample,
     resample_quaternions,
     retarget,
-    turn,
 )
 from motionloom.datasets.motion.features.smpl75 import fit_smpl75, joints24_of
 from motionloom.datasets.motion.kinematics import forward_kinematics
@@ -29,6 +28,11 @@ from motionloom.datasets.schema import UserError
 
 FPS = 20.0
 BODY = Skeleton.named("smpl22")
+
+
+def turn(joints: NDArray, angle: float) -> NDArray:
+    """Points turned left about the Y axis."""
+    return joints @ Rotation.from_rotvec([0, angle, 0]).as_matrix().T
 
 
 def walk(turned: float, seconds: float = 5.0, fps: float = FPS, skeleton: Skeleton = BODY) -> NDArray:

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.motion.canonical import canonicalize, ground, retarget, turn
+from motionloom.datasets.motion.canonical import canonicalize, ground, retarget
 from motionloom.datasets.motion.features.codec import decode, encode, face_of
 from motionloom.datasets.motion.features.h3d import encode_h3d, uniform_joints
 from motionloom.datasets.motion.features.joints import JointFlow, joints_of, local_joints_of
@@ -20,6 +21,11 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, make_sample
 
 BODY = MotionLayout.named("body133")
+
+
+def turn(joints: NDArray, angle: float) -> NDArray:
+    """Points turned left about the Y axis."""
+    return joints @ Rotation.from_rotvec([0, angle, 0]).as_matrix().T
 
 
 def clip(layout: MotionLayout, frames: int, turns: float, seed: int = 0) -> NDArray[np.float64]:

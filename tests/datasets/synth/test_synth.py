@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from motionloom.datasets.actions.measure import agrees, measure
+from motionloom.datasets.actions.measure import action_of, agrees
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reader import ShardDataset
@@ -263,7 +263,7 @@ def test_wrong_options_are_named(options: dict[str, object], words: str) -> None
 
 def test_measure_refuses_what_it_cannot_read() -> None:
     with pytest.raises(UserError, match="joints of shape"):
-        measure(np.zeros((10, 5, 3)), FPS)
+        action_of(np.zeros((10, 5, 3)), FPS)
     with pytest.raises(UserError, match="no 'action'"):
         agrees({}, np.zeros((10, 22, 3)), None, FPS)
 
