@@ -36,19 +36,6 @@ def test_place_and_heading_of_the_start_do_not_count(golden: dict[str, torch.Ten
     assert max(abs(v) for v in (*found.ape.values(), *found.ave.values())) < 1e-9
 
 
-def test_by_hand() -> None:
-    """A body that shifts by 1 m a frame to its side, beside one that stands: its path is wrong by 0, 1 and
-    2 m, the variance by 1 m²; the pose, seen from the root, is right."""
-    still = torch.zeros(3, 22, 3, dtype=torch.float64)
-    still[:, [1, 16], 0], still[:, [2, 17], 0] = 0.1, -0.1
-    still[:, :, 1] = torch.linspace(1.0, 0.0, 22)
-    moving = still.clone()
-    moving[..., 0] += torch.arange(3.0)[:, None]
-    found = position_errors(moving, still)
-    assert [found.ape[kind] for kind in KINDS] == pytest.approx([1.0, 0.0, 1.0, 1.0])
-    assert [found.ave[kind] for kind in KINDS] == pytest.approx([1.0, 0.0, 1.0, 1.0])
-
-
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(ValueError, match="one shape"):
         position_errors(torch.zeros(4, 22, 3), torch.zeros(5, 22, 3))

@@ -149,18 +149,6 @@ def test_a_report_fits(visit: Any, folder: Path, width: int, height: int) -> Non
     assert any(wide for _, wide, _ in boxes) and any("down" in said for _, _, said in boxes)
 
 
-def test_a_hint_follows_the_scrolling(visit: Any, until: Any, folder: Path) -> None:
-    page = visit(folder / "report.html", width=390, height=844)
-    said = "getComputedStyle(document.querySelector('.scroll'), '::after').content"
-    assert "scroll sideways for more" in page.evaluate(said)
-    page.evaluate("() => { document.querySelector('.scroll').scrollLeft = 1e6; }")
-    until(page, f"{said}.includes('scroll back')")
-    page.evaluate("() => { document.querySelector('.mlv-scroll').scrollTop = 1e6; }")
-    until(page, "document.querySelector('.mlv-more').textContent.includes('more above')")
-    page = visit(folder / "one.html", width=1280, height=900)
-    assert page.locator(".mlv-more:visible").count() == 0
-
-
 def test_print_has_every_figure_and_no_controls(visit: Any, folder: Path) -> None:
     drawn = """(index) => {
         const drawn = document.querySelectorAll("canvas")[index], {width, height} = drawn;
