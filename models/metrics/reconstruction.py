@@ -15,13 +15,18 @@ from motionloom.models.layers.transformer import length_mask
 
 
 class JointErrors(NamedTuple):
-    """Sums over frames; `means()` divides."""
+    """Sums over frames, so that batches can be added up; `means()` divides."""
 
     mpjpe: Tensor
     pa_mpjpe: Tensor
     accel: Tensor
     frames: Tensor
     accel_frames: Tensor
+
+    def __add__(self, other: object) -> JointErrors:  # type: ignore[override]
+        if not isinstance(other, JointErrors):
+            return NotImplemented
+        return JointErrors(*(a + b for a, b in zip(self, other, strict=True)))
 
     def means(self) -> dict[str, float]:
         """MPJPE and PA-MPJPE per frame (mm), ACCEL per inner frame (mm / frame^2)."""
