@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.schedule import Sampler
 
@@ -54,9 +55,9 @@ class SamplingConfig(Config):
         """Guidance of a motion, by the modalities that it is conditioned on."""
         return next((self.guidance[name] for name in self.guidance if present.get(name)), self.cfg_scale)
 
-    @property
-    def face_guidance(self) -> float:
-        return self.cfg_scale if self.face_cfg_scale is None else self.face_cfg_scale
+    def guidance_of(self, part: Part) -> float:
+        """Guidance of a generator of that part."""
+        return self.face_cfg_scale if part == "face" and self.face_cfg_scale is not None else self.cfg_scale
 
 
 class StreamConfig(Config):

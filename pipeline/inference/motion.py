@@ -93,27 +93,11 @@ class EditedMotion(GeneratedMotion):
 
 
 @dataclass(frozen=True)
-class MotionChunk:
-    """Some frames of a stream, final, all driven by one caption."""
+class MotionChunk(GeneratedMotion):
+    """Some frames of a stream, final, all driven by one caption; they go on where the chunk before ends."""
 
-    start: int
+    start: int = field(kw_only=True)
     """Number of its first frame, counted from the stream's."""
-    prompt: Prompt
-    features: NDArray[np.float32]
-    """Body-hand features [T, D]."""
-    joints: NDArray[np.float64]
-    """Positions [T, N, 3] in metres; they go on where the chunk before ends."""
-    face: NDArray[np.float32] | None
-    """Expression [T, 50], or None where the model makes no face."""
-    layout: MotionLayout
-
-    @property
-    def caption(self) -> str:
-        return self.prompt.text
-
-    @property
-    def fps(self) -> float:
-        return self.layout.fps
 
 
 def joined(chunks: Sequence[MotionChunk], seed: int | None = None) -> GeneratedMotion:

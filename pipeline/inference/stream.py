@@ -134,7 +134,7 @@ class MotionStream(Iterator[MotionChunk]):
         features, with_it = split_columns(body, self._body.generator, self.layout)
         face = with_it if self._face is None else self._face.take(count)
         chunk = MotionChunk(
-            self._given, self._bounds[0][1], features, self._joints(features), face, self.layout
+            self._bounds[0][1], features, self._joints(features), face, self.layout, start=self._given
         )
         self._given += count
         return chunk

@@ -179,10 +179,8 @@ class Site:
         """Keep the sound file that the body is, under a name for later requests."""
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
-        # Decoded in another thread, so that the server answers meanwhile; the body is held until then.
-        async with self._uploads:
-            most = _bytes(self.config.max_sound_mb)
-            data = await read_body(http, "the sound", most, self.config.patience)
+        # Decoded in another thread, so that the server answers meanwhile.
+        data = await self._upload(http, "the sound", self.config.max_sound_mb)
         name, sound = await asyncio.to_thread(self.sounds.add, data)
         return JSONResponse({"sound": name, "seconds": round(sound.seconds, 3)})
 
@@ -190,9 +188,12 @@ class Site:
         """Keep the motion file that the body is, under a name for later requests."""
         if (why := why_not(self.model)) is not None:
             raise HTTPException(400, why)
-        async with self._uploads:
-            data = await read_body(http, CLIP, _bytes(self.config.max_clip_mb), self.config.patience)
+        data = await self._upload(http, CLIP, self.config.max_clip_mb)
         return JSONResponse(await asyncio.to_thread(self.clips.add, data))
+
+    async def _upload(self, http: Request, what: str, most: float) -> bytes:
+        async with self._uploads:
+            return await read_body(http, what, _bytes(most), self.config.patience)
 
     async def _read_request(self, http: Request, kind: type[RequestT]) -> tuple[RequestT, Sound | None]:
         media = http.headers.get("content-type", "").split(";")[0].strip().lower()

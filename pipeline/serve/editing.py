@@ -63,14 +63,8 @@ class ChangeRequest(Config):
         if (why := why_not(model)) is not None:
             raise UserError(why)
         task = self.task
-        length = max(map(len, (task.caption, task.face, *(said.text for said in task.words))))
-        if length > limits.max_caption:
-            raise UserError(f"a caption has {length} letters; this server takes at most {limits.max_caption}")
-        seconds = task.lead + (task.seconds or 0.0)
-        if seconds > limits.max_seconds:
-            raise UserError(
-                f"{seconds:g} s were asked for; this server makes at most {limits.max_seconds:g} s"
-            )
+        texts = [task.caption, task.face, *(said.text for said in task.words)]
+        limits.require_small(texts, task.lead + (task.seconds or 0.0))
         if isinstance(self.clip, MotionRequest):
             self.clip.require_within(limits, model)
 

@@ -7,7 +7,7 @@ import json
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Generic, TypeVar
@@ -60,6 +60,14 @@ class ServeConfig(Config):
     connections: int = Field(256, ge=1)
     """Connections at a time; one more is answered 503."""
 
+    def require_small(self, texts: Iterable[str], seconds: float) -> None:
+        """Refuse captions and a motion that are longer than allowed."""
+        length = max(map(len, texts))
+        if length > self.max_caption:
+            raise UserError(f"a caption has {length} letters; this server takes at most {self.max_caption}")
+        if seconds > self.max_seconds:
+            raise UserError(f"{seconds:g} s were asked for; this server makes at most {self.max_seconds:g} s")
+
 
 def known_answer(name: str) -> str:
     """The name of a format that a server gives; ValueError for others."""
@@ -99,16 +107,7 @@ class MotionRequest(Config):
 
     def require_within(self, limits: ServeConfig, model: MotionModel) -> None:
         """Refuse what is too much; `UserError` in one sentence."""
-        for name in ("caption", "face"):
-            length = len(getattr(self, name))
-            if length > limits.max_caption:
-                raise UserError(
-                    f"{name} has {length} letters; this server takes at most {limits.max_caption}"
-                )
-        if self.seconds is not None and self.seconds > limits.max_seconds:
-            raise UserError(
-                f"{self.seconds:g} s were asked for; this server makes at most {limits.max_seconds:g} s"
-            )
+        limits.require_small([self.caption, self.face], self.seconds or 0.0)
         if not self.caption.strip() and self.sound is None:
             raise UserError("caption is empty; say what the person does")
         if self.face and not model.bundle.faces:

@@ -69,7 +69,7 @@ class DiffusionMotion(DenoisedMotion):
         return sample_motions(
             self.net, request.pooled_text(self.who).to(device_of(self.net)), frames, seeds=request.seeds,
             sampler=sampler, steps=steps,
-            guidance=self._guidance(sampling),
+            guidance=sampling.guidance_of(self.part),
         )  # fmt: skip
 
     @property
@@ -86,7 +86,7 @@ class DiffusionMotion(DenoisedMotion):
         """Fill in what an edit leaves free (`Editor`)."""
         stats: FeatureStats = self.given["stats"]
         layout, columns, device = self.layout, self.layout.part(self.part), device_of(self.net)
-        guidance = self._guidance(sampling)
+        guidance = sampling.guidance_of(self.part)
         if guidance != 1 and self.net.config.condition_dropout == 0:
             raise UserError(
                 "guidance needs a diffusion model trained with condition_dropout > 0; set cfg_scale to 1"
@@ -127,6 +127,3 @@ class DiffusionMotion(DenoisedMotion):
         if text is None or text.pooled is None:
             return CaptionSpan(torch.zeros(self.net.text_dim, device=device), False, shares)
         return CaptionSpan(text.pooled[0].float().to(device), True, shares)
-
-    def _guidance(self, sampling: SamplingConfig) -> float:
-        return sampling.face_guidance if self.part == "face" else sampling.cfg_scale

@@ -121,7 +121,7 @@ class GptGenerator(OfTokens):
             temperature=sampling.temperature,
             top_k=sampling.top_k or None,
             top_p=sampling.top_p,
-            cfg_scale=sampling.face_guidance if self.face else sampling.cfg_scale,
+            cfg_scale=sampling.guidance_of(self.part),
             seed=list(seeds),
         )
         motions = self.tokenizer.decode(codes.codes, codes.groups.tolist())
@@ -135,7 +135,7 @@ class GptGenerator(OfTokens):
             self.gpt.net,
             how=Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
             context=streaming.context_frames // self.unit_frames,
-            cfg_scale=sampling.face_guidance if self.face else sampling.cfg_scale,
+            cfg_scale=sampling.guidance_of(self.part),
             seed=seed,
         )
         return GptFlow(tokens, lambda conditions: self.prior(GenerationRequest(conditions, None, [seed])))
