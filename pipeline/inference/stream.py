@@ -84,7 +84,9 @@ class MotionStream(Iterator[MotionChunk]):
         self._notice, self._noticed = notice, set[str]()
         self._weights = weight_bytes(bundle.stages)
         self._body = _Maker(bundle, bundle.main, seeds[0], sampling, config)
-        face = _streaming_face(bundle, sampling)
+        # The face generator that was asked for, or the first that can stream.
+        able = (stage for stage in bundle.faces.values() if bundle.of(stage).capabilities.streaming)
+        face = next(able, None) if sampling.face_model is None else bundle.choose_face(sampling.face_model)
         self._face = None if face is None else _Maker(bundle, face, seeds[1], sampling, config)
         self._idle = IdleBlend(bundle.layout, self._body.generator.part)
         self._joints = JointFlow(bundle.layout)
@@ -248,14 +250,6 @@ class _Maker:
     def _add(self, made: Tensor | None) -> None:
         if made is not None:
             self._frames = np.concatenate([self._frames, np.asarray(self._units(made), np.float32)])
-
-
-def _streaming_face(bundle: Bundle, sampling: SamplingConfig) -> CompletedStage | None:
-    """The face generator that was asked for, or the first that can stream; None where there is none."""
-    if sampling.face_model is not None:
-        return bundle.choose_face(sampling.face_model)
-    found = (stage for stage in bundle.faces.values() if bundle.of(stage).capabilities.streaming)
-    return next(found, None)
 
 
 Captions = str | Iterable[str | tuple[str, float]] | Script | None

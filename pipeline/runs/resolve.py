@@ -299,7 +299,12 @@ class StartingModel:
         stages = {"gpt": gpt, "tokenizer": tokenizer, "stats": tokenizer.inputs["stats"]}
         if "tma" in gpt.inputs:
             stages["tma"] = gpt.inputs["tma"]
-        faces = tuple(stage for stage in generators if stage not in gpts and _of_face(stage))
+        # Whose config says so: a GPT or a diffusion model of the face, a VAE of that part.
+        faces = tuple(
+            stage
+            for stage in generators
+            if getattr(stage.config, "face", False) or getattr(stage.config, "part", "") == "face"
+        )
         return StartingModel(name, stages, faces, load_facts(tokenizer.folder).layout.layout())
 
     def entry(self, key: str, entry: Tree, missing: Mapping[str, CompletedStage], where: str) -> Tree:
@@ -355,7 +360,3 @@ def _generators(name: str, where: str) -> list[CompletedStage]:
     if not folder.exists():
         raise UserError(f"{where}: {no_such_model(name)}")
     raise UserError(f"{where}: neither an export nor a run; name the folder of one")
-
-
-def _of_face(stage: CompletedStage) -> bool:
-    return bool(getattr(stage.config, "face", False)) or getattr(stage.config, "part", "") == "face"

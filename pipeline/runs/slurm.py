@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import shlex
 import shutil
 import subprocess
@@ -200,7 +201,9 @@ def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> lis
     if shutil.which("sbatch") is None:
         raise UserError("no sbatch here: start this where jobs are submitted, or look with --dry-run")
     require_own(Path(plan.out))
-    folder = _new_folder(Path(plan.out) / LOG_FOLDER)
+    # A folder of its own for every submission.
+    folder = Path(plan.out) / LOG_FOLDER / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
+    folder.mkdir(parents=True)
     if plan.shipped is None:
         write_text(folder / RECIPE_FILE, plan.recipe.to_yaml())
     scripts = slurm_scripts(plan, options, folder, Path.cwd())
@@ -222,19 +225,6 @@ def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> lis
         markup=False,
     )
     return ids
-
-
-def _new_folder(parent: Path) -> Path:
-    """A folder of its own for every submission."""
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    for number in range(1000):
-        folder = parent / (f"{stamp}-{number}" if number else stamp)
-        try:
-            folder.mkdir(parents=True)
-            return folder
-        except FileExistsError:
-            continue
-    raise UserError(f"{parent}: too many submissions in one second")
 
 
 def _text(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path) -> str:

@@ -27,8 +27,7 @@ def compare_with_paper(
     Nothing is measured and no model is loaded: the figures are those of the runs' finished evaluations.
 
     Args:
-        table: Its name, such as `humantomato/7`; a paper's, such as `ude`, for all of its tables; or a YAML
-            file of the same form.
+        table: Its name, such as `humantomato/7`, or a paper's, such as `ude`, for all of its tables.
         runs: Run folders; without any, the paper's numbers stand alone.
         out: File (.md) to write in place of printing.
         console: Where to print; standard output by default.
@@ -68,9 +67,7 @@ def shipped_tables() -> dict[str, Path]:
 
 
 def paper_table(name: str) -> PaperTable:
-    """A table by its name, such as `humantomato/7`, or from a file of one's own, such as `mine.yaml`."""
-    if name.endswith((".yaml", ".yml")):
-        return PaperTable.parse(read_yaml(Path(name)), name)
+    """A table by its name, such as `humantomato/7`."""
     shipped = shipped_tables()
     if name not in shipped:
         raise UserError(f"--table {name}: no such table{nearest(name.lower(), list(shipped))}")

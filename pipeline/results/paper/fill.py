@@ -157,13 +157,11 @@ class _Filling:
         self, column: Column, evaluation: Evaluation, values: Mapping[str, str], row: str = MODEL
     ) -> Figure | None:
         """The figure of a column in an evaluation; None where it measures another thing or other data."""
-        if column.figure is None or evaluation.measure != column.of or not self._about(column, evaluation):
+        if column.figure is None or evaluation.measure != column.of:
+            return None
+        if column.data and data_set_of(evaluation, self.table.data) != column.data:
             return None
         return evaluation.figure(column.figure.format(**values), row)
-
-    def _about(self, column: Column, evaluation: Evaluation) -> bool:
-        """Whether an evaluation is of the column's data set."""
-        return not column.data or data_set_of(evaluation, self.table.data) == column.data
 
     def _settings(self, run: Path, model: StageRecord, paper: Mapping[str, object]) -> None:
         """Note where a model of ours has another setting than the paper's."""

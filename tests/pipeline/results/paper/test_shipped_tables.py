@@ -10,7 +10,7 @@ import pytest
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.results.paper.compare import paper_table, shipped_tables
 from motionloom.pipeline.results.paper.fill import fill
-from motionloom.pipeline.results.paper.schema import PaperTable
+from motionloom.pipeline.results.paper.schema import Printed
 
 NAMES = list(shipped_tables())
 
@@ -53,34 +53,30 @@ def test_an_unknown_table_names_the_nearest() -> None:
         paper_table("humantomatoes/7")
     with pytest.raises(UserError, match="valid names: humantomato/1, "):
         paper_table("x")
-    with pytest.raises(UserError, match=r"nowhere\.yaml: "):
-        paper_table("nowhere.yaml")
 
 
-BASE = {
-    "title": "t",
-    "section": "1",
-    "measured": {"data": "d"},
-    "columns": [{"name": "a", "figure": "x"}],
-    "rows": [{"method": "m", "paper": "1.50", "ours": {"tokenizer": {"kind": "vq"}}}],
-}
-ROW = BASE["rows"][0]
-WRONG = {
-    "a word among the numbers": ({"rows": [{**ROW, "paper": "about 3"}]}, "'about 3' is no number"),
-    "too many numbers": ({"rows": [{**ROW, "paper": "1 | 2"}]}, "row 'm' has 2 numbers for 1 columns"),
-    "neither figure nor why": ({"columns": [{"name": "a"}]}, "give either figure"),
-    "no row of three": ({"rows": [{"method": "m", "paper": "1"}]}, "give one of ours"),
-    "conditions on nothing": ({"rows": [{**ROW, "ours": {"setting": {"a": 1}}}]}, "needs a condition"),
-    "unknown role": ({"rows": [{**ROW, "ours": {"tokeniser": {"kind": "vq"}}}]}, "did you mean 'tokenizer'"),
-    "columns of one name": ({"columns": BASE["columns"] * 2}, "two columns are called 'a'"),
-    "unknown data set": ({"columns": [{"name": "a", "figure": "x", "data": "GRAB"}]}, "no data set 'GRAB'"),
-}
+@pytest.mark.parametrize("name", NAMES)
+def test_columns_and_rows_say_what_is_ours(name: str) -> None:
+    table = paper_table(name)
+    titles = [column.title for column in table.columns]
+    assert len(set(titles)) == len(titles)
+    assert all((column.figure is None) == bool(column.why) for column in table.columns)
+    assert all(column.printed or column.figure for column in table.columns)
+    assert {column.data for column in table.columns} - {""} <= {one.name for one in table.data}
+    for row in table.rows:
+        assert len(row.printed()) == sum(column.printed for column in table.columns)
+        assert row.recorded + (row.ours is not None) + bool(row.why) == 1, "a model, recorded, or why none"
+        assert row.ours is None or any(row.ours.conditions().values())
 
 
-@pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_file_is_refused(case: str) -> None:
-    change, message = WRONG[case]
-    with pytest.raises(UserError, match=re.escape(message)):
-        PaperTable.parse({**BASE, **change}, "table.yaml")
-    (cell,) = PaperTable.parse(BASE, "table.yaml").rows[0].printed()
-    assert cell is not None and (cell.text, cell.mean, cell.decimals) == ("1.50", 1.5, 2)
+def test_a_number_as_it_is_printed() -> None:
+    cell = Printed.of(" 1.50 ± .2 ")
+    assert cell is not None and (cell.text, cell.mean, cell.spread, cell.decimals) == (
+        "1.50 ± .2",
+        1.5,
+        0.2,
+        2,
+    )
+    assert Printed.of("-") is None
+    with pytest.raises(ValueError, match="'about 3' is no number"):
+        Printed.of("about 3")

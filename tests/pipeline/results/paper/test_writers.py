@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from motionloom.pipeline import compare_with_paper
 from motionloom.pipeline.results.paper.compare import paper_table, shipped_tables
 from motionloom.pipeline.results.paper.fill import fill
 from motionloom.pipeline.results.paper.filled import Difference, FilledRow, FilledTable
@@ -102,21 +101,6 @@ def test_the_list_of_tables(call: Call) -> None:
     assert re.findall(r"(?:humantomato|ude)/\d+", shown.out) == list(shipped_tables())
 
 
-def test_a_table_of_ones_own(baselines: Callable[..., Path], tmp_path: Path) -> None:
-    path = tmp_path / "mine.yaml"
-    path.write_text(
-        "title: mine\nsection: '1'\nmeasured: {data: D}\n"
-        "columns: [{name: pose, unit: mm, better: lower, figure: reconstruction.mpjpe}]\n"
-        "rows: [{method: any VQ, paper: '1.5', ours: {tokenizer: {kind: [vq, rvq]}}}]\n"
-    )
-    (filled,) = compare_with_paper(str(path), [baselines()])
-    assert [(row.label, row.cells[0] and row.cells[0].text) for row in filled.rows[:3]] == [
-        ("any VQ", "1.5"),
-        ("bl vq", "140.0"),
-        ("bl rvq", "110.0"),
-    ]
-
-
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -124,7 +108,6 @@ def test_a_table_of_ones_own(baselines: Callable[..., Path], tmp_path: Path) -> 
         (["--table", "ude/1", "nowhere"], "nowhere: no such folder"),
         (["--table", "ude/1", "--clips", "4"], "--clips, --repeats and --device measure anew"),
         (["--table", "ude/1", "-o", "x.csv"], "x.csv: a table is written as Markdown"),
-        (["--table", "gone.yaml"], "gone.yaml: cannot be read"),
         (["--table", "list", "runs"], "--table list names the tables alone"),
         (["runs", "-o", "x.md"], "--out is of a table"),
         (["one", "two"], "2 run folders to evaluate; name one"),
