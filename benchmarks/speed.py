@@ -41,6 +41,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.script import Script, ScriptSegment
 
 COLUMNS = (Column("ours", "ours"), Column("the usual way", "usual"), Column("times faster", "ratio", 1))
 CAPTIONS = ("a person walks forward", "a person waves with the left hand", "a person squats")
@@ -218,8 +219,9 @@ def streaming(args: Namespace) -> Record:
     next(model.stream(CAPTIONS[0]))  # loads the text encoder
     first = cpu_seconds({"first": lambda: next(model.stream(CAPTIONS[1], seed=1))})["first"]
     begin, frames, early, largest = process_seconds(), 0, 0.0, 0.0
-    captions = ((caption, 10.0) for caption in itertools.cycle(CAPTIONS))
-    for chunk in model.stream(captions, seed=1):
+    captions = itertools.islice(itertools.cycle(CAPTIONS), round(6 * args.minutes) + 1)
+    segments = [ScriptSegment(text=caption, seconds=10.0) for caption in captions]
+    for chunk in model.stream(Script(segments=segments), seed=1):
         frames += len(chunk.joints)
         if frames >= 60 * model.fps:
             pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])

@@ -263,8 +263,12 @@ def _stream(asked: _Request, out: Path | None) -> None:
     segments = None if asked.script is None else Script.read(asked.script)
     sound = read_music(songs[0]) if songs else None
     bundle = MotionModel(asked.model, asked.device).bundle
-    said = texts if len(texts) > 1 else texts[0] if texts else None
-    driver = segments or segments_of(bundle, said, face=face, sound=sound, seconds=asked.seconds)
+    if len(texts) > 1:
+        said = [{"text": text, "seconds": asked.seconds} for text in texts]
+        segments = Script.parse({"segments": said}, "captions").open()
+    driver = segments or segments_of(
+        bundle, texts[0] if texts else None, face=face, sound=sound, seconds=asked.seconds
+    )
     stream = MotionStream(
         bundle, driver, seed=asked.seed, sampling=asked.sampling, notice=partial(print_note, aside)
     )

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -142,7 +142,7 @@ class MotionModel(
 
     def stream(
         self,
-        captions: str | Iterable[str | tuple[str, float]] | Script | None = None,
+        caption: str | Script | None = None,
         *,
         face: str = "",
         sound: Sound | None = None,
@@ -154,13 +154,11 @@ class MotionModel(
         """One motion as an iterator of chunks, each there as soon as its frames are final.
 
         Args:
-            captions: One caption; or several, one after another, each as (caption, seconds) or all `seconds`
-                long, which may be made while the stream runs; or a `Script`. `say` of the stream changes the
-                caption on the way.
-            face: What the face does, while one caption lasts.
-            sound: Music to move to, beside one caption or alone.
-            seconds: Length of one caption, or of each that does not come with its own. Without it one caption
-                goes on until `say` or `close`, and music to its end.
+            caption: What the person does, or a `Script` of several segments. `say` of the stream changes it
+                on the way.
+            face: What the face does.
+            sound: Music to move to, beside a caption or alone.
+            seconds: Length. Without it a caption goes on until `say` or `close`, and music to its end.
             seed: Equal arguments give equal motions. The frames of one caption are those of `generate` with
                 the same seed and length, as far as the network's block goes.
             sampling: As of `generate`.
@@ -169,7 +167,7 @@ class MotionModel(
         As `generate`, it warns of a caption that the model does not know, when its turn has come.
         """
         config = StreamConfig.parse({} if streaming is None else streaming, "streaming")
-        segments = segments_of(self.bundle, captions, face=face, sound=sound, seconds=seconds)
+        segments = segments_of(self.bundle, caption, face=face, sound=sound, seconds=seconds)
         drawn = SamplingConfig.of(sampling)
         return MotionStream(self.bundle, segments, seed=seed, sampling=drawn, config=config, notice=_warn)
 

@@ -30,7 +30,13 @@ from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.idle_pose import IdleBlend
 from motionloom.pipeline.inference.motion import MotionChunk
-from motionloom.pipeline.inference.requests import require_driven, require_seed, split_columns, weight_bytes
+from motionloom.pipeline.inference.requests import (
+    require_driven,
+    require_seed,
+    require_words,
+    split_columns,
+    weight_bytes,
+)
 from motionloom.pipeline.inference.script import DrivenSegment, Script, segment_frames
 from motionloom.pipeline.launch.hardware import threads_for
 from motionloom.pipeline.store.known_captions import Unknown
@@ -105,8 +111,7 @@ class MotionStream(Iterator[MotionChunk]):
         It lasts `seconds`, then the next segment comes; without them, until `say`. Frames that are drawn
         already still come: those that the decoder looks ahead, and of a UDE at most `hop_frames` more.
         """
-        if not caption.strip():
-            raise UserError("the caption is empty; say what the person does")
+        require_words([caption])
         length = math.inf if seconds is None else seconds
         segment = DrivenSegment(Prompt(caption, face), length, caption)
         self._check(segment, self._number)
@@ -252,53 +257,29 @@ class _Maker:
             self._frames = np.concatenate([self._frames, np.asarray(self._units(made), np.float32)])
 
 
-Captions = str | Iterable[str | tuple[str, float]] | Script | None
-
-
 def segments_of(
     bundle: Bundle,
-    captions: Captions,
+    caption: str | Script | None,
     *,
     face: str = "",
     sound: Sound | None = None,
     seconds: float | None = None,
-) -> Iterator[DrivenSegment]:
-    """Yield the segments that drive the motion of `MotionModel.stream`'s arguments, one after another."""
-    if seconds is not None and not 0 < seconds < math.inf:
-        raise UserError(f"{seconds:g} s: give a length above 0, or none for a stream without an end")
-    if isinstance(captions, Script):
+) -> list[DrivenSegment]:
+    """The segments that drive the motion of `MotionModel.stream`'s arguments, one after another."""
+    if isinstance(caption, Script):
         if face or sound is not None or seconds is not None:
             raise UserError("a script says everything: leave face, sound and seconds out")
-        opened = captions.open()
-        require_driven(bundle.generator, [segment.prompt for segment in opened])
-        return iter(opened)
-    if captions is None or isinstance(captions, str):
+        segments = caption.open()
+    else:
+        if seconds is not None and not 0 < seconds < math.inf:
+            raise UserError(f"{seconds:g} s: give a length above 0, or none for a stream without an end")
+        if caption is not None or sound is None:
+            require_words([caption or ""])
         if face and bundle.choose_face(None) is None:
             raise UserError("this model makes no face: leave the face caption out")
-        prompt = Prompt(captions or "", face, sound)
-        if captions is not None or sound is None:
-            _require_text(captions or "", 0)
-        require_driven(bundle.generator, [prompt])
+        prompt = Prompt(caption or "", face, sound)
         longest = math.inf if sound is None else sound.seconds
         length = longest if seconds is None else min(seconds, longest)
-        return iter([DrivenSegment(prompt, length, prompt.text or "music")])
-    if face or sound is not None:
-        raise UserError("face and sound go with one caption; of several give a Script")
-    return _several(captions, seconds)
-
-
-def _several(captions: Iterable[str | tuple[str, float]], seconds: float | None) -> Iterator[DrivenSegment]:
-    for number, given in enumerate(captions):
-        text, length = (given, seconds) if isinstance(given, str) else given
-        _require_text(text, number)
-        if length is None:
-            raise UserError(
-                f"captions[{number}] ('{text}') says not how long it lasts; give (caption, seconds), or "
-                f"seconds for all"
-            )
-        yield DrivenSegment(Prompt(text), float(length), text)
-
-
-def _require_text(text: str, number: int) -> None:
-    if not isinstance(text, str) or not text.strip():
-        raise UserError(f"captions[{number}] is empty; say what the person does")
+        segments = [DrivenSegment(prompt, length, prompt.text or "music")]
+    require_driven(bundle.generator, [segment.prompt for segment in segments])
+    return segments

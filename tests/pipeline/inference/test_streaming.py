@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,11 @@ def ude(ude_run: Any) -> MotionModel:
     bundle = made.bundle
     bundle._generators[bundle.main.folder] = replace(bundle.generator, dmd=None)  # type: ignore[type-var]
     return made
+
+
+def two(*captions: tuple[str, float]) -> Script:
+    """Captions one after another."""
+    return Script(segments=[ScriptSegment(text=text, seconds=seconds) for text, seconds in captions])
 
 
 def whole(chunks: list[MotionChunk]) -> Any:
@@ -75,7 +80,7 @@ def test_one_caption_is_what_generate_makes(model: MotionModel, chunk_frames: in
 def test_frames_are_those_of_all_tokens_at_once(model: MotionModel, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the network's block and across captions: its own tokens, decoded in one piece."""
     tokenizer = model.bundle.generator.tokenizer  # type: ignore[attr-defined]
-    stream, drawn = model.stream([("a person walks", 14.0), ("a person sits", 3.0)], seed=2), []
+    stream, drawn = model.stream(two(("a person walks", 14.0), ("a person sits", 3.0)), seed=2), []
     draw = stream._body._flow.draw
     stream._body._flow.draw = lambda left: drawn.append(draw(left)) or drawn[-1]  # type: ignore[method-assign]
     made = whole(list(stream))
@@ -117,26 +122,12 @@ def test_it_goes_on_until_it_is_closed(model: MotionModel) -> None:
     assert stream._body._frames.nbytes < 100_000 and len(stream._bounds) == 1
 
 
-def test_captions_may_be_made_while_it_runs(model: MotionModel) -> None:
-    given: list[int] = []
-
-    def captions() -> Iterator[tuple[str, float]]:
-        for number in itertools.count():
-            given.append(number)
-            yield f"a person waves {number}", 1.0
-
-    chunks = list(itertools.islice(model.stream(captions()), 12))
-    assert chunks[-1].caption == f"a person waves {chunks[-1].start // 20}" and len(given) < 12
-
-
 @pytest.mark.parametrize(
     ("captions", "options", "words"),
     [
         ("", {}, "captions[0] is empty"),
-        (["a"], {}, "captions[0] ('a') says not how long it lasts"),
-        ([("a", 0.01)], {}, "the shortest this model makes is"),
-        ([("a", -1.0)], {}, "give a length above 0"),
-        (["a", "b"], {"face": "x"}, "face and sound go with one caption"),
+        (two(("a", 0.01), ("b", 1.0)), {}, "the shortest this model makes is"),
+        (two(("a", 1.0), ("b", 1.0)), {"face": "x"}, "a script says everything"),
         ("a", {"seconds": 0.0}, "above 0"),
         ("a", {"sound": Sound(np.full(100, 0.1, np.float32), 100)}, "conditioned on text only"),
         ("a", {"seed": -1}, "a seed is a whole number"),
@@ -186,7 +177,7 @@ def test_a_dance_without_an_end_of_its_own(ude: MotionModel) -> None:
 def test_windows_of_the_diffusion_decoder(ude_run: Any, ude: MotionModel) -> None:
     """Of the same tokens, in whatever pieces they come."""
     model = MotionModel.from_pretrained(ude_run.folder, device="cpu")
-    captions = [("a person walks", 5.0), ("a person waves", 2.0)]
+    captions = two(("a person walks", 5.0), ("a person waves", 2.0))
     made = [whole(list(model.stream(captions, seed=2, streaming={"hop_frames": hop}))) for hop in (4, 40)]
     assert len(made[0].joints) == 140
     np.testing.assert_array_equal(made[0].features, made[1].features)
@@ -215,7 +206,7 @@ def test_json_lines_of_the_command(
     assert head["fps"] == 20.0 and len(head["joint_names"]) == len(head["parents"]) == 52
     assert [frame["frame"] for frame in frames] == list(range(48))
     assert [frame["caption"] for frame in frames] == ["a person waves"] * 24 + ["a person walks"] * 24
-    made = whole(list(model.stream(["a person waves", "a person walks"], seconds=1.2, seed=3)))
+    made = whole(list(model.stream(two(("a person waves", 1.2), ("a person walks", 1.2)), seed=3)))
     np.testing.assert_allclose([frame["joints"] for frame in frames], made.joints, rtol=0, atol=1.1e-5)
     np.testing.assert_allclose([frame["face"] for frame in frames], made.face, rtol=0, atol=1.1e-5)
 

@@ -12,6 +12,7 @@ import pytest
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.script import Script, ScriptSegment
 from motionloom.pipeline.store.known_captions import (
     FALSE_ALARMS,
     KNOWN_FILES,
@@ -153,7 +154,9 @@ def test_a_stream_says_so_when_the_captions_turn_comes(small_run: Any, call: Any
     said = call("generate", small_run.folder, known, strange, known, strange, *options).err
     assert said.count("note: ") == 1 and f"note: '{strange}' is unlike" in said
     model = MotionModel.from_pretrained(small_run.folder, device="cpu")
-    stream = model.stream([(known, 0.8), (strange, 0.8), (known, 0.8)], seed=1)
+    stream = model.stream(
+        Script(segments=[ScriptSegment(text=text, seconds=0.8) for text in (known, strange, known)]), seed=1
+    )
     with pytest.warns(UserWarning, match="violin.*The nearest it knows") as warned:
         list(stream)
     assert len(warned) == 1 and warned[0].filename == __file__
