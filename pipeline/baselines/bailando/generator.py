@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,35 +12,24 @@ from motionloom.datasets.loading.dances import joints_of_dance
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.smpl75 import fit_smpl75
-from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.motion.layout import Part
 from motionloom.pipeline.baselines.bailando.codes import DanceVq
 from motionloom.pipeline.baselines.bailando.network import CrossGpt
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
-from motionloom.pipeline.stages.networks.clips import music_of
+from motionloom.pipeline.stages.networks.clips import DanceGenerator, music_of
 from motionloom.pipeline.store.networks import device_of
 
 
 @dataclass(frozen=True)
-class BailandoGenerator:
-    """One dance for each music, by the likeliest codes: what it begins with makes the difference."""
+class BailandoGenerator(DanceGenerator):
+    """Dances by the likeliest codes."""
 
     gpt: CrossGpt
     vq: DanceVq
-    layout: MotionLayout
-    given: Mapping[str, Any]
-    """The stage's loaded inputs; "audio" is read."""
     note: str = ""
     """A remark that its figures must carry."""
     method = "bailando"
-    modalities = frozenset({"audio"})
-    settings = frozenset[str]()
-    max_frames = None
-    decides_length = False
     part: Part = "bodyhand"
-
-    @property
-    def prepared(self) -> Mapping[str, object]:
-        return {"audio": self.given.get("audio")}
 
     @property
     def unit_frames(self) -> int:

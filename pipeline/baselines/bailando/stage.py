@@ -5,7 +5,7 @@ dance_vq -> cross_gpt -> actor_critic
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
 from pydantic import Field
@@ -14,7 +14,6 @@ from torch.utils.data import Dataset
 from motionloom.datasets.loading.dances import BeatBatches, JointCrops, danced_joints
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.bailando.codes import DanceVq, DanceVqConfig, places
@@ -33,7 +32,6 @@ from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
-    from motionloom.models.training.stage_module import Batch
     from motionloom.pipeline.baselines.bailando.module import ActorCriticModule, CrossGptModule, DanceVqModule
 
 _ADAM = OptimConfig(optimizer="adam", lr=3e-5, betas=(0.5, 0.999), grad_clip=0.0)
@@ -135,13 +133,43 @@ class CrossGptInputs(Inputs):
     dance_vq: DanceVq
 
 
-class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt]):
+C = TypeVar("C", bound=TrainedStageConfig)
+I = TypeVar("I", bound=CrossGptInputs)  # noqa: E741
+G = TypeVar("G", CrossGpt, ActorCritic)
+
+
+class DanceGptStage(TrainedStage[C, I, G]):
+    """A stage of a network that has the GPT; subclasses build it and its module."""
+
+    offers = frozenset({GENERATOR})
+
+    def release(self, net: G) -> Release:
+        """Bailando's; the critic is read where there is one."""
+        return release_of_gpt(net)
+
+    def example(self, config: C, net: G, inputs: I, batch: int) -> Example:
+        gpt, vq = gpt_in(net), inputs.dance_vq
+        frames = window_of(gpt, vq)["max_frames"]
+        music = MODALITIES["audio"].example(batch, frames, gpt.music_dim)
+        tensors = {"motion": torch.zeros(batch, frames, 3 * vq.joints), "conditions": {"audio": music}}
+        return Example(tensors, f"3 x {gpt.config.context} positions")
+
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
+        songs = getattr(stage.config, "reward_songs", "train")
+        note = "" if songs == "train" else "rewarded on the songs of the test split"
+        layout, gpt = load_facts(stage.folder).layout.layout(), gpt_in(self.load(stage, given, device))
+        return BailandoGenerator(layout, given, gpt, given["dance_vq"], note)
+
+    def exported(self, config: C) -> tuple[str, ...]:
+        return ("dance_vq", "audio")
+
+
+class CrossGptStage(DanceGptStage[CrossGptStageConfig, CrossGptInputs, CrossGpt]):
     """Music to codes of both halves of the body."""
 
     name = "cross_gpt"
     summary = "Bailando: music to codes"
     config = CrossGptStageConfig
-    offers = frozenset({GENERATOR})
     inputs = CrossGptInputs
     curves = tuple(Curve(name) for name in ("loss", "accuracy_up", "accuracy_down"))
 
@@ -152,10 +180,6 @@ class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt])
 
     def network(self, facts: ModelFacts, inputs: CrossGptInputs) -> CrossGpt:
         return gpt_of(facts)
-
-    def release(self, net: CrossGpt) -> Release:
-        """Bailando's, without its critic."""
-        return release_of_gpt(net)
 
     def prepare(self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs) -> None:
         """First codes of training dances."""
@@ -182,18 +206,6 @@ class CrossGptStage(TrainedStage[CrossGptStageConfig, CrossGptInputs, CrossGpt])
             balance=MUSIC,
         )  # fmt: skip
 
-    def example(
-        self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, batch: int
-    ) -> Example:
-        return Example(example_of(net, inputs.dance_vq, batch), f"3 x {net.config.context} positions")
-
-    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
-        gpt = self.load(stage, given, device)
-        return BailandoGenerator(gpt, given["dance_vq"], layout_of(stage), given)
-
-    def exported(self, config: CrossGptStageConfig) -> tuple[str, ...]:
-        return ("dance_vq", "audio")
-
 
 class ActorCriticStageConfig(TrainedStageConfig):
     """Actor-critic training of a finished `cross_gpt`."""
@@ -212,13 +224,12 @@ class ActorCriticInputs(CrossGptInputs):
     cross_gpt: CrossGpt
 
 
-class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, ActorCritic]):
+class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, ActorCritic]):
     """The GPT taught to keep the beat."""
 
     name = "actor_critic"
     summary = "Bailando: rewards for the beat"
     config = ActorCriticStageConfig
-    offers = frozenset({GENERATOR})
     inputs = ActorCriticInputs
     curves = (Curve("actor_reward"), Curve("critic_loss"))
 
@@ -234,10 +245,6 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
 
     def network(self, facts: ModelFacts, inputs: ActorCriticInputs) -> ActorCritic:
         return ActorCritic(gpt_of(facts), facts.fact("critic_layers", int))
-
-    def release(self, net: ActorCritic) -> Release:
-        """Bailando's."""
-        return release_of_gpt(net)
 
     def prepare(self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs) -> None:
         """The actor starts as the trained GPT."""
@@ -282,17 +289,8 @@ class ActorCriticStage(TrainedStage[ActorCriticStageConfig, ActorCriticInputs, A
     def example(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, batch: int
     ) -> Example:
-        example = example_of(net.gpt, inputs.dance_vq, batch)
-        beats = torch.zeros(example["motion"].shape[:2], dtype=torch.bool)
-        return Example({**example, "beats": beats}, f"3 x {net.gpt.config.context} positions")
-
-    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
-        note = "" if stage.config.reward_songs == "train" else "rewarded on the songs of the test split"
-        gpt = self.load(stage, given, device).gpt
-        return BailandoGenerator(gpt, given["dance_vq"], layout_of(stage), given, note)
-
-    def exported(self, config: ActorCriticStageConfig) -> tuple[str, ...]:
-        return ("dance_vq", "audio")
+        tensors, note = super().example(config, net, inputs, batch)
+        return Example({**tensors, "beats": torch.zeros(tensors["motion"].shape[:2], dtype=torch.bool)}, note)
 
 
 def gpt_of(facts: ModelFacts) -> CrossGpt:
@@ -301,22 +299,15 @@ def gpt_of(facts: ModelFacts) -> CrossGpt:
     return CrossGpt(CrossGptConfig.parse(facts.config, facts.where), **sizes)
 
 
-def layout_of(stage: CompletedStage) -> MotionLayout:
-    """The layout of a finished stage's data."""
-    return load_facts(stage.folder).layout.layout()
+def gpt_in(net: CrossGpt | ActorCritic) -> CrossGpt:
+    """The GPT itself."""
+    return net.gpt if isinstance(net, ActorCritic) else net
 
 
 def window_of(gpt: CrossGpt, vq: DanceVq) -> dict[str, int]:
     """Lengths of a training window: the context, and one code more."""
     frames = (gpt.config.context + 1) * vq.config.code_frames
     return {"max_frames": frames, "min_frames": frames}
-
-
-def example_of(gpt: CrossGpt, vq: DanceVq, batch: int) -> Batch:
-    """A batch of windows with music."""
-    frames = window_of(gpt, vq)["max_frames"]
-    music = MODALITIES["audio"].example(batch, frames, gpt.music_dim)
-    return {"motion": torch.zeros(batch, frames, 3 * vq.joints), "conditions": {"audio": music}}
 
 
 register(DanceVqStage())

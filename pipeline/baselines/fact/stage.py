@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from pydantic import Field
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.motion.layout import Part
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.fact.network import Fact, FactConfig
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest, MotionGenerator
@@ -23,6 +22,7 @@ from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs
 from motionloom.pipeline.stages.networks.captions import part_columns, part_of
 from motionloom.pipeline.stages.networks.clips import (
     MUSIC,
+    DanceGenerator,
     clip_batches,
     motion_example,
     music_of,
@@ -39,24 +39,13 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class FactGenerator:
-    """One dance for each music; it draws nothing, so the motion that it begins with makes the difference."""
+class FactGenerator(DanceGenerator):
+    """Dances frame by frame; of the inputs "stats" is read too."""
 
     net: Fact
-    layout: MotionLayout
     part: Part
-    given: Mapping[str, Any]
-    """The stage's loaded inputs; "stats" and "audio" are read."""
     method = "fact"
-    modalities = frozenset({"audio"})
-    settings = frozenset[str]()
     unit_frames = 1
-    max_frames = None
-    decides_length = False
-
-    @property
-    def prepared(self) -> Mapping[str, object]:
-        return {"audio": self.given.get("audio")}
 
     @property
     def capabilities(self) -> Capabilities:
@@ -150,7 +139,7 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
         return Example(motion_example(batch, frames, width, conditions={"audio": music}), note)
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
-        return FactGenerator(self.load(stage, given, device), given["stats"].layout, stage.config.part, given)
+        return FactGenerator(given["stats"].layout, given, self.load(stage, given, device), stage.config.part)
 
     def exported(self, config: FactStageConfig) -> tuple[str, ...]:
         return ("stats", "audio")

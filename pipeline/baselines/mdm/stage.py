@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.layers.transformer import name_in_torch
 from motionloom.pipeline.baselines.mdm.network import Mdm
 from motionloom.pipeline.contract.stage import register
 from motionloom.pipeline.stages.networks.captions import CaptionInputs, DenoiserStage, DenoiserStageConfig
-from motionloom.pipeline.store.weights import ModelFacts, Release
+from motionloom.pipeline.store.weights import Release
 
 if TYPE_CHECKING:
     from motionloom.models.diffusion.module import TextDenoiserModule
@@ -21,10 +20,7 @@ class MdmStage(DenoiserStage[DenoiserStageConfig, Mdm]):
     name = "mdm"
     summary = "MDM: motion diffusion"
     config = DenoiserStageConfig
-
-    def network(self, facts: ModelFacts, inputs: CaptionInputs) -> Mdm:
-        config = TextDenoiserConfig.parse(facts.config, facts.where)
-        return Mdm(config, facts.fact("motion_dim", int), facts.fact("text_dim", int))
+    denoiser = Mdm
 
     def release(self, net: Mdm) -> Release:
         """Return MDM's published names; text encoder and positions are not read."""

@@ -14,10 +14,9 @@ Legend: B batch, T frames, D motion features, L tokens, E their width, C width, 
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
@@ -25,8 +24,6 @@ from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.network import step_waves
 from motionloom.models.diffusion.schedule import ScheduleConfig
 from motionloom.models.layers.transformer import StackConfig, Transformer
-
-Attention = Literal["linear", "full"]
 
 
 class CaptionConfig(StackConfig):
@@ -47,8 +44,6 @@ class MotionDiffuseConfig(StackConfig):
     dim: int = Field(default=512, ge=2, multiple_of=2)
     layers: int = Field(default=8, ge=1)
     dropout: float = Field(default=0.0, ge=0, lt=1)
-    attention: Attention = "linear"
-    """`linear` in the frames, or `full`: every pair of frames, with the same weights."""
     caption: CaptionConfig = CaptionConfig()
     schedule: ScheduleConfig = ScheduleConfig(betas="linear", predicts="epsilon")
 
@@ -81,7 +76,7 @@ class Attend(nn.Module):
     def __init__(self, config: MotionDiffuseConfig, memory_dim: int | None = None) -> None:
         super().__init__()
         dim = config.dim
-        self.heads, self.linear = config.heads, config.attention == "linear"
+        self.heads = config.heads
         self.norm = nn.LayerNorm(dim)
         self.norm_memory = None if memory_dim is None else nn.LayerNorm(memory_dim)
         self.query = nn.Linear(dim, dim)
@@ -93,11 +88,7 @@ class Attend(nn.Module):
         x = self.norm(x)
         read = x if self.norm_memory is None or memory is None else self.norm_memory(memory)
         query, key, value = (self._split(part) for part in (self.query(x), self.key(read), self.value(read)))
-        if self.linear:
-            out = linear_attention(query, key, value, mask)
-        else:
-            out = F.scaled_dot_product_attention(query, key, value, mask[:, None, None])
-        return out.transpose(1, 2).flatten(2)
+        return linear_attention(query, key, value, mask).transpose(1, 2).flatten(2)
 
     def _split(self, x: Tensor) -> Tensor:
         return x.view(*x.shape[:2], self.heads, -1).transpose(1, 2)

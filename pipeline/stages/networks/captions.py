@@ -83,8 +83,9 @@ T = TypeVar("T", bound=TextDenoiser)
 
 
 class DenoiserStage(CaptionStage[D, CaptionInputs, T]):
-    """A stage of a `TextDenoiser`; subclasses build the network and its module."""
+    """A stage of a `TextDenoiser`; subclasses name the network and build its module."""
 
+    denoiser: type[T]
     offers = frozenset({GENERATOR})
     inputs = CaptionInputs
     curves = (Curve("loss"),)
@@ -94,6 +95,10 @@ class DenoiserStage(CaptionStage[D, CaptionInputs, T]):
         width = len(part_columns(layout, config.part))
         extra = {"motion_dim": width, "text_dim": inputs.text.dim, "part": config.part}
         return ModelFacts.of(self.name, config.net, layout, extra)
+
+    def network(self, facts: ModelFacts, inputs: CaptionInputs) -> T:
+        config = type(self.config.model_fields["net"].default).parse(facts.config, facts.where)
+        return self.denoiser(config, facts.fact("motion_dim", int), facts.fact("text_dim", int))
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))

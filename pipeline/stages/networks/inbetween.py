@@ -15,7 +15,6 @@ from motionloom.pipeline.stages.networks.captions import (
     DenoiserStageConfig,
     part_columns,
 )
-from motionloom.pipeline.store.weights import ModelFacts
 
 if TYPE_CHECKING:
     from motionloom.models.diffusion.module import InBetweenModule
@@ -34,10 +33,7 @@ class InBetweenStage(DenoiserStage[InBetweenStageConfig, InBetweener]):
     name = "inbetween"
     summary = "motion in-betweening"
     config = InBetweenStageConfig
-
-    def network(self, facts: ModelFacts, inputs: CaptionInputs) -> InBetweener:
-        config = InBetweenConfig.parse(facts.config, facts.where)
-        return InBetweener(config, facts.fact("motion_dim", int), facts.fact("text_dim", int))
+    denoiser = InBetweener
 
     def module(
         self, config: InBetweenStageConfig, net: InBetweener, inputs: CaptionInputs, seed: int

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, create_model
 from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.batches import WindowBatches
@@ -74,40 +74,9 @@ def require_uses(vectors: int, codes: int, reset_below: float, *, times: float =
         )
 
 
-class H2VQStageConfig(TokenizerStageConfig):
-    """Body and hand codebooks with their hierarchy."""
-
-    net: H2VQConfig = H2VQConfig()
-
-
-class VqStageConfig(TokenizerStageConfig):
-    """One codebook."""
-
-    net: VqConfig = VqConfig()
-
-
-class RvqStageConfig(TokenizerStageConfig):
-    """Residual codebooks (body-only data, face)."""
-
-    net: RvqConfig = RvqConfig()
-
-
-class SeparateStageConfig(TokenizerStageConfig):
-    """Body and hands apart, the ablation of H2VQ."""
-
-    net: SeparateConfig = SeparateConfig()
-
-
-class FsqStageConfig(TokenizerStageConfig):
-    """Finite scalar quantization."""
-
-    net: FsqConfig = FsqConfig()
-
-
-class MqStageConfig(TokenizerStageConfig):
-    """UDE's motion quantization."""
-
-    net: MqConfig = MqConfig()
+def stage_config(net: TokenizerConfig) -> type[TokenizerStageConfig]:
+    """Return the settings of a stage of one kind of tokenizer, by the defaults of its network."""
+    return create_model(f"{net.kind}_stage", __base__=TokenizerStageConfig, net=(type(net), net))
 
 
 class WindowInputs(Inputs):
@@ -207,9 +176,12 @@ def window_batches(
     return Batches(train, lambda: EvalBatches(data.held_out(), stats, columns=columns, **validation))
 
 
-register(TokenizerStage("h2vq", "H2VQ tokenizer", H2VQStageConfig))
-register(TokenizerStage("vq", "VQ tokenizer", VqStageConfig))
-register(TokenizerStage("rvq", "RVQ tokenizer", RvqStageConfig))
-register(TokenizerStage("separate", "body and hands apart", SeparateStageConfig))
-register(TokenizerStage("fsq", "FSQ tokenizer", FsqStageConfig))
-register(TokenizerStage("mq", "UDE's motion quantization", MqStageConfig))
+for _net, _summary in (
+    (H2VQConfig(), "H2VQ tokenizer"),
+    (VqConfig(), "VQ tokenizer"),
+    (RvqConfig(), "RVQ tokenizer"),
+    (SeparateConfig(), "body and hands apart"),
+    (FsqConfig(), "FSQ tokenizer"),
+    (MqConfig(), "UDE's motion quantization"),
+):
+    register(TokenizerStage(_net.kind, _summary, stage_config(_net)))

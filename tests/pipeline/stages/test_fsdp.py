@@ -35,7 +35,7 @@ from motionloom.pipeline.contract.stage import StageCache, StageContext, fingerp
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.gpt import GptStageConfig
 from motionloom.pipeline.stages.networks.tma import TmaStageConfig
-from motionloom.pipeline.stages.networks.tokenizer import H2VQStageConfig
+from motionloom.pipeline.stages.networks.tokenizer import stage_config
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trainer import fit
@@ -196,7 +196,7 @@ def test_the_strategy_is_no_part_of_the_fingerprint() -> None:
     ("build", "train", "message"),
     [
         (TmaStageConfig, {}, "for gpt stages"),
-        (H2VQStageConfig, {}, "codebooks must be whole"),
+        (stage_config(H2VQConfig()), {}, "codebooks must be whole"),
         (GptStageConfig, {"compile": True}, "train.compile makes one graph"),
         (GptStageConfig, {"precision": "16-mixed"}, "set train.precision: bf16-mixed"),
     ],

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import pytest
 import torch
 from torch import nn
@@ -12,8 +10,6 @@ from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.module import DenoiserModule
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.baselines.motiondiffuse.network import (
-    Attend,
-    Attention,
     CaptionConfig,
     MotionDiffuse,
     MotionDiffuseConfig,
@@ -27,10 +23,10 @@ SMALL = MotionDiffuseConfig(
 )
 
 
-def small(attention: Attention = "linear", max_frames: int = 20) -> MotionDiffuse:
+def small() -> MotionDiffuse:
     """With weights that let everything through, in float64."""
     torch.manual_seed(0)
-    net = MotionDiffuse(SMALL.model_copy(update={"attention": attention}), 5, 7, max_frames)
+    net = MotionDiffuse(SMALL, 5, 7, max_frames=20)
     for parameter in net.parameters():
         nn.init.normal_(parameter, std=0.4)
     return net.double().eval()
@@ -54,20 +50,6 @@ def test_linear_attention_beside_a_slow_one() -> None:
             below = sum(key[b, h, s, c].exp() for s in seen)
             total += share * sum(key[b, h, s, c].exp() / below * value[b, h, s, d] for s in seen)
         assert float(found[b, h, t, d]) == pytest.approx(float(total), rel=1e-12)
-
-
-def test_full_attention_beside_a_slow_one() -> None:
-    torch.manual_seed(0)
-    attend = Attend(SMALL.model_copy(update={"attention": "full"})).double()
-    x, mask = torch.randn(2, 6, 16).double(), torch.tensor([[True] * 6, [True] * 4 + [False] * 2])
-    found = attend(x, mask)
-    seen = attend.norm(x)
-    parts = [layer(seen).view(2, 6, 2, 8) for layer in (attend.query, attend.key, attend.value)]
-    for b in range(2):
-        for h in range(2):
-            query, key, value = (part[b, :, h] for part in parts)
-            share = (query @ key[mask[b]].T / 8**0.5).softmax(1)
-            torch.testing.assert_close(found[b, :, 8 * h : 8 * h + 8], share @ value[mask[b]])
 
 
 def test_stylization() -> None:
@@ -94,9 +76,8 @@ def test_an_untrained_one_predicts_no_noise() -> None:
 
 
 @pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize("attention", get_args(Attention))
-def test_padding_of_frames_and_captions_plays_no_part(attention: Attention) -> None:
-    net, text, x, step = small(attention), words([4, 2]), torch.randn(2, 9, 5), torch.tensor([30, 800])
+def test_padding_of_frames_and_captions_plays_no_part() -> None:
+    net, text, x, step = small(), words([4, 2]), torch.randn(2, 9, 5), torch.tensor([30, 800])
     mask = torch.arange(9) < torch.tensor([[9], [5]])
     found = net(x, step, text, mask)
     alone = Condition(text.features[1:, :2], text.mask[1:, :2])
