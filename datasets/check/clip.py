@@ -102,11 +102,6 @@ def read_member(file: BinaryIO, clip: TarClip, name: str) -> bytes:
     return file.read(size)
 
 
-def read_meta(file: BinaryIO, path: Path, clip: TarClip) -> ClipMeta:
-    """`meta.json` of a clip of an open shard; `UserError` when it is not one."""
-    return meta_from_json(read_member(file, clip, "meta.json"), f"{path}: '{clip.key}.meta.json'")
-
-
 def read_motion(file: BinaryIO, path: Path, clip: TarClip) -> NDArray[np.floating]:
     """`motion.npy` of a clip of an open shard, as stored."""
     return npy_from_bytes(read_member(file, clip, "motion.npy"), f"{path}: '{clip.key}.motion.npy'")
@@ -116,7 +111,7 @@ def check_clip(
     file: BinaryIO, path: Path, clip: TarClip, shard: ShardInfo, layout: MotionLayout
 ) -> CheckedClip:
     """Read one clip of an open shard. Raises `UserError` or `ValueError` at the first thing wrong."""
-    meta = read_meta(file, path, clip)
+    meta = meta_from_json(read_member(file, clip, "meta.json"), f"{path}: '{clip.key}.meta.json'")
     stated = (meta.layout, meta.family, meta.fps, meta.skeleton, meta.split)
     wanted = (layout.name, layout.family, layout.fps, layout.skeleton_name, shard.split)
     if stated != wanted:

@@ -9,7 +9,7 @@ place (floor 0, first root above the origin, first heading +Z).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -17,13 +17,12 @@ from typing import Literal
 import numpy as np
 
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip, note_broken
+from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import read_ids
 from motionloom.datasets.convert.sets.shared.body import SOUND_SUFFIXES, BodyConfig, BodyRelease
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
-from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
+from motionloom.datasets.schema import Caption, Split, UserError
 
 FPS = 60.0
 MOTIONS = "motions"
@@ -104,7 +103,7 @@ class Aistpp(BodyRelease[AistppConfig]):
             try:
                 facts = _facts(name)
             except UserError as error:
-                note_broken(draft, f"{MOTIONS}/{name}.pkl", error)
+                draft.fail(f"{MOTIONS}/{name}.pkl", error)
                 continue
             genre = GENRES.get(facts["genre"], f"{facts['genre']} dance")
             caption = Caption(text=f"a dancer performs {genre}", source="genre")
@@ -143,24 +142,10 @@ class Aistpp(BodyRelease[AistppConfig]):
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SOUND_SUFFIXES)
         return {path.stem: path.name for path in reversed(files) if path.name[0] != "."}
 
-    def with_sound(
-        self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
-    ) -> Iterator[tuple[Entry, str]]:
-        for entry, reason in super().with_sound(entries, draft):
+    def with_sound(self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        for entry in super().with_sound(entries, draft):
             both = entry.sound is not None and self.config.stores_music
-            yield replace(entry, licence=MUSIC_LICENCE if both else None), reason
-
-    def plan(self, settings: PlanSettings) -> ConversionPlan[ReleaseClip]:
-        plan = super().plan(settings)
-        pieces = {
-            split: {str(clip.entry.facts["music"]) for own, clip in plan.items if own == split}
-            for split in SPLITS
-        }
-        for split in ("val", "test"):
-            if shared := sorted(pieces["train"] & pieces[split]):
-                some = ", ".join(shared[:5]) + (", ..." if len(shared) > 5 else "")
-                plan.notes.append(f"{len(shared)} pieces of music are in train and in {split}: {some}")
-        return plan
+            yield replace(entry, licence=MUSIC_LICENCE if both else None)
 
     def licence(self, plan: ConversionPlan[ReleaseClip]) -> str:
         return self.config.licence or (MUSIC_LICENCE if self.config.stores_music else MOTION_LICENCE)

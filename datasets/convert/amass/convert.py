@@ -32,14 +32,7 @@ from motionloom.datasets.convert.common.features import (
 from motionloom.datasets.convert.common.files import check_id, inside
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.release import (
-    Entry,
-    Figure,
-    Release,
-    ReleaseClip,
-    ReleaseConfig,
-    note_broken,
-)
+from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import hash_split, original_of
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
@@ -248,8 +241,7 @@ class Amass(Release[AmassConfig]):
         """The frames of a clip."""
         fingers, palms = self.layout.num_joints > BODY_JOINTS, self.layout.name == "smpl75"
         frames, label = slice(clip.first, clip.last), clip.entry.file
-        motion = read_motion(self.path_of(label), label, hands=fingers, palms=palms, frames=frames)
-        return Figure(rotations=motion.rotations, trans=motion.trans, betas=motion.betas)
+        return read_motion(self.path_of(label), label, hands=fingers, palms=palms, frames=frames)
 
     def joints(self, clip: ReleaseClip) -> SourceJoints:
         return SourceJoints(self._posed(clip, self.figure(clip), 1), clip.fps)
@@ -319,7 +311,7 @@ def list_files(source: Path, draft: ConversionPlan[ReleaseClip]) -> list[str]:
                     inside(source, relative).stat()
                     labels.append(label)
             except (UserError, OSError) as error:
-                note_broken(draft, label, error)
+                draft.fail(label, error)
     if not labels:
         raise UserError(f"{source}: no {SUFFIX} file with motion in it")
     draft.broken.sort(key=lambda drop: drop.source)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.convert.common.arrays import check_values
+from motionloom.datasets.convert.common.release import Figure
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.schema import UserError
@@ -48,15 +49,6 @@ class MotionHeader:
     """Whether there are finger rotations."""
 
 
-@dataclass(frozen=True)
-class SmplMotion:
-    """Rotations [T, N, 3] (axis-angle, radians), translations [T, 3] (metres), one shape [B] or none."""
-
-    rotations: NDArray[np.float64]
-    trans: NDArray[np.float64]
-    betas: NDArray[np.float64] | None
-
-
 def read_motion_header(path: Path, label: str) -> MotionHeader:
     """Length, frame rate and model of a clip without reading its motion; `UserError` when it is not one."""
     with NpzFile(path, label) as file:
@@ -87,7 +79,7 @@ def read_motion_header(path: Path, label: str) -> MotionHeader:
 
 def read_motion(
     path: Path, label: str, *, hands: bool, palms: bool = False, frames: slice = slice(None)
-) -> SmplMotion:
+) -> Figure:
     """The 22 body joints, and the 30 finger joints with `hands`, of the given frames.
 
     With `palms` SMPL's two hand joints follow the body's: SMPL-H and SMPL-X have none, theirs are at rest.
@@ -114,7 +106,7 @@ def read_motion(
     rotations = np.concatenate(parts, axis=1) if hands else parts[0]
     if palms:
         rotations = np.concatenate([rotations, extra], axis=1)
-    return SmplMotion(rotations.reshape(len(rotations), -1, 3), trans, betas)
+    return Figure(rotations=rotations.reshape(len(rotations), -1, 3), trans=trans, betas=betas)
 
 
 def _trans(file: NpzFile) -> str:

@@ -8,7 +8,7 @@ joints to samples is decided here, alike for all sets. A plan reads lists and he
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, Literal, TypeVar
@@ -30,7 +30,6 @@ from motionloom.datasets.convert.common.splits import (
     split_files,
 )
 from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
-from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.sample import Sample
 
 _END_TOLERANCE = 0.5
@@ -190,13 +189,13 @@ class Release(Converter[Cfg, ReleaseClip]):
         for clip_id, split in (self.listed or {}).items():
             if clip_id not in named:
                 draft.miss(clip_id, f"listed in {split}.txt, but not in the source")
-        for entry, reason in self.with_sound(entries, draft):
+        for entry in self.with_sound(entries, draft):
             state = scanned[entry.file]
             if state is None:
                 draft.miss(entry.file, f"clip '{entry.id}' is listed, but its file is not in the source")
             elif not isinstance(state, UserError):
                 clip, problem = self._clip(entry, state, draft)
-                reason = clip.entry.problem or reason or problem
+                reason = clip.entry.problem or problem
                 captioned, keep = bool(clip.entry.texts), config.uncaptioned == "keep"
                 draft.take(clip, reason, captioned=captioned, wanted=config.has_captions, keep=keep)
         draft.limit(lambda clip: clip.id)
@@ -230,11 +229,9 @@ class Release(Converter[Cfg, ReleaseClip]):
         draft.notes += notes
         return splits
 
-    def with_sound(
-        self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
-    ) -> Iterator[tuple[Entry, str]]:
-        """The entries as their sound allows, and why one must be left out; sets without sound have none."""
-        return ((entry, "") for entry in entries)
+    def with_sound(self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        """The entries as their sound allows; sets without sound have none."""
+        return entries
 
     def fitted(self, entry: Entry, frames: int, fps: float, draft: ConversionPlan[ReleaseClip]) -> Entry:
         """Return an entry as the length and frame rate of its file, which lists do not know, make it."""
@@ -315,8 +312,3 @@ class Release(Converter[Cfg, ReleaseClip]):
         return self.meta(
             clip, motion, source=clip.label(), licence=clip.licence, mirror_of=clip.entry.mirror_of, **facts
         )
-
-
-def note_broken(draft: ConversionPlan[ReleaseClip], label: str, error: Exception) -> None:
-    """A list, caption or sound file that cannot be read: what needs it goes without."""
-    draft.broken.append(drop(label, error))

@@ -6,8 +6,6 @@ Columns are named by the layout `smplx322`. None of the functions changes its ar
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,8 +27,6 @@ _AIST_RAW, _AIST_TWICE = 30.0, 0.2
 """Largest |translation| of a clip: raw ones stand about 120 units high, scaled ones stay within a hall of a
 few metres, and scaled twice a dance is a few centimetres."""
 
-AistScale = Literal["raw", "scaled", "twice"]
-
 
 def value_limits() -> NDArray[np.float64]:
     """Largest sensible absolute value of each column; beyond it a file is damaged."""
@@ -40,24 +36,18 @@ def value_limits() -> NDArray[np.float64]:
     return limits
 
 
-def aist_scale(values: NDArray[np.floating]) -> AistScale:
-    """Return the state that the translations of an `aist/` clip are in."""
-    most = float(np.abs(values[:, TRANS]).max())
-    return "raw" if most > _AIST_RAW else "twice" if most < _AIST_TWICE else "scaled"
-
-
 def scale_aist(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """An `aist/` clip in metres: raw translations divided by 94, z negated; scaled ones as they are.
 
     `UserError` for a clip that was scaled twice: its movement through the room cannot be restored, since the
     second time may have been anything.
     """
-    state = aist_scale(values)
-    if state == "twice":
+    most = float(np.abs(values[:, TRANS]).max())
+    if most < _AIST_TWICE:
         raise UserError(
             "the translation stays within 20 cm: the aist script was run twice on it; unpack the clip again"
         )
-    if state == "scaled":
+    if most <= _AIST_RAW:
         return values
     scaled = values.copy()
     scaled[:, TRANS] *= np.array([1.0, 1.0, -1.0]) / AIST_UNIT

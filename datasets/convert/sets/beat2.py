@@ -17,7 +17,7 @@ from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip, note_broken
+from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.tables import captions_of, read_csv
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
 from motionloom.datasets.motion.layout import FACE_DIMS
@@ -113,7 +113,7 @@ class Beat2(BodyRelease[Beat2Config]):
             if tier is None:
                 raise UserError(f'{file}: no tier "words" in it')
         except UserError as error:
-            note_broken(draft, file, error)
+            draft.fail(file, error)
             return
         phrase: list[str] = []
         start = end = 0.0

@@ -15,7 +15,7 @@ import numpy as np
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip, note_broken
+from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.body import SOURCE_FPS, BodyConfig, BodyRelease
@@ -77,7 +77,7 @@ class FineDance(BodyRelease[FineDanceConfig]):
                         key: str(value) for key, value in stated.items() if not isinstance(value, dict | list)
                     }
             except UserError as error:
-                note_broken(draft, label, error)
+                draft.fail(label, error)
             genre = next(
                 (str(facts[key]) for key in ("style2", "genre", "style1", "style") if key in facts), ""
             )

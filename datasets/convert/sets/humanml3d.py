@@ -27,14 +27,7 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.files import check_id, inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.release import (
-    Entry,
-    Figure,
-    Release,
-    ReleaseClip,
-    ReleaseConfig,
-    note_broken,
-)
+from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.motion.features.codec import decode
@@ -101,7 +94,7 @@ class HumanMl3d(Release[HumanMl3dConfig]):
                     texts, problems = read_humanml_captions(path, seconds=None, name=label)
                     draft.notes += [f"{label}: {'; '.join(problems)}"] if problems else []
                 except UserError as error:
-                    note_broken(draft, label, error)
+                    draft.fail(label, error)
             original = original_of(clip_id)
             yield Entry(
                 clip_id, file, tuple(texts), group=original or clip_id, mirror_of=original,
@@ -122,7 +115,7 @@ class HumanMl3d(Release[HumanMl3dConfig]):
                 try:
                     found.setdefault(check_id(name.removesuffix(".npy"), label), label)
                 except UserError as error:
-                    note_broken(draft, label, error)
+                    draft.fail(label, error)
         return found
 
     def _texts(self) -> str:

@@ -27,14 +27,7 @@ from motionloom.datasets.convert.common.arrays import check_array_header, load_a
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.release import (
-    Entry,
-    Figure,
-    Release,
-    ReleaseClip,
-    ReleaseConfig,
-    note_broken,
-)
+from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.common.tables import captions_of
 from motionloom.datasets.convert.sets.shared.vectors import walked
@@ -124,7 +117,7 @@ class Motion272(Release[Motion272Config]):
                 else:
                     yield from captions_of(line, "texts")
         except UserError as error:
-            note_broken(draft, file, error)
+            draft.fail(file, error)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return check_array_header(path, width=WIDTH, name=label), self.config.source_fps

@@ -16,7 +16,7 @@ from dataclasses import replace
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import inside, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.release import Entry, ReleaseClip, note_broken
+from motionloom.datasets.convert.common.release import Entry, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
@@ -147,7 +147,7 @@ class MotionHub(BodyRelease[MotionHubConfig]):
                 for level in self.config.levels:
                     yield from captions_of(levels.get(level), level)
             except UserError as error:
-                note_broken(draft, name, error)
+                draft.fail(name, error)
 
 
 def _motions(row: dict[str, object]) -> Iterator[str]:

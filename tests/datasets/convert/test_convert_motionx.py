@@ -34,7 +34,6 @@ from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.motionx.convert import MotionX, parameters_to_joints
 from motionloom.datasets.convert.motionx.parameters import (
     RAW,
-    aist_scale,
     resample_parameters,
     scale_aist,
     stretch,
@@ -216,7 +215,6 @@ def test_dances_are_scaled_exactly_once(copy: Path) -> None:
     np.testing.assert_array_equal(scale_aist(values), values)
 
     rewrite(path, script)
-    assert aist_scale(np.load(path)) == "twice"
     with pytest.raises(UserError, match="run twice"):
         sample(copy, DANCE)
 

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from motionloom.datasets.convert.bvh.joint_guess.figure import CONVENTIONS, Figure
+from motionloom.datasets.convert.bvh.joint_guess.figure import Figure
 from motionloom.datasets.convert.bvh.joint_guess.limbs import (
     How,
     Kind,
@@ -126,7 +126,6 @@ def guess_joint_map(motion: BvhMotion, target: Skeleton) -> JointGuess:
         kinds = [kind for kind, pair in (("legs", legs), ("arms", arms)) if pair is None]
         problems.append(f"found no {' and no '.join(kinds)} by name")
         _fill_limbs(legs or arms, rows)
-        _fill_by_words(figure, rows)
     else:
         legs = with_feet(figure, legs, rows)
         fill_trunk(figure, legs, arms, rows)
@@ -145,23 +144,6 @@ def _fill_limbs(limbs: Iterable[Limb] | None, rows: Rows) -> None:
                 rows.doubt(name, rivals)
             elif joint is not None and name not in rows.sources:
                 rows.put(name, [joint], "name")
-
-
-def _fill_by_words(figure: Figure, rows: Rows) -> None:
-    """Add candidates by single names, for whoever completes the map of a figure without whole limbs."""
-    slots: list[tuple[str, str, set[str]]] = [
-        *(("", joint, {known.neck[i] for known in CONVENTIONS}) for i, joint in enumerate(("neck", "head"))),
-        ("", "pelvis", {known.trunk[0] for known in CONVENTIONS}),
-    ]
-    for kind, words in _SLOTS.items():
-        for i, word in enumerate(words):
-            fits = {getattr(known, kind)[i] for known in CONVENTIONS}
-            slots += [(side, f"{side}_{word}", fits) for side in ("left", "right")]
-    for side, joint, fits in slots:
-        if joint not in rows.sources:
-            found = [j for j, n in enumerate(figure.names) if n.word in fits - {""} and n.side == side]
-            if found:
-                rows.doubt(joint, found)
 
 
 def _fill_collars(figure: Figure, arms: Limbs, rows: Rows) -> None:

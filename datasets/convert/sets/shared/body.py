@@ -6,7 +6,7 @@ loudness are then the piece's, not the cut's.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +20,6 @@ from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_fea
 from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
-from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import (
     body_of,
@@ -31,14 +30,7 @@ from motionloom.datasets.convert.common.features import (
 )
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.release import (
-    Entry,
-    Figure,
-    Release,
-    ReleaseClip,
-    ReleaseConfig,
-    note_broken,
-)
+from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.motion.body.smpl import SkeletonName, smpl_joints
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.motion.layout import BODY_JOINTS
@@ -53,9 +45,21 @@ Wav = tuple[NDArray[np.float32], int]
 """Samples and their rate."""
 
 
-class SoundConfig(ConvertConfig):
-    """Options of converters whose clips have sound."""
+SOURCE_FPS = 30.0
+"""Frame rate of all these sets, where a file states none."""
 
+
+class BodyConfig(ReleaseConfig):
+    """Options of sets of body model parameters, with sound."""
+
+    layouts: ClassVar[tuple[str, ...]] = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
+
+    body_model: Path | None = None
+    """Your body model (.npz), for bones by each clip's shape; else those of one neutral adult."""
+    up: Literal["y", "z"] = "y"
+    """The axis that points up in the files."""
+    sound: Literal["optional", "require", "none"] = "optional"
+    """Whether a clip needs its music or speech; `none` converts the motion alone."""
     max_music_gap: float = Field(default=1.0, ge=0)
     """Seconds of motion that may be cut where the sound ends first; beyond that the clip is left out."""
     audio_features: bool = True
@@ -71,23 +75,6 @@ class SoundConfig(ConvertConfig):
         if not self.audio_features:
             return None
         return AudioSettings.parse({"fps": self.audio_fps or self.fps}, "audio features")
-
-
-SOURCE_FPS = 30.0
-"""Frame rate of all these sets, where a file states none."""
-
-
-class BodyConfig(ReleaseConfig, SoundConfig):
-    """Options of sets of body model parameters."""
-
-    layouts: ClassVar[tuple[str, ...]] = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
-
-    body_model: Path | None = None
-    """Your body model (.npz), for bones by each clip's shape; else those of one neutral adult."""
-    up: Literal["y", "z"] = "y"
-    """The axis that points up in the files."""
-    sound: Literal["optional", "require", "none"] = "optional"
-    """Whether a clip needs its music or speech; `none` converts the motion alone."""
 
 
 Cfg = TypeVar("Cfg", bound=BodyConfig)
@@ -122,8 +109,7 @@ class BodyRelease(Release[Cfg]):
         return header.frames, header.fps or SOURCE_FPS
 
     def figure(self, clip: ReleaseClip) -> Figure:
-        motion = read_motion(self.path_of(clip.entry.file), clip.entry.file, hands=True)
-        return Figure(rotations=motion.rotations, trans=motion.trans, betas=motion.betas)
+        return read_motion(self.path_of(clip.entry.file), clip.entry.file, hands=True)
 
     def options(self) -> dict[str, object]:
         version = VERSION if self._audio else None
@@ -139,9 +125,7 @@ class BodyRelease(Release[Cfg]):
             plan.notes.append(f"{self._cut} clips end with their sound, at most {gap:g} s early")
         return plan
 
-    def with_sound(
-        self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]
-    ) -> Iterator[tuple[Entry, str]]:
+    def with_sound(self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         silent, lengths = 0, self._sounds
         folder = "" if self.sound_folder == self.config.source else f"{self.sound_folder.name}/"
         for sound in dict.fromkeys(entry.sound for entry in entries if self.config.sound != "none"):
@@ -150,15 +134,15 @@ class BodyRelease(Release[Cfg]):
                 try:
                     lengths[sound] = sound_seconds(inside(self.sound_folder, sound, label), label)
                 except UserError as error:
-                    note_broken(draft, label, error)
+                    draft.fail(label, error)
         for entry in entries:
             sound = entry.sound if entry.sound in lengths else None
             silent += sound is None and self.config.sound != "none"
-            missing = f"no readable sound ({entry.sound or 'none is listed'})"
-            yield (
-                replace(entry, sound=sound, facts={**entry.facts, "sound": float(sound is not None)}),
-                missing if sound is None and self.config.sound == "require" else "",
-            )
+            problem = entry.problem
+            if sound is None and self.config.sound == "require":
+                problem = problem or f"no readable sound ({entry.sound or 'none is listed'})"
+            facts = {**entry.facts, "sound": float(sound is not None)}
+            yield replace(entry, sound=sound, facts=facts, problem=problem)
         if silent:
             draft.notes.append(f"{silent} of {len(entries)} clips have no sound")
 
@@ -224,7 +208,7 @@ class BodyRelease(Release[Cfg]):
 
 
 def cut_of(
-    config: SoundConfig, folder: Path, sound: str, start: float, seconds: float
+    config: BodyConfig, folder: Path, sound: str, start: float, seconds: float
 ) -> tuple[NDArray[np.float32] | None, Wav | None]:
     """The part of a piece from second `start` on that is `seconds` long.
 
