@@ -19,8 +19,8 @@ Legend: B batch, L positions of one modality, S positions of all, F its features
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from itertools import accumulate
+import functools
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -111,27 +111,19 @@ class Mate(nn.Module):
         sizes = [piece.shape[1] for piece in pieces]
         x = self.stack(self.dropout(x), torch.cat([mask.new_ones(size, 1), mask], dim=1))
         seq = x[:, 1:].masked_fill(~mask[..., None], 0.0)
-        return Encoded(x[:, 0], seq, mask, self._timed(seq, sizes))
+        return Encoded(x[:, 0], seq, mask, self._timed(seq.split(sizes, dim=1)))
 
     def unconditional(self, batch: int) -> Encoded:
         """Return the encoding of rows without any modality, S = 0."""
         out: Encoded = self({}, batch)
         return out
 
-    def _timed(self, seq: Tensor, sizes: list[int]) -> Tensor | None:
-        """The sum of the timed modalities' embeddings [B, T, E], of which T is the longest's."""
-        ends = list(accumulate(sizes))
-        found = [
-            seq[:, end - size : end]
-            for name, size, end in zip(self.widths, sizes, ends, strict=True)
-            if size and name in self.timed
-        ]
-        size = max([0, *(part.shape[1] for part in found)])
-        out: Tensor | None = None
-        for part in found:
-            padded = nn.functional.pad(part, (0, 0, 0, size - part.shape[1]))
-            out = padded if out is None else out + padded
-        return out
+    def _timed(self, parts: Sequence[Tensor]) -> Tensor | None:
+        """The sum of the timed modalities' embeddings [B, T, E], of which T is the longest's; None = none."""
+        found = [x for name, x in zip(self.widths, parts, strict=True) if name in self.timed and x.shape[1]]
+        size = max([0, *(x.shape[1] for x in found)])
+        padded = [nn.functional.pad(x, (0, 0, 0, size - x.shape[1])) for x in found]
+        return functools.reduce(torch.add, padded) if padded else None
 
     def _modality(
         self, condition: Condition | None, name: str, width: int, size: int

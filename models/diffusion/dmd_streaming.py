@@ -22,9 +22,10 @@ from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.diffusion.sampling import decode_window
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.models.tokenizer.streaming import ArrivingTokens
 
 
-class DmdStream:
+class DmdStream(ArrivingTokens):
     """Decodes one motion's tokens as they come, to the coordinates of training.
 
     Args:
@@ -44,12 +45,10 @@ class DmdStream:
         window: int,
         overlap: int,
     ) -> None:
-        self.net, self.per_group, self.seed = net.eval(), dict(per_group), seed
+        super().__init__(per_group)
+        self.net, self.seed = net.eval(), seed
         self.sampler, self.steps = sampler, steps
         self.window, self.overlap = window, min(overlap, window // 2 // GROUP_FRAMES * GROUP_FRAMES)
-        self._codes: dict[str, Tensor] = {}
-        self._first = self._known = 0
-        """Group that `_codes` begin with, and groups whose tokens are known."""
         self._given = 0
         """Frames given."""
         self._tail: Tensor | None = None
@@ -59,11 +58,7 @@ class DmdStream:
         """More tokens, per stream int64 [1, G * per_group] -> the frames [T, D] that are final now; None =
         none yet.
         """
-        for name, values in codes.items():
-            before = self._codes.get(name)
-            self._codes[name] = values if before is None else torch.cat([before, values], dim=1)
-        name, per = next(iter(self.per_group.items()))
-        self._known += codes[name].shape[1] // per
+        self._add(codes)
         out = []
         # Not the window that ends with what is known: where the motion ends there, it is the last one.
         while self._given + self.window < self._known * GROUP_FRAMES:
@@ -71,7 +66,8 @@ class DmdStream:
             keep = self.window - self.overlap
             out.append(made[:keep])
             self._tail, self._given = made[keep:], self._given + keep
-            self._drop()
+            # The last window may begin a window before the end.
+            self._forget(max(0, (self._given - self.window) // GROUP_FRAMES))
         return torch.cat(out) if out else None
 
     def finish(self) -> Tensor | None:
@@ -115,10 +111,3 @@ class DmdStream:
         )
         both = rise * made[:count] + (1 - rise) * self._tail[:count]
         return torch.cat([both, made[count:]])
-
-    def _drop(self) -> None:
-        """Forget tokens that no later window reads: the last one may begin a window before the end."""
-        keep = max(0, (self._given - self.window) // GROUP_FRAMES)
-        for name, per in self.per_group.items():
-            self._codes[name] = self._codes[name][:, (keep - self._first) * per :]
-        self._first = keep

@@ -63,14 +63,10 @@ def recall(
     text, motion = text.double(), motion.double()
     if distance == "cosine":
         text, motion = F.normalize(text, dim=-1), F.normalize(motion, dim=-1)
-    count = len(text)
-    size = count if batch is None else min(batch, count)
-    order = torch.arange(count)
-    if batch is not None:
-        order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
     found: dict[str, list[Tensor]] = {"t2m": [], "m2t": []}
+    batches = _batches(text, motion, batch, None if batch is None else seed)
     # Each batch is a set of candidates of its own; ranks of all batches are averaged together.
-    for rows in order.to(text.device)[: count // size * size].view(-1, size):
+    for rows in batches:
         between = -(text[rows] @ motion[rows].T)
         if distance == "euclidean":
             between = torch.cdist(text[rows], motion[rows])
@@ -80,7 +76,7 @@ def recall(
             positive = unit @ unit.T >= threshold
         found["t2m"].append(ranks(between, positive))
         found["m2t"].append(ranks(between.T, positive))
-    out = {"size": float(size)}
+    out = {"size": float(batches.shape[1])}
     for way, parts in found.items():
         rank = torch.cat(parts)
         out |= {f"{way}/R@{k}": (rank < k).double().mean().item() for k in recalls}
@@ -97,14 +93,8 @@ def r_precision(
     dropped. With fewer rows than `batch` the whole set is one batch. For TMA-R-Precision pass L2-normalised
     embeddings.
     """
-    text, motion, size = _batches(text, motion, batch, seed)
-    width = text.shape[1]
-    rank = torch.cat(
-        [
-            ranks(torch.cdist(t, m))
-            for t, m in zip(text.view(-1, size, width), motion.view(-1, size, width), strict=True)
-        ]
-    )
+    text, motion, batches = text.double(), motion.double(), _batches(text, motion, batch, seed)
+    rank = torch.cat([ranks(torch.cdist(text[rows], motion[rows])) for rows in batches])
     return torch.stack([(rank < k).double().mean() for k in range(1, top + 1)])
 
 
@@ -115,22 +105,21 @@ def matching_score(
 
     `batch` and `seed` drop the same rows as `r_precision` does, as the public evaluators do.
     """
-    text, motion, _ = _batches(text, motion, batch or len(text), seed)
-    out: Tensor = torch.linalg.vector_norm(text - motion, dim=-1).mean()
+    rows = _batches(text, motion, batch, seed).flatten()
+    out: Tensor = torch.linalg.vector_norm(text.double()[rows] - motion.double()[rows], dim=-1).mean()
     return out
 
 
-def _batches(text: Tensor, motion: Tensor, batch: int, seed: int | None) -> tuple[Tensor, Tensor, int]:
-    """Float64 rows cut to whole batches, and the batch size."""
+def _batches(text: Tensor, motion: Tensor, batch: int | None, seed: int | None) -> Tensor:
+    """Row numbers int64 [n, size] of whole batches (None: one of all), shuffled where a seed is given."""
     if text.shape != motion.shape:
         raise ValueError(f"text {tuple(text.shape)} and motion {tuple(motion.shape)} are not row-aligned")
     count = len(text)
-    size = min(batch, count)
+    size = count if batch is None else min(batch, count)
     order = torch.arange(count)
     if seed is not None:
         order = torch.randperm(count, generator=torch.Generator().manual_seed(seed))
-    order = order[: count // size * size].to(text.device)
-    return text.double()[order], motion.double()[order], size
+    return order[: count // size * size].view(-1, size).to(text.device)
 
 
 # Accuracy of UDE's Table 1: is a motion's own text the nearest among 61? (UDE section 4.3).

@@ -204,8 +204,6 @@ class MotionQuantizer(OneCodebook):
         super().__init__(config, layout, config.part, (Stream("code", config.num_codes, 1),), ("code",))
         sizes, dim = config.conv_sizes(), config.code_dim
         self.encoder = StridedEncoder(self.dim, dim, **sizes)
-        if config.quantizer == "gradient":
-            self.quantizer = GradientQuantizer(config.codebook())
-        else:
-            self.quantizer = EmaQuantizer(config.codebook())
+        kind = GradientQuantizer if config.quantizer == "gradient" else EmaQuantizer
+        self.quantizer = kind(config.codebook())
         self.decoder = StridedDecoder(dim, self.dim, **sizes)

@@ -18,7 +18,35 @@ from torch import Tensor
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 
 
-class StreamDecoder:
+class ArrivingTokens:
+    """Tokens as they come, without those that are read no more.
+
+    Args:
+        per_group: Tokens of each stream in a group.
+    """
+
+    def __init__(self, per_group: Mapping[str, int]) -> None:
+        self.per_group = dict(per_group)
+        self._codes: dict[str, Tensor] = {}
+        self._first = self._known = 0
+        """Group that `_codes` begin with, and groups whose tokens are known."""
+
+    def _add(self, codes: Mapping[str, Tensor]) -> None:
+        """More tokens, per stream int64 [B, G * per_group]."""
+        for name, values in codes.items():
+            before = self._codes.get(name)
+            self._codes[name] = values if before is None else torch.cat([before, values], dim=1)
+        name, per = next(iter(self.per_group.items()))
+        self._known += codes[name].shape[1] // per
+
+    def _forget(self, first: int) -> None:
+        """Drop the tokens of the groups before `first`."""
+        for name, per in self.per_group.items():
+            self._codes[name] = self._codes[name][:, (first - self._first) * per :]
+        self._first = first
+
+
+class StreamDecoder(ArrivingTokens):
     """Decodes tokens as they come.
 
     Args:
@@ -27,23 +55,17 @@ class StreamDecoder:
     """
 
     def __init__(self, net: Tokenizer, least: int = 1) -> None:
+        super().__init__({stream.name: stream.per_group for stream in net.streams})
         self.net, self.least = net, max(1, least)
-        self._codes: dict[str, Tensor] = {}
-        self._first = 0
-        """Group that `_codes` begin with."""
-        self._decoded = self._known = 0
-        """Groups whose frames were given, and groups whose tokens are known."""
+        self._decoded = 0
+        """Groups whose frames were given."""
 
     def push(self, codes: Mapping[str, Tensor]) -> Tensor | None:
         """More tokens, per stream int64 [B, G * per_group] -> the frames [B, T, dim] that are final now.
 
         None where there are none yet.
         """
-        for name, values in codes.items():
-            before = self._codes.get(name)
-            self._codes[name] = values if before is None else torch.cat([before, values], dim=1)
-        stream = self.net.streams[0]
-        self._known += codes[stream.name].shape[1] // stream.per_group
+        self._add(codes)
         final = self._known - self.net.reach
         return self._decode(final) if final - self._decoded >= self.least else None
 
@@ -58,8 +80,5 @@ class StreamDecoder:
         begin = self._decoded - self._first
         frames = window[:, begin * GROUP_FRAMES : (end - self._first) * GROUP_FRAMES]
         self._decoded = end
-        drop = max(0, end - self.net.reach - self._first)
-        for stream in self.net.streams:
-            self._codes[stream.name] = self._codes[stream.name][:, drop * stream.per_group :]
-        self._first += drop
+        self._forget(max(self._first, end - self.net.reach))
         return frames
