@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.body.feet import FeetOptions, FeetReport, foot_contacts, plant_feet
+from motionloom.datasets.motion.body.feet import FeetReport, foot_contacts, plant_feet
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.features.joints import rotations_of
 from motionloom.datasets.schema import Config
@@ -27,7 +27,6 @@ class FigureOptions(Config):
 
     plant_feet: bool = True
     """Hold feet still where they stand (`datasets/motion/body/feet.py`)."""
-    feet: FeetOptions = FeetOptions()
     body_model: Path | None = None
     """Your SMPL-X model (.npz), which the files of format smplx are made for."""
     arkit_bases: Path | None = None
@@ -84,7 +83,7 @@ def shown(motion: GeneratedMotion | ShownMotion, options: FigureOptions | None =
         return ShownMotion(motion, figure)
     # Only the h3d family has contact columns; others are judged by height and speed.
     columns = motion.features if layout.family == "h3d" else None
-    contacts = foot_contacts(figure.joints, layout.skeleton, layout.fps, options.feet, columns, layout)
+    contacts = foot_contacts(figure.joints, layout.skeleton, layout.fps, columns, layout)
     if motion.kept is not None:
         contacts &= ~motion.kept[:, None]
-    return ShownMotion(motion, *plant_feet(figure, motion.joints, contacts, layout.fps, options.feet))
+    return ShownMotion(motion, *plant_feet(figure, motion.joints, contacts, layout.fps))

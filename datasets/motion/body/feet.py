@@ -14,14 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.rigid import FitError, RigidMotion
 from motionloom.datasets.motion.canonical import runs
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Config
 
 SIDES = ("left", "right")
 
@@ -32,18 +30,15 @@ _KNEES = 0.05
 """Knees are where a leg may bend."""
 
 
-class FeetOptions(Config):
-    """Thresholds of a standing foot, and the blending of its correction."""
-
-    height: float = Field(0.05, gt=0, allow_inf_nan=False)
-    """Metres above the floor below which a ball of the foot may stand; the floor is the balls' lowest place,
-    2 percent of the frames left out."""
-    speed: float = Field(0.8, gt=0, allow_inf_nan=False)
-    """Metres a second along the floor below which it may stand; sliding feet of small models reach 0.6."""
-    shortest: float = Field(0.1, ge=0, allow_inf_nan=False)
-    """Seconds: shorter contacts are none, and shorter gaps between two are closed."""
-    blend: float = Field(0.15, ge=0, allow_inf_nan=False)
-    """Seconds in which a correction comes and goes."""
+HEIGHT = 0.05
+"""Metres above the floor below which a ball of the foot may stand; the floor is the balls' lowest place,
+2 percent of the frames left out."""
+SPEED = 0.8
+"""Metres a second along the floor below which it may stand; sliding feet of small models reach 0.6."""
+_SHORTEST = 0.1
+"""Seconds: shorter contacts are none, and shorter gaps between two are closed."""
+_BLEND = 0.15
+"""Seconds in which a correction comes and goes."""
 
 
 @dataclass(frozen=True)
@@ -53,23 +48,14 @@ class FeetReport:
     slide_before: float
     """Centimetres a second along the floor."""
     slide_after: float
-    contact: float
-    """Share of the frames in which a foot stands, the mean of both feet."""
     unplanted: FitError
     """Distance of the figure from the joints before its feet were planted."""
-
-    def __str__(self) -> str:
-        if not self.contact:
-            return "no foot stands in this motion, nothing was planted"
-        slide = f"feet slide {self.slide_after:.1f} cm/s where they slid {self.slide_before:.1f}"
-        return f"{slide}, at the cost of the way from {self.unplanted}"
 
 
 def foot_contacts(
     joints: NDArray[np.floating],
     skeleton: Skeleton,
     fps: float,
-    options: FeetOptions | None = None,
     features: NDArray[np.floating] | None = None,
     layout: MotionLayout | None = None,
 ) -> NDArray[np.bool_]:
@@ -77,16 +63,15 @@ def foot_contacts(
 
     `features` [T, D] of a `layout` with contact columns take the place of the speed.
     """
-    options = options or FeetOptions()
     balls = np.asarray(joints, np.float64)[:, _balls(skeleton)]
-    low = balls[..., 1] - np.percentile(balls[..., 1], 2) < options.height
+    low = balls[..., 1] - np.percentile(balls[..., 1], 2) < HEIGHT
     if features is not None and layout is not None and layout.has("foot_contacts"):
         stated = np.asarray(features)[:, layout.slice("foot_contacts")] > 0.5
         slow = stated[:, [1, 3]]  # ankle and ball of the left foot, then of the right one
     else:
         way = np.gradient(balls[..., [0, 2]], axis=0) if len(balls) > 1 else np.zeros((1, 2, 2))
-        slow = np.linalg.norm(way * fps, axis=-1) < options.speed
-    shortest = max(1, round(options.shortest * fps))
+        slow = np.linalg.norm(way * fps, axis=-1) < SPEED
+    shortest = max(1, round(_SHORTEST * fps))
     standing = low & slow
     # Gaps first: a contact that flickers is one contact, and only then may a short one be dropped.
     for foot in range(2):
@@ -96,24 +81,19 @@ def foot_contacts(
 
 
 def plant_feet(
-    motion: RigidMotion,
-    unfitted: NDArray[np.floating],
-    contacts: NDArray[np.bool_],
-    fps: float,
-    options: FeetOptions | None = None,
+    motion: RigidMotion, unfitted: NDArray[np.floating], contacts: NDArray[np.bool_], fps: float
 ) -> tuple[RigidMotion, FeetReport]:
     """Return the motion with its feet pinned while `contacts` [T, 2] say that they stand.
 
     `unfitted` [T, N, 3] are the joints before any fit, which the result's error is measured against.
     """
-    options = options or FeetOptions()
     skeleton, balls = motion.skeleton, _balls(motion.skeleton)
     before = _slide(motion.joints[:, balls], contacts, fps)
     if not contacts.any():
-        return motion, FeetReport(before, before, 0.0, motion.error)
+        return motion, FeetReport(before, before, motion.error)
     targets = motion.joints.copy()
     weights = np.ones(len(skeleton))
-    blend = max(1, round(options.blend * fps))
+    blend = max(1, round(_BLEND * fps))
     for foot, side in enumerate(SIDES):
         ankle = skeleton.index(f"{side}_ankle")
         change = _correction(motion.joints[:, balls[foot]], contacts[:, foot], blend)
@@ -125,7 +105,7 @@ def plant_feet(
     )
     planted = RigidMotion.posed(skeleton, turned, root, unfitted)
     after = _slide(planted.joints[:, balls], contacts, fps)
-    return planted, FeetReport(before, after, float(contacts.mean()), motion.error)
+    return planted, FeetReport(before, after, motion.error)
 
 
 def _balls(skeleton: Skeleton) -> list[int]:

@@ -205,9 +205,8 @@ def test_feet_stand_where_they_are_low_and_slow_and_without_contacts_nothing_cha
     np.testing.assert_array_equal(contacts, expected)
     assert not foot_contacts(standing_and_sliding(slide=2.0), SKELETON, FPS).any()
     fitted: RigidMotion = fit_rigid(standing_and_sliding(slide=2.0), SKELETON)
-    same, report = plant_feet(fitted, fitted.joints, np.zeros((60, 2), bool), FPS)
+    same, _ = plant_feet(fitted, fitted.joints, np.zeros((60, 2), bool), FPS)
     assert same is fitted
-    assert report.contact == 0
 
 
 def test_contact_columns_take_the_place_of_speed_and_short_contacts_are_none() -> None:
@@ -219,7 +218,7 @@ def test_contact_columns_take_the_place_of_speed_and_short_contacts_are_none() -
     columns[50:, 3] = 1
     columns[54, 3] = 0  # a gap of one frame
     features[:, layout.slice("foot_contacts")] = columns
-    contacts = foot_contacts(standing_and_sliding(slide=2.0), SKELETON, FPS, None, features, layout)
+    contacts = foot_contacts(standing_and_sliding(slide=2.0), SKELETON, FPS, features, layout)
     expected = np.zeros((60, 2), bool)
     expected[:20, 0] = expected[50:, 1] = True
     np.testing.assert_array_equal(contacts, expected)
@@ -235,7 +234,6 @@ def test_planted_feet_stay_where_they_stand_and_the_report_says_so() -> None:
         assert spread.max() < 2e-3
     assert report.slide_before == pytest.approx(20.0, abs=0.5)
     assert report.slide_after < 0.5
-    assert report.contact == pytest.approx(2 / 3)
     assert planted.error.mean_mm > fitted.error.mean_mm == report.unplanted.mean_mm
     # Bones stay what they were, and the jump between the contacts has no step in it.
     parents = list(SKELETON.parents[1:])

@@ -15,8 +15,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from motionloom.datasets.motion.body import feet
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
-from motionloom.datasets.motion.body.feet import FeetOptions
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of, rotations_of
@@ -134,11 +134,14 @@ def test_faces_are_written_as_arkit_weights_by_the_users_bases(
         write_motions(tmp_path / "no", motions, ["arkit"], title="t", seed=0)
 
 
-def test_planted_feet_say_what_they_cost(motions: list[GeneratedMotion]) -> None:
+def test_planted_feet_say_what_they_cost(
+    motions: list[GeneratedMotion], monkeypatch: pytest.MonkeyPatch
+) -> None:
     # Trembling bones make the feet of these walks fast: they stand by a looser rule.
-    feet = FeetOptions(height=0.1, speed=2.0)
+    monkeypatch.setattr(feet, "HEIGHT", 0.1)
+    monkeypatch.setattr(feet, "SPEED", 2.0)
     plain = shown(motions[0], FigureOptions(plant_feet=False))
-    planted = shown(motions[0], FigureOptions(feet=feet))
+    planted = shown(motions[0])
     assert planted.feet is not None and plain.feet is None
     facts = planted.facts()
     assert facts["slide_after_cm_s"] < facts["slide_before_cm_s"]
