@@ -6,33 +6,15 @@ up, the rest pose is a T-pose that faces +Z, left is +X.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import model_validator
 
-from motionloom.datasets.schema import Config, UserError
-
-
-class SkeletonFile(Config):
-    """The JSON form of a skeleton."""
-
-    name: str
-    note: str = ""
-    joints: list[str]
-    parents: list[int]
-    offsets: list[tuple[float, float, float]]
-
-    @model_validator(mode="after")
-    def _consistent(self) -> SkeletonFile:
-        if not len(self.joints) == len(self.parents) == len(self.offsets):
-            raise ValueError("joints, parents and offsets must have one length")
-        if self.parents[:1] != [-1] or any(not 0 <= p < i for i, p in enumerate(self.parents) if i):
-            raise ValueError("joint 0 is the root (parent -1) and every parent comes before its child")
-        return self
+from motionloom.datasets.schema import UserError
 
 
 @dataclass(frozen=True)
@@ -108,5 +90,6 @@ def _load(name: str) -> Skeleton:
     if not path.is_file():
         known = sorted(p.name.removesuffix(".json") for p in folder.iterdir() if p.name.endswith(".json"))
         raise UserError(f"no skeleton '{name}'; known: {', '.join(known)}")
-    data = SkeletonFile.model_validate_json(path.read_text(encoding="utf-8"))
-    return Skeleton(data.name, tuple(data.joints), tuple(data.parents), tuple(data.offsets))
+    data = json.loads(path.read_text(encoding="utf-8"))
+    rest = tuple((float(x), float(y), float(z)) for x, y, z in data["offsets"])
+    return Skeleton(name, tuple(data["joints"]), tuple(data["parents"]), rest)

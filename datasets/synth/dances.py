@@ -158,19 +158,13 @@ class Dance:
         return self.start / fps
 
 
-def song_of(number: int, dances: DanceConfig, seed: int) -> Song:
-    """The song of dance `number`: all songs of the pool once, in shuffled order, before any comes again (for
-    `in_a_row` dances each).
-    """
-    turn, place = divmod(number // dances.in_a_row, dances.songs)
-    order = np.random.default_rng([seed, turn, 233]).permutation(dances.songs)
-    return dances.song(int(order[place]), seed)
-
-
 def plan_dance(number: int, index: int, dances: DanceConfig, seed: int, span: Span, fps: float) -> Dance:
     """Dance `number`, which is clip `index`."""
     rng = np.random.default_rng([seed, index, 0])
-    song = song_of(number, dances, seed)
+    # All songs of the pool once, in shuffled order, before any comes again (for `in_a_row` dances each).
+    turn, place = divmod(number // dances.in_a_row, dances.songs)
+    order = np.random.default_rng([seed, turn, 233]).permutation(dances.songs)
+    song = dances.song(int(order[place]), seed)
     whole = int(song.seconds * fps)
     frames = min(max(8, round(span.pick(rng, at_least=min(4.0, span.high)) * fps)), whole)
     start = int(rng.integers(whole - frames + 1))

@@ -49,7 +49,14 @@ def write_mp4(
     except ModuleNotFoundError:
         raise UserError(f"{path}: films need imageio-ffmpeg; pip install 'motionloom[film]'") from None
     width, height = (side + side % 2 for side in size)
-    actor = _actor(joints, skeleton, figure, face_controls)
+    exact = np.asarray(joints, np.float64)
+    if exact.ndim != 3 or exact.shape[1:] != (len(skeleton), 3) or not len(exact):
+        raise UserError(
+            f"joints must be [T, {len(skeleton)}, 3] for {skeleton.name}, got {list(exact.shape)}"
+        )
+    if not np.isfinite(exact).all():
+        raise UserError("joints hold NaN or infinity; nothing sensible can be filmed")
+    actor = Actor.of(exact, skeleton, figure, face_controls)
     frames = _frames(actor, fps, _subtitle(caption, (width, height)), (width, height))
     with atomic_path(path) as temporary:
         wav = temporary.with_suffix(".wav")
@@ -81,22 +88,6 @@ def write_mp4(
             raise UserError(
                 f"{path}: ffmpeg could not write the film ({reason}); is the disk full? No film is left there"
             )
-
-
-def _actor(
-    joints: NDArray[np.floating],
-    skeleton: Skeleton,
-    figure: RigidMotion | None,
-    face_controls: NDArray[np.floating] | None,
-) -> Actor:
-    exact = np.asarray(joints, np.float64)
-    if exact.ndim != 3 or exact.shape[1:] != (len(skeleton), 3) or not len(exact):
-        raise UserError(
-            f"joints must be [T, {len(skeleton)}, 3] for {skeleton.name}, got {list(exact.shape)}"
-        )
-    if not np.isfinite(exact).all():
-        raise UserError("joints hold NaN or infinity; nothing sensible can be filmed")
-    return Actor.of(exact, skeleton, figure, face_controls)
 
 
 def _frames(

@@ -89,7 +89,15 @@ def fit_rigid(
     `skeleton` names the joints and gives the rest directions. `rotations` [T, N, 3, 3] are local rotations
     where they are known: the search starts there.
     """
-    _check(joints, skeleton, rotations)
+    wanted = (len(skeleton), 3)
+    if joints.ndim != 3 or joints.shape[1:] != wanted or not len(joints):
+        raise UserError(
+            f"skeleton {skeleton.name} needs joints [T, {wanted[0]}, 3] with T > 0, not {list(joints.shape)}"
+        )
+    if not np.isfinite(joints).all():
+        raise UserError("joints hold NaN or infinite values: no skeleton can be fitted to them")
+    if rotations is not None and rotations.shape != (*joints.shape, 3):
+        raise UserError(f"rotations {list(rotations.shape)} do not fit joints {list(joints.shape)}")
     points = np.asarray(joints, dtype=np.float64)
     if rotations is None:
         own = measured_skeleton(points, skeleton)
@@ -190,18 +198,3 @@ def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
 def with_offsets(skeleton: Skeleton, offsets: NDArray[np.floating]) -> Skeleton:
     """The skeleton with other rest offsets [N, 3]."""
     return replace(skeleton, rest=tuple((float(x), float(y), float(z)) for x, y, z in offsets))
-
-
-def _check(joints: NDArray[np.floating], skeleton: Skeleton, rotations: NDArray[np.floating] | None) -> None:
-    wanted = (len(skeleton), 3)
-    if joints.ndim != 3 or joints.shape[1:] != wanted or not len(joints):
-        raise UserError(
-            f"skeleton {skeleton.name} needs joints [T, {wanted[0]}, 3] with T > 0, not {list(joints.shape)}"
-        )
-    if not np.isfinite(joints).all():
-        raise UserError("joints hold NaN or infinite values: no skeleton can be fitted to them")
-    if rotations is not None and rotations.shape != (*joints.shape, 3):
-        raise UserError(
-            f"rotations {list(rotations.shape)} do not fit joints {list(joints.shape)}: "
-            f"expected {[*joints.shape, 3]}"
-        )

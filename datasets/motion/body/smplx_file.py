@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.body.rigid import FitError, RigidMotion, on_bones
@@ -35,6 +34,8 @@ def smplx_parameters(
     motion: RigidMotion, fps: float, body: BodyModel | None = None
 ) -> tuple[dict[str, Any], FitError]:
     """The arrays of the file, and how far the posed body is from the motion on the body's bones."""
+    from scipy.spatial.transform import Rotation
+
     name = motion.skeleton.name
     if name not in ("smpl22", "smplx52"):
         raise UserError(f"skeleton {name} has no SMPL-X parameters; smpl22 and smplx52 have")
@@ -45,7 +46,31 @@ def smplx_parameters(
         raise UserError(f"the body model has {len(body.skeleton)} joints, the motion {count}: use SMPL-X")
     rest = body.rest_joints()[:count]
     worn = on_bones(motion, motion.skeleton.bones(rest))
-    return _arrays(worn.rotations, worn.root, rest[0], fps), worn.error
+    frames = len(worn.root)
+    upright = Rotation.from_euler("x", 90, degrees=True)  # Y up to Z up: +Z ahead becomes -Y
+    vectors = np.zeros((frames, BODY_JOINTS + FINGERS, 3))
+    turns = Rotation.from_matrix(worn.rotations.reshape(-1, 3, 3)).as_rotvec()
+    vectors[:, :count] = turns.reshape(frames, count, 3)
+    vectors[:, 0] = (upright * Rotation.from_matrix(worn.rotations[:, 0])).as_rotvec()
+    flat = vectors.reshape(frames, -1).astype(np.float32)
+    trunk, hands = flat[:, 3 : 3 * BODY_JOINTS], flat[:, 3 * BODY_JOINTS :]
+    jaw, eyes = np.zeros((frames, 3), np.float32), np.zeros((frames, 6), np.float32)
+    arrays = {
+        "poses": np.concatenate([flat[:, :3], trunk, jaw, eyes, hands], axis=1),
+        "root_orient": flat[:, :3],
+        "pose_body": trunk,
+        "pose_jaw": jaw,
+        "pose_eye": eyes,
+        "pose_hand": hands,
+        # A model turns its body about the pelvis, which stays at rest pelvis + trans.
+        "trans": (upright.apply(worn.root) - rest[0]).astype(np.float32),
+        "betas": np.zeros(_BETAS, np.float32),
+        "gender": np.array("neutral"),
+        "surface_model_type": np.array("smplx"),
+        "mocap_frame_rate": np.array(float(fps)),
+        "mocap_time_length": np.array(frames / fps),
+    }
+    return arrays, worn.error
 
 
 def write_smplx(path: Path, motion: RigidMotion, fps: float, body: BodyModel | None = None) -> FitError:
@@ -54,34 +79,3 @@ def write_smplx(path: Path, motion: RigidMotion, fps: float, body: BodyModel | N
     with atomic_file(path) as file:
         np.savez_compressed(file, **arrays)
     return error
-
-
-def _arrays(
-    rotations: NDArray[np.float64], root: NDArray[np.float64], pelvis: NDArray[np.float64], fps: float
-) -> dict[str, Any]:
-    from scipy.spatial.transform import Rotation
-
-    frames, count = rotations.shape[:2]
-    upright = Rotation.from_euler("x", 90, degrees=True)  # Y up to Z up: +Z ahead becomes -Y
-    vectors = np.zeros((frames, BODY_JOINTS + FINGERS, 3))
-    turns = Rotation.from_matrix(rotations.reshape(-1, 3, 3)).as_rotvec()
-    vectors[:, :count] = turns.reshape(frames, count, 3)
-    vectors[:, 0] = (upright * Rotation.from_matrix(rotations[:, 0])).as_rotvec()
-    flat = vectors.reshape(frames, -1).astype(np.float32)
-    body, hands = flat[:, 3 : 3 * BODY_JOINTS], flat[:, 3 * BODY_JOINTS :]
-    jaw, eyes = np.zeros((frames, 3), np.float32), np.zeros((frames, 6), np.float32)
-    return {
-        "poses": np.concatenate([flat[:, :3], body, jaw, eyes, hands], axis=1),
-        "root_orient": flat[:, :3],
-        "pose_body": body,
-        "pose_jaw": jaw,
-        "pose_eye": eyes,
-        "pose_hand": hands,
-        # A model turns its body about the pelvis, which stays at rest pelvis + trans.
-        "trans": (upright.apply(root) - pelvis).astype(np.float32),
-        "betas": np.zeros(_BETAS, np.float32),
-        "gender": np.array("neutral"),
-        "surface_model_type": np.array("smplx"),
-        "mocap_frame_rate": np.array(float(fps)),
-        "mocap_time_length": np.array(frames / fps),
-    }
