@@ -6,7 +6,6 @@ import asyncio
 import json
 import sys
 import traceback
-import uuid
 from collections.abc import AsyncIterator, Callable
 from importlib import resources
 from typing import TypeVar
@@ -128,17 +127,15 @@ class Site:
 
     async def generate(self, http: Request) -> Response:
         request, sound = await self._read_request(http, MotionRequest)
-        return await self._respond(http, request, lambda: make(self.model, request, sound, self.config))
+        return await self._respond(http, lambda: make(self.model, request, sound, self.config))
 
     async def edit(self, http: Request) -> Response:
         """A clip of which a part is made anew."""
         request, sound = await self._read_request(http, ChangeRequest)
-        return await self._respond(http, request, lambda: self.clips.change(request, sound))
+        return await self._respond(http, lambda: self.clips.change(request, sound))
 
-    async def _respond(
-        self, http: Request, request: MotionRequest | ChangeRequest, call: Callable[[], Answer]
-    ) -> Response:
-        answer, headers = await self._result(http, call), {"x-request": request.request}
+    async def _respond(self, http: Request, call: Callable[[], Answer]) -> Response:
+        answer, headers = await self._result(http, call), dict[str, str]()
         if answer.file:
             headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
         return Response(answer.body, media_type=answer.kind, headers=headers)
@@ -169,11 +166,9 @@ class Site:
                 words = str(error) if isinstance(error, UserError | Stopped) else _BROKEN
                 if words is _BROKEN:
                     traceback.print_exception(error, file=sys.stderr)
-                yield json.dumps({"error": words, "request": request.request}) + "\n"
+                yield json.dumps({"error": words}) + "\n"
 
-        return StreamingResponse(
-            body(), media_type="application/x-ndjson", headers={"x-request": request.request}
-        )
+        return StreamingResponse(body(), media_type="application/x-ndjson")
 
     async def add_sound(self, http: Request) -> Response:
         """Keep the sound file that the body is, under a name for later requests."""
@@ -210,21 +205,19 @@ class Site:
             raise HTTPException(400, "the request is not JSON") from None
         if not isinstance(fields, dict):
             raise HTTPException(400, 'the request is not a JSON object like {"caption": "a person waves"}')
-        http.state.name = _plain(fields.get("request") or "")
         request = kind.parse(fields, "request")
         request.require_within(self.config, self.model)
         sound = None if request.sound is None else self.sounds.kept.get(request.sound)
         if isinstance(request, ChangeRequest) and isinstance(request.clip, str):
             self.clips.kept.get(request.clip)
-        http.state.name = http.state.name or uuid.uuid4().hex
-        return request.model_copy(update={"request": http.state.name}), sound
+        return request, sound
 
 
 _REFUSALS = (HTTPException, UserError, ClientDisconnect, Busy, Stopped)
 
 
 async def refused(http: Request, error: Exception) -> Response:
-    """Return a refusal as JSON of one sentence, which names its request."""
+    """Return a refusal as JSON of one sentence."""
     status, words, headers = 400, str(error), dict[str, str]()
     if isinstance(error, HTTPException):
         status, headers = error.status_code, dict(error.headers or {})
@@ -233,10 +226,7 @@ async def refused(http: Request, error: Exception) -> Response:
         status, headers = 429, {"retry-after": "2"}
     elif isinstance(error, Stopped):
         status = 503
-    body = {"error": words}
-    if name := getattr(http.state, "name", ""):
-        body["request"] = headers["x-request"] = name
-    return JSONResponse(body, status, headers)
+    return JSONResponse({"error": words}, status, headers)
 
 
 async def broken(http: Request, error: Exception) -> Response:
@@ -247,11 +237,6 @@ async def broken(http: Request, error: Exception) -> Response:
 def _web_file(name: str) -> str:
     """Return the text of a file of the folder `web`."""
     return (resources.files("motionloom.pipeline.serve") / "web" / name).read_text(encoding="utf-8")
-
-
-def _plain(name: object) -> str:
-    """A request's name as a header can carry it."""
-    return "".join(letter for letter in str(name)[:64] if letter.isascii() and letter.isprintable()).strip()
 
 
 def _bytes(megabytes: float) -> int:

@@ -51,7 +51,6 @@ class ChangeRequest(Config):
     seed: int = Field(0, ge=0, lt=2**63)
     format: Annotated[str, AfterValidator(known_answer)] = "joints"
     """As of `MotionRequest`; the viewer's data hold the clip and the result."""
-    request: str = Field("", max_length=64)
 
     @property
     def sound(self) -> str | None:
@@ -121,14 +120,14 @@ class Clips:
         if isinstance(given, str):
             clip, motion = given, self.kept.get(given)
         else:
-            clip = _name_of(given.model_dump(mode="json", exclude={"format", "request"}, exclude_unset=True))
+            clip = _name_of(given.model_dump(mode="json", exclude={"format"}, exclude_unset=True))
             motion = self.kept.made(clip, lambda: motion_of(self._model, given, sound, self._config))
         name = _name_of({"clip": clip, "task": asked.task.dump(), "seed": asked.seed})
         made = self.kept.made(name, lambda: self._model.edit(motion, asked.task, seed=asked.seed)[0])
         assert isinstance(made, EditedMotion)
         # JSON knows no NaN, which stands for what a task does not ask.
         report = {key: None if value != value else value for key, value in asdict(made.report).items()}
-        facts = {"request": asked.request, "clip": name, "seed": asked.seed, "notes": list(made.remarks)}
+        facts = {"clip": name, "seed": asked.seed, "notes": list(made.remarks)}
         cells = {"before": made.original, "after": made}
         note = "\n".join(made.report.lines())
         return answer(made, asked.format, {**facts, "report": report}, note, cells)

@@ -102,8 +102,6 @@ class MotionRequest(Config):
     top_p: float = Field(0.95, gt=0, le=1)
     format: Annotated[str, AfterValidator(known_answer)] = "joints"
     """Numbers (`joints`), the viewer's data (`viewer`), or a file of a quick format of `WRITERS`."""
-    request: str = Field("", max_length=64)
-    """A name for the answer to bear; made up where it is empty."""
 
     def require_within(self, limits: ServeConfig, model: MotionModel) -> None:
         """Refuse what is too much; `UserError` in one sentence."""
@@ -154,7 +152,7 @@ def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: 
     """The motion that is asked for, in its format."""
     motion = motion_of(model, asked, sound, limits)
     notes = notes_of(model, asked, sound, motion)
-    facts = {"request": asked.request, "seed": asked.seed, "face": asked.face, **notes}
+    facts = {"seed": asked.seed, "face": asked.face, **notes}
     return answer(motion, asked.format, facts, "\n".join(notes["notes"]), {"generated": motion})
 
 
@@ -185,8 +183,9 @@ def motion_of(
 def lines(
     model: MotionModel, name: str, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
 ) -> Iterator[str]:
-    """JSON lines of a stream of the model of this name, at most as long as the server allows; the first names
-    the request and has its notes.
+    """JSON lines of a stream of the model of this name, at most as long as the server allows.
+
+    The first line has the notes.
     """
     longest = limits.max_seconds if sound is None else min(sound.seconds, limits.max_seconds)
     caption = asked.caption if asked.caption.strip() else None
@@ -195,7 +194,7 @@ def lines(
     )
     made = MotionStream(model.bundle, segments, seed=asked.seed, sampling=asked.sampling)
     facts = json.loads(heading(made.layout, asked.seed, name))
-    yield json.dumps({"request": asked.request, **facts, **notes_of(model, asked, sound)}) + "\n"
+    yield json.dumps({**facts, **notes_of(model, asked, sound)}) + "\n"
     for chunk in made:
         yield "".join(frame_lines(chunk))
 

@@ -46,7 +46,7 @@ function wanted() {
 }
 
 async function generate() {
-  const mine = ++turn, body = { ...wanted(), format: "viewer", request: `page-${Date.now()}-${turn}` };
+  const mine = ++turn, body = { ...wanted(), format: "viewer" };
   if (!body.caption && !body.sound) {
     say(info.modalities.includes("audio") ? "Say what the person does, or choose music." : "Say what the person does.", true);
     one("caption").focus();
@@ -58,7 +58,6 @@ async function generate() {
   try {
     const answer = await (await post("/api/generate", body)).json();
     if (mine !== turn) return;
-    if (answer.request !== body.request) throw new Error("this answer belongs to another request; try again");
     show(answer, body);
     say(`${answer.seconds.toFixed(1)} s of motion, made in ${((performance.now() - began) / 1000).toFixed(1)} s, seed ${answer.seed}`);
   } catch (error) {
@@ -78,7 +77,7 @@ function mount(data, over) {
 function show(answer, body) {
   mount(answer.viewer);
   savable({ path: "/api/generate", body });
-  const { format, request, ...ref } = body;
+  const { format, ...ref } = body;
   current = { ref, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, face: answer.face, name: answer.caption || "a dance" };
   note(answer.notes, answer.nearest);
 }
