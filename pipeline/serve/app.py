@@ -28,7 +28,7 @@ from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, why_not
 from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
-from motionloom.pipeline.serve.work import Busy, Stopped, Worker
+from motionloom.pipeline.serve.work import Busy, Worker
 
 T = TypeVar("T")
 RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
@@ -163,7 +163,7 @@ class Site:
                     call = self.worker.submit(lambda: next(made, ""), begun=True)
                     piece = await asyncio.wrap_future(call)
             except Exception as error:
-                words = str(error) if isinstance(error, UserError | Stopped) else _BROKEN
+                words = str(error) if isinstance(error, UserError) else _BROKEN
                 if words is _BROKEN:
                     traceback.print_exception(error, file=sys.stderr)
                 yield json.dumps({"error": words}) + "\n"
@@ -213,7 +213,7 @@ class Site:
         return request, sound
 
 
-_REFUSALS = (HTTPException, UserError, ClientDisconnect, Busy, Stopped)
+_REFUSALS = (HTTPException, UserError, ClientDisconnect, Busy)
 
 
 async def refused(http: Request, error: Exception) -> Response:
@@ -224,8 +224,6 @@ async def refused(http: Request, error: Exception) -> Response:
         words = {404: "no such page", 405: "no such method here"}.get(status, error.detail)
     elif isinstance(error, Busy):
         status, headers = 429, {"retry-after": "2"}
-    elif isinstance(error, Stopped):
-        status = 503
     return JSONResponse({"error": words}, status, headers)
 
 

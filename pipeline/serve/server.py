@@ -6,7 +6,6 @@ import os
 import socket
 from contextlib import closing
 from pathlib import Path
-from types import FrameType
 
 import numpy as np
 import uvicorn
@@ -33,7 +32,7 @@ def serve(folder: Path | str, config: ServeConfig, *, device: str = "auto", cons
         model = MotionModel.from_pretrained(place, device=device)
         warm(model)
         worker, name = Worker(config.waiting), Path(folder).resolve().name
-        server = server_of(Site(model, config, worker, name), worker)
+        server = server_of(Site(model, config, worker, name))
         host, port = listener.getsockname()[:2]
         address = f"[{host}]" if ":" in host else host
         if not is_loopback(config.host):
@@ -67,7 +66,7 @@ def listen(config: ServeConfig) -> socket.socket:
     return listener
 
 
-def server_of(site: Site, worker: Worker) -> uvicorn.Server:
+def server_of(site: Site) -> uvicorn.Server:
     """Return the HTTP server of a site."""
     config = uvicorn.Config(
         site.app,
@@ -84,19 +83,7 @@ def server_of(site: Site, worker: Worker) -> uvicorn.Server:
         timeout_keep_alive=10,
         timeout_graceful_shutdown=_GRACE,
     )
-    return _Server(config, worker)
-
-
-class _Server(uvicorn.Server):
-    """Stops its worker at the first signal, so that waiting requests are answered before it ends."""
-
-    def __init__(self, config: uvicorn.Config, worker: Worker) -> None:
-        super().__init__(config)
-        self._worker = worker
-
-    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        self._worker.stop()
-        return super().handle_exit(sig, frame)
+    return uvicorn.Server(config)
 
 
 def warm(model: MotionModel) -> None:

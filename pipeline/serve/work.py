@@ -6,21 +6,15 @@ before it is begun.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-_STOPPING = "the server is stopping"
 
 
 class Busy(Exception):  # noqa: N818 - an answer, not a fault
     """The largest allowed number of requests waits."""
-
-
-class Stopped(Exception):  # noqa: N818
-    """The server is stopping."""
 
 
 class Worker:
@@ -34,17 +28,12 @@ class Worker:
         self.waiting = waiting
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="model")
         self._calls: list[Future[Any]] = []
-        self._stopped = threading.Event()
 
     def submit(self, call: Callable[[], T], *, begun: bool = False) -> Future[T]:
-        """The future of a call; `Busy` where too many wait, unless it goes on with one that was begun;
-        `Stopped` after `stop`.
-        """
-        if self.stopped:
-            raise Stopped(_STOPPING)
+        """The future of a call; `Busy` where too many wait, unless it goes on with one that was begun."""
         if self.length >= self.waiting and not begun:
             raise Busy(f"{self.waiting} requests are waiting already; try again in a moment")
-        future = self._pool.submit(self._begin, call)
+        future = self._pool.submit(call)
         self._calls.append(future)
         return future
 
@@ -54,17 +43,6 @@ class Worker:
         self._calls = [future for future in self._calls if not future.done()]
         return sum(not future.running() for future in self._calls)
 
-    @property
-    def stopped(self) -> bool:
-        """Whether `stop` was called; long calls look at it."""
-        return self._stopped.is_set()
-
     def stop(self) -> None:
-        """Answer all that wait with `Stopped`; what runs is let finish."""
-        self._stopped.set()
-        self._pool.shutdown(wait=False)
-
-    def _begin(self, call: Callable[[], T]) -> T:
-        if self.stopped:
-            raise Stopped(_STOPPING)
-        return call()
+        """Drop all that wait; what runs is let finish."""
+        self._pool.shutdown(wait=False, cancel_futures=True)

@@ -164,7 +164,7 @@ class Served:
 def _run_server(model: Any, **settings: Any) -> Iterator[Served]:
     config = ServeConfig(port=0, **settings)
     place, worker = listen(config), Worker(config.waiting)
-    server = server_of(Site(model, config, worker, "quick"), worker)
+    server = server_of(Site(model, config, worker, "quick"))
     thread = threading.Thread(target=server.run, args=([place],), daemon=True)
     thread.start()
     made = Served(place.getsockname()[1], server, worker, thread)

@@ -277,20 +277,15 @@ def test_who_goes_away_is_not_served(run_server: Callable[..., Any], quick: Any)
     assert quick.asked == ["a person waves", "a person waves"]
 
 
-def test_the_end_answers_everybody(run_server: Callable[..., Any], quick: Any) -> None:
+def test_the_end_answers_what_has_begun(run_server: Callable[..., Any], quick: Any) -> None:
     quick.open.clear()
-    with run_server(quick) as served, ThreadPoolExecutor(4) as clients:
+    with run_server(quick) as served, ThreadPoolExecutor(1) as clients:
         runs = clients.submit(served.post, "/api/generate", WAVE)
         served.wait_for(lambda: bool(quick.asked))
-        wait = [clients.submit(served.post, "/api/generate", WAVE) for _ in range(3)]
-        served.wait_for(lambda: served.worker.length == 3)
         served.server.handle_exit(signal.SIGINT, None)
         quick.open.set()
         assert runs.result().status == 200
-        said = [answer.result() for answer in wait]
         served.thread.join(20)
-    assert [got.status for got in said] == [503] * 3
-    assert said[2].json["error"]
 
 
 def test_a_taken_port_is_one_sentence() -> None:
@@ -326,7 +321,7 @@ def test_the_command_says_where_and_who_can_reach_it(
 
     monkeypatch.setattr(server.MotionModel, "from_pretrained", lambda *_, **options: quick)
     monkeypatch.setattr(server, "warm", lambda model: None)
-    monkeypatch.setattr(server, "server_of", lambda site, worker: Interrupted())
+    monkeypatch.setattr(server, "server_of", lambda site: Interrupted())
     said = Console(file=io.StringIO(), width=200)
     server.serve(tmp_path, ServeConfig(host=host, port=0), console=said)
     text = said.file.getvalue()  # type: ignore[attr-defined]
