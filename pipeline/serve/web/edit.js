@@ -1,6 +1,6 @@
 /* Changing a motion: the panel below the figure, what it holds, and what it asks of the server. */
 
-import { buildLanes } from "./lanes.js";
+import { buildLanes, element } from "./lanes.js";
 import { figureTools } from "./figure.js";
 import { HANDLES, History, freshState, mark, missing, paceOf, pin, resize, rowsOf, say, taskOf, walk } from "./task.js";
 
@@ -90,9 +90,8 @@ export function makeEditor(page) {
 
   /* Something that was dragged or drawn: goes to its time, or takes it away. */
   function chip({ words, frame, joint, drop }) {
-    const node = document.createElement("span"), to = document.createElement("button"), off = document.createElement("button");
-    to.type = off.type = "button";
-    to.textContent = words;
+    const to = element("button", { type: "button", textContent: words, onclick: () => { viewer.play(false); viewer.setFrame(frame); } });
+    const title = `Take away: ${words}`, off = element("button", { type: "button", textContent: "×", title, ariaLabel: title, onclick: () => change(drop, true) });
     if (joint) {
       to.title = "Arrow keys move it, with Shift in large steps";
       to.addEventListener("keydown", (event) => {
@@ -103,13 +102,7 @@ export function makeEditor(page) {
         nudge(joint, ...way.map((v) => v * PIXELS * (event.shiftKey ? 4 : 1)));
       });
     }
-    off.textContent = "×";
-    off.title = `Take away: ${words}`;
-    off.setAttribute("aria-label", off.title);
-    to.addEventListener("click", () => { viewer.play(false); viewer.setFrame(frame); });
-    off.addEventListener("click", () => change(drop, true));
-    node.append(to, off);
-    return node;
+    return element("span", {}, to, off);
   }
 
   /* Moves a joint at the frame that is shown, and leaves the keys with it. */

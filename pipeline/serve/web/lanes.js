@@ -6,7 +6,8 @@ const STAYS = "stays as it is", NEW = "made anew", PARTLY = "stays in part";
 const TAP = 4; // pixels that a finger may slip in a tap
 const SAID = 1.0; // seconds of words that a tap begins
 
-function element(tag, properties, ...children) {
+/* A node with properties and children. */
+export function element(tag, properties, ...children) {
   const node = Object.assign(document.createElement(tag), properties);
   node.append(...children);
   return node;

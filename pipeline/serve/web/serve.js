@@ -1,6 +1,7 @@
 /* The page of `motionloom serve`: asks for a motion and shows it. Everything that is shown goes through `textContent`. */
 
 import { makeEditor } from "./edit.js";
+import { element } from "./lanes.js";
 
 const one = (id) => document.getElementById(id);
 const form = one("ask"), status = one("status"), go = one("go"), save = one("save");
@@ -92,20 +93,12 @@ function savable(what) {
 }
 
 /* Captions to be clicked. */
-const choices = (captions) => captions.map((caption) => {
-  const known = document.createElement("button");
-  known.type = "button";
-  known.textContent = caption;
-  known.addEventListener("click", () => { one("caption").value = caption; generate(); });
-  return known;
-});
+const choices = (captions) => captions.map((caption) => element("button", {
+  type: "button", textContent: caption, onclick: () => { one("caption").value = caption; generate(); },
+}));
 
 function note(lines, captions) {
-  notes.replaceChildren(...lines.map((words) => {
-    const line = document.createElement("p");
-    line.textContent = words;
-    return line;
-  }), ...choices(captions));
+  notes.replaceChildren(...lines.map((words) => element("p", { textContent: words })), ...choices(captions));
   notes.hidden = !notes.children.length;
 }
 
@@ -114,9 +107,7 @@ async function keep(format) {
     const answer = await post(asked.path, { ...asked.body, format });
     const name = /filename\*=UTF-8''(.+)/.exec(answer.headers.get("content-disposition") || "");
     const address = URL.createObjectURL(await answer.blob());
-    const link = document.createElement("a");
-    link.href = address;
-    link.download = name ? decodeURIComponent(name[1]) : `motion.${format}`;
+    const link = element("a", { href: address, download: name ? decodeURIComponent(name[1]) : `motion.${format}` });
     link.click();
     setTimeout(() => URL.revokeObjectURL(address), 10000);
     say(`Saved ${link.download}`);
