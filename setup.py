@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from setuptools import setup
+from setuptools.command.build_py import build_py
 
 ROOTS = ("configs", "datasets", "models", "pipeline")
 
@@ -19,4 +20,11 @@ def packages() -> list[str]:
     return ["motionloom", *sorted(".".join(("motionloom", *folder.parts)) for folder in folders)]
 
 
-setup(packages=packages())
+class BuildPackages(build_py):
+    """Takes this file, which lies beside `__init__.py`, for no module."""
+
+    def find_package_modules(self, package: str, folder: str) -> list[tuple[str, str, str]]:
+        return [module for module in super().find_package_modules(package, folder) if module[1] != "setup"]
+
+
+setup(packages=packages(), cmdclass={"build_py": BuildPackages})
