@@ -25,7 +25,13 @@ PROJECT = CONFIG["project"]
 # Imported by Lightning's loggers, which are what we import.
 THROUGH_LIGHTNING = {"tensorboard", "wandb", "mlflow"}
 
-BROUGHT = {"tokenizers": "transformers", "soxr": "librosa", "pydantic-core": "pydantic"}
+BROUGHT = {
+    "tokenizers": "transformers",
+    "soxr": "librosa",
+    "numba": "librosa",
+    "llvmlite": "numba",
+    "pydantic-core": "pydantic",
+}
 """Imported by us too, and required by a package that we require."""
 
 
@@ -110,7 +116,7 @@ def test_everything_declared_is_imported() -> None:
 def test_what_others_bring_they_require() -> None:
     for name, other in BROUGHT.items():
         needed = [one for one in requires(other) or () if "extra ==" not in one]
-        assert other in REQUIRED and name in declared(needed)
+        assert other in REQUIRED | BROUGHT.keys() and name in declared(needed)
 
 
 def test_nothing_is_both_required_and_optional() -> None:
@@ -119,7 +125,10 @@ def test_nothing_is_both_required_and_optional() -> None:
 
 BESIDE = (".ci", "benchmarks", "docs", "tests")
 """Folders of the source distribution that are no part of the package."""
+TOP = ("__init__.py", "__init__.pyi", "py.typed")
+"""Files of the package itself, beside its folders."""
 ALONE = (
+    *TOP,
     ".gitignore",
     ".pre-commit-config.yaml",
     "CHANGELOG.md",
@@ -130,6 +139,7 @@ ALONE = (
     "README.md",
     "constraints.txt",
     "pyproject.toml",
+    "setup.py",
 )
 
 
@@ -178,8 +188,8 @@ def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
     """Recipes, the papers' tables, skeletons, models, READMEs, the pages' css, js and html."""
     with zipfile.ZipFile(wheel) as archive:
         inside = {name for name in archive.namelist() if ".dist-info/" not in name}
-    assert inside == {f"motionloom/{name}" for name in files_of(*FOLDERS)}
-    kinds = {".py", ".yaml", ".json", ".css", ".js", ".html", ".npz", ".typed", ".md"}
+    assert inside == {f"motionloom/{name}" for name in (*TOP, *files_of(*FOLDERS))}
+    kinds = {".py", ".pyi", ".yaml", ".json", ".css", ".js", ".html", ".npz", ".typed", ".md"}
     if any((ROOT / "models" / "pretrained").glob("*/bundle.json")):
         kinds |= {".safetensors"}
     assert {Path(name).suffix or Path(name).name for name in inside} == kinds
