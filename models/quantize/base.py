@@ -226,10 +226,22 @@ def draw_rows(rows: Tensor, mask: Tensor | None, count: int, *, salt: int, step:
     return torch.where(((mine >= 0) & (mine < len(local)))[:, None], picked, 0.0)
 
 
+_TIE = 4e-6
+"""Rounding of a dot product of some hundred float32 numbers, relative to the squares of both sides."""
+
+
 def nearest(z: Tensor, codebook: Tensor) -> Tensor:
-    """Index of the nearest code by squared distance; z [n, d], codebook [K, d] -> int64 [n]."""
+    """Index of the nearest code by squared distance; z [n, d], codebook [K, d] -> int64 [n].
+
+    Of codes that are equally near up to rounding it is the first: a young codebook holds many that are almost
+    the same, and which of them were used, hence which are reset, must not depend on the order of sums, which
+    another number of processes changes.
+    """
     # |z|^2 does not change the order, so one matmul with |e|^2 as its bias is the whole distance.
-    return torch.addmm(codebook.square().sum(1), z, codebook.t(), alpha=-2).argmin(1)
+    norms = codebook.square().sum(1)
+    distances = torch.addmm(norms, z, codebook.t(), alpha=-2)
+    most = distances.amin(1) + _TIE * (z.square().sum(1) + norms.max())
+    return (distances <= most[:, None]).to(torch.uint8).argmax(1)
 
 
 def hash32(x: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from motionloom.models.quantize.base import QuantizerConfig
+from motionloom.models.quantize.base import QuantizerConfig, nearest
 from motionloom.models.quantize.ema import EmaQuantizer, ResidualQuantizer
 from motionloom.models.quantize.fsq import FsqQuantizer
 from motionloom.models.quantize.gradient import GradientQuantizer, GradientQuantizerConfig
@@ -49,3 +49,13 @@ def test_masked_batch_equals_truncated_batch(make: Callable[[], nn.Module], padd
             assert wide.grad is not None and (wide.grad[:, 12:] == 0).all()
     for name, value in plain.state_dict().items():
         torch.testing.assert_close(padded.state_dict()[name], value)
+
+
+def test_the_first_of_codes_that_are_equally_near_is_taken() -> None:
+    """Whatever the order of sums: codes that differ by rounding share no rows, others have their own."""
+    torch.manual_seed(0)
+    rows, codes = torch.randn(400, 64) * 5, torch.randn(40, 64) * 5
+    doubled = torch.cat([codes, codes * (1 + 1e-7 * torch.randn(40, 1))])
+    found = nearest(rows, doubled)
+    assert torch.equal(found, nearest(rows, codes)) and found.max() < 40
+    assert torch.equal(found, torch.cdist(rows.double(), codes.double()).argmin(1))
