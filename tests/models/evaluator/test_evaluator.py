@@ -14,7 +14,7 @@ from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.evaluator.losses import EvaluatorLossConfig, matching_loss, movement_loss
 from motionloom.models.evaluator.module import EvaluatorModule
-from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig, SequenceEncoder
+from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.models.training.optim import OptimConfig
 
 LAYOUT = MotionLayout.named("h3d263")
@@ -56,37 +56,6 @@ def test_what_a_motion_is_batched_with_plays_no_part() -> None:
     torch.testing.assert_close(net.encode_motion(other, LENGTH)[1], together[1], rtol=1e-9, atol=1e-12)
     other[1, 35] = 9.0
     assert (net.encode_motion(other, LENGTH)[1] - together[1]).abs().max() > 1e-4
-
-
-@pytest.mark.usefixtures("float64")
-def test_a_motion_is_followed_by_frames_of_zero_up_to_the_longest() -> None:
-    """As published, where all are padded to 196: a full one ends at the convolutions' own edge."""
-    short, long = network(), network()
-    long.max_frames = 400
-    motion = batch()["motion"]
-    lengths = torch.full((len(motion),), 40)
-    assert (short.encode_motion(motion, lengths) - long.encode_motion(motion, lengths)).abs().max() > 1e-4
-    lengths -= 4
-    torch.testing.assert_close(short.encode_motion(motion, lengths), long.encode_motion(motion, lengths))
-
-
-@pytest.mark.usefixtures("float64")
-def test_sequences_are_read_both_ways_as_packed_ones_are() -> None:
-    torch.manual_seed(0)
-    net = SequenceEncoder(4, 6, 3)
-    twin = torch.nn.GRU(6, 6, batch_first=True, bidirectional=True)
-    state = {}
-    for gru, end in ((net.ahead, ""), (net.back, "_reverse")):
-        state |= {f"{name}{end}": value for name, value in gru.state_dict().items()}
-    twin.load_state_dict(state)
-    x, length = torch.randn(5, 9, 4), torch.tensor([9, 1, 4, 8, 2])
-    packed = torch.nn.utils.rnn.pack_padded_sequence(
-        net.project(x), length, batch_first=True, enforce_sorted=False
-    )
-    _, last = twin(packed, net.start[:, None].expand(2, 5, 6).contiguous())
-    h = net.norm(net.narrow(torch.cat([last[0], last[1]], dim=-1)))
-    expected = net.out(torch.where(h > 0, h, 0.2 * h))
-    torch.testing.assert_close(net(x, length), expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.usefixtures("float64")

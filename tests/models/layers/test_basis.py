@@ -12,7 +12,6 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.layers.basis import Basis
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.module import TokenizerModule
-from motionloom.models.tokenizer.single import RvqConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.evaluation.reference_baselines import local_joints
 
@@ -94,25 +93,6 @@ def test_without_gains_nothing_changes_and_nothing_is_saved() -> None:
 
 
 SIZES = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8, "reset_below": 0.1}
-
-
-@pytest.mark.parametrize("config", [H2VQConfig, RvqConfig])
-def test_a_tokenizer_with_gains_gives_the_papers_features(config: type[H2VQConfig | RvqConfig]) -> None:
-    torch.manual_seed(0)
-    settings = config.model_validate({**SIZES, "root_gain": 5.0, "finger_gain": 2.0})
-    net = settings.build(LAYOUT)
-    net.basis.learn(MEAN[LAYOUT.part("bodyhand")], STD[LAYOUT.part("bodyhand")])
-    x, length = torch.randn(2, 16, 313), torch.tensor([16, 8])
-    x[1, 8:] = 0
-    codes = net.eval().encode(x, length)
-    out = net(x, length)
-    recon = net.features(out.reconstruction, length)
-    # The palms of these random hands magnify float32's rounding some hundred times.
-    torch.testing.assert_close(net.decode(codes, length), recon, rtol=1e-3, atol=1e-3)
-    assert not recon[1, 8:].any(), "padding stays zero"
-    again = settings.build(LAYOUT)
-    again.load_state_dict(net.state_dict())
-    torch.testing.assert_close(again.eval().decode(codes, length), recon, rtol=1e-3, atol=1e-3)
 
 
 def test_the_loss_is_of_what_is_seen() -> None:

@@ -345,38 +345,29 @@ def test_evaluate_runs_every_stage_of_figures(run: tuple[Path, str]) -> None:
         assert file.of("movement.mm_k") is None or path.parent.name == "evaluate_dances", "decoded twice"
 
 
-MUSIC_ONLY = """
+TINY = "train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}"
+MUSIC_ONLY = f"""
+extends: ude-tiny
 name: music
-seed: 7
-hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+hardware: {{accelerator: cpu, threads: 1, convert_workers: 1}}
 stages:
   data:
-    kind: synth
-    layout: wholebody363
-    clips: 18
-    fps: 20
-    actions: [dance]
-    max_seconds: 5
-    test_fraction: 0.34
-    val_fraction: 0.17
-    dances: {songs: 6, song_seconds: 6, conditions: {audio: 1, both: 0}}
-  stats: {kind: stats}
-  audio: {kind: audio}
-  tokenizer:
-    kind: mq
-    net: {part: all, width: 16, depth: 1, code_dim: 8, num_codes: 16}
-    train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
+    {{clips: 18, layout: wholebody363, actions: [dance], max_seconds: 5, test_fraction: 0.34,
+     val_fraction: 0.17, dances: {{songs: 6, song_seconds: 6, share: 1, conditions: {{audio: 1, both: 0}}}}}}
+  text: null
+  tma: null
+  dmd: null
+  evaluate_dances: null
+  tokenizer: {{net: {{width: 16, code_dim: 8, num_codes: 16}}, {TINY}}}
   utt:
-    kind: utt
     modalities: [audio]
-    net: {layers: 1, dim: 16, heads: 2, ff: 16, block_size: 48, z_dim: 4}
-    mate: {dim: 16, layers: 1, heads: 2, ff: 16}
-    loss: {adversarial_start: 2, adversarial_ramp: 2, discriminator: {dim: 16, ff: 16, heads: 2}}
-    train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}
-  ude: {kind: ude}
-  generate: {kind: generate, dances: 1, formats: [npz]}
-  evaluate: {kind: evaluate, clips: 3, repeats: 1}
-  report: {kind: report, dances: 1}
+    net: {{layers: 1, dim: 16, heads: 2, ff: 16, z_dim: 4}}
+    mate: {{dim: 16, layers: 1, heads: 2, ff: 16}}
+    loss: {{adversarial_start: 2, adversarial_ramp: 2, discriminator: {{dim: 16, ff: 16, heads: 2}}}}
+    {TINY}
+  generate: {{dances: 1, formats: [npz]}}
+  evaluate: {{clips: 3, repeats: 1}}
+  report: {{dances: 1}}
 """
 
 

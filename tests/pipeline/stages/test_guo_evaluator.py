@@ -299,15 +299,5 @@ def test_a_run_is_judged_by_it(
     facts = made["evaluator.top-1"].protocol
     assert (facts["clips"], facts["candidates"]) == (10, 4)
     assert made["evaluator.matching_score"].value > 0 and made["evaluator.multimodality"].value > 0
-    done = call("retrieval", tmp_path / "run", "--stage", "guo")
-    assert done.code == 0, done.err
-    record = json.loads((tmp_path / "run/retrieval-guo.json").read_text())
-    about, facts = record["about"], next(iter(record["protocol"].values()))
-    assert (about["kind"], about["sha256"], about["untagged"]) == ("guo_evaluator", weights, "refuse")
-    assert (facts["split"], facts["clips"], facts["distance"]) == ("test", 10, "euclidean")
-    assert {one["name"][0] for one in record["figures"]} == set("ABCD"), "the run has a text stage"
     done = call("run", tmp_path / "plain.yaml", "--out", tmp_path / "plain-run")
     assert done.code == 2 and "word/POS tags" in done.err
-    other = ("--set", "guo.untagged=other")
-    done = call("run", tmp_path / "plain.yaml", "--out", tmp_path / "plain-run", *other)
-    assert done.code == 0, done.err

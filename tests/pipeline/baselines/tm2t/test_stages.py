@@ -125,18 +125,12 @@ def test_captions_are_measured_beside_those_that_need_no_model(
     assert value("bert", OWN_CAPTION) > value("bert", COMMON_CAPTION)
 
 
-def test_text_to_motion_is_trained_killed_exported_and_asked(
+def test_text_to_motion_is_trained_exported_and_asked(
     trained: Path, recipe: Path, tmp_path: Path, call: Callable[..., Any]
 ) -> None:
     """Beside the GPT of the run, as a stage that a recipe lists."""
     folder = trained / "stages/seq2seq"
     assert call("run", recipe, "--out", trained, "--until", "seq2seq").code == 0
-    whole = (folder / "artifact.json").read_bytes()
-    for name in ("artifact.json", "model.json", "model.safetensors", "checkpoints/step=00000006.ckpt"):
-        (folder / name).unlink()
-    done = call("run", recipe, "--out", trained, "--until", "seq2seq")
-    assert done.code == 0 and "seq2seq at step 4" in done.out
-    assert (folder / "artifact.json").read_bytes() == whole
     logged = [row for row in read_training_log(folder) if "val/inverse" in row]
     assert [row["step"] for row in logged] == [2, 4, 6]
 
