@@ -89,10 +89,8 @@ def foot_contact_score(joints: NDArray[np.floating], fps: float) -> float:
     return float((left * right * strength / top).mean() * 10_000)
 
 
-def foot_skating(
-    joints: NDArray[np.floating], fps: float, *, height: float = 0.05, speed: float = 0.5
-) -> float:
-    """Share of the steps in which a foot slides: low (`height`, metres) and fast (`speed`, m/s) **[ours]**.
+def foot_skating(joints: NDArray[np.floating], fps: float) -> float:
+    """Share of the steps in which a foot slides: below 0.05 m and faster than 0.5 m/s **[ours]**.
 
     Joints [T >= 2, N >= 12, 3], Y up; the floor is the lowest joint of the motion. A step of the toes
     from frame t to t + 1 counts as low when both its frames are; each foot counts on its own.
@@ -101,8 +99,8 @@ def foot_skating(
     if x.ndim != 3 or len(x) < 2 or x.shape[1] < 12:
         raise UserError(f"foot skating needs joints [T >= 2, N >= 12, 3], not {list(x.shape)}")
     toes = x[:, [toe for _, toe in _ANKLES_TOES]]
-    low = toes[..., 1] - x[..., 1].min() < height
-    fast = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps > speed
+    low = toes[..., 1] - x[..., 1].min() < 0.05
+    fast = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps > 0.5
     return float((low[1:] & low[:-1] & fast).mean())
 
 

@@ -1,4 +1,7 @@
-"""A band that plays songs, with the sounds of real instruments (`instruments.py`).
+"""A band that plays songs, with the sounds of real instruments: FluidSynth with a General MIDI sound font.
+
+Needs `pip install 'motionloom[band]'`, the library FluidSynth and a sound font: the file that
+`MOTIONLOOM_SOUND_FONT` names, or FluidR3 (MIT licence; Debian's `fluid-soundfont-gm`).
 
 What it plays is a pure function of the song: a line-up (a whole drum kit, one that leaves out beats, hats or
 hands alone, none at all), a feel (straight, swung, half-time, double-time, syncopated), harmony, bass, pads,
@@ -8,16 +11,26 @@ unevenness of hands. In a break one chord rings. Beats are those of the song's g
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.synth.music.instruments import DRUMS, Instruments
+from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.song import Section, Song
+
+SOUND_FONT = Path("/usr/share/sounds/sf2/FluidR3_GM.sf2")
+DRUMS = 9
+"""The channel of drums."""
+_DRUM_BANK = 128
+
+Stroke = tuple[float, int, Callable[[], object]]
+"""When in seconds, what comes first of what is at one time (the lower), and what is done."""
 
 _KICK, _SNARE, _CLAP, _HAT, _OPEN_HAT, _CRASH, _RIDE, _SHAKER, _RIM = 36, 38, 39, 42, 46, 49, 51, 70, 37
 _TOMS = (50, 48, 45, 43)
@@ -31,6 +44,59 @@ _PROGRAMS = {
 }
 _SOFT_HANDS = 0.006
 """Seconds that hands are early or late, standard deviation."""
+
+
+class Instruments:
+    """Sixteen players, dry and at the rate of the samples."""
+
+    def __init__(self, rate: int) -> None:
+        try:
+            import fluidsynth
+        except ImportError as error:  # the binding, or the library that it binds
+            raise UserError(
+                f"songs of `music: played` need FluidSynth ({error}); pip install 'motionloom[band]' and the "
+                f"library (Debian: apt install libfluidsynth3)"
+            ) from None
+        font = sound_font()
+        dry = {"synth.reverb.active": 0, "synth.chorus.active": 0}
+        self.rate = rate
+        self.synth: Any = fluidsynth.Synth(gain=0.5, samplerate=rate, channels=16, **dry)
+        self._font = self.synth.sfload(str(font))
+
+    def select(self, channel: int, program: int) -> None:
+        """Give a channel the instrument of a General MIDI number from 0; that of drums a kit."""
+        self.synth.program_select(channel, self._font, _DRUM_BANK if channel == DRUMS else 0, program)
+
+    def play(self, strokes: Iterable[Stroke], seconds: float) -> NDArray[np.float32]:
+        """Strokes in any order -> dry mono samples [seconds * rate], loudest 1. The players then go home."""
+        total = round(seconds * self.rate)
+        timed = sorted(
+            ((round(at * self.rate), first, do) for at, first, do in strokes), key=lambda one: one[:2]
+        )
+        blocks, now = [], 0
+        for at, _, do in timed:
+            if at >= total:
+                break
+            if at > now:
+                blocks.append(self.synth.get_samples(at - now))
+                now = at
+            do()
+        if now < total:
+            blocks.append(self.synth.get_samples(total - now))
+        self.synth.delete()
+        sound = np.concatenate(blocks).reshape(-1, 2).mean(axis=1)
+        return np.asarray(sound / max(1.0, float(np.abs(sound).max())), dtype=np.float32)
+
+
+def sound_font() -> Path:
+    """The file; `UserError` where there is none."""
+    path = Path(os.environ.get("MOTIONLOOM_SOUND_FONT", SOUND_FONT))
+    if not path.is_file():
+        raise UserError(
+            f"{path}: no such sound font, which songs of `music: played` need; install one (Debian: "
+            f"apt install fluid-soundfont-gm libfluidsynth3) or name it in MOTIONLOOM_SOUND_FONT"
+        )
+    return path
 
 
 class Note(NamedTuple):

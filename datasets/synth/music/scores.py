@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.actions.maths import Array
-from motionloom.datasets.synth.music.instruments import DRUMS, Instruments, Stroke
+from motionloom.datasets.synth.music.band import DRUMS, Instruments, Stroke
 
 SLOWEST, FASTEST = 60.0, 190.0
 """Beats a minute."""

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.landing import eased, landed, reached
 from motionloom.datasets.motion.canonical import ground, retarget
-from motionloom.datasets.motion.features.codec import encode
-from motionloom.datasets.motion.features.exact import encode_exact, place
+from motionloom.datasets.motion.features.codec import encode, encode_exact, place
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.layout import PIECES, piece_columns, piece_joints
 from motionloom.datasets.schema import UserError

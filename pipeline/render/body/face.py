@@ -17,7 +17,6 @@ without effect at rest.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -136,23 +135,18 @@ class ArkitBases:
         with NpzFile(path) as file:
             source = file.numbers("source", limit=_BASIS_BYTES)
             arkit = file.numbers("arkit", limit=_BASIS_BYTES)
-        return ArkitBases(source, arkit).checked(str(path))
-
-    def checked(self, where: str) -> ArkitBases:
-        """Itself, where shapes and numbers are sound."""
-        source, arkit = self.source.shape, self.arkit.shape
-        if len(source) != 3 or source[2] != 3 or len(arkit) != 3 or arkit[::2] != (len(ARKIT), 3):
+        if source.ndim != 3 or source.shape[2] != 3 or arkit.ndim != 3 or arkit.shape[::2] != (len(ARKIT), 3):
             raise UserError(
-                f"{where}: 'source' is {list(source)} and 'arkit' {list(arkit)}; they must be [K, V, 3] and "
-                f"[{len(ARKIT)}, V, 3]"
+                f"{path}: 'source' is {list(source.shape)} and 'arkit' {list(arkit.shape)}; they must be "
+                f"[K, V, 3] and [{len(ARKIT)}, V, 3]"
             )
-        if source[1] != arkit[1]:
+        if source.shape[1] != arkit.shape[1]:
             raise UserError(
-                f"{where}: 'source' has {source[1]} vertices, 'arkit' {arkit[1]}; they must be the same"
+                f"{path}: 'source' has {source.shape[1]} vertices, 'arkit' {arkit.shape[1]}: not the same"
             )
-        if not (np.isfinite(self.source).all() and np.isfinite(self.arkit).all()):
-            raise UserError(f"{where}: a basis holds NaN or infinite values")
-        return self
+        if not (np.isfinite(source).all() and np.isfinite(arkit).all()):
+            raise UserError(f"{path}: a basis holds NaN or infinite values")
+        return ArkitBases(source, arkit)
 
     def weights(self, values: NDArray[np.floating]) -> Floats:
         """Weights [T, 52] in 0..1 of expression values [T, K]."""
@@ -181,12 +175,11 @@ def write_arkit_csv(path: Path, weights: NDArray[np.floating], fps: float) -> No
     """One row a frame: time in seconds and the 52 weights, named in the first row."""
     if weights.ndim != 2 or weights.shape[1] != len(ARKIT):
         raise UserError(f"{path}: ARKit weights must be [T, {len(ARKIT)}], not {list(weights.shape)}")
-    rows = [_row(frame / fps, row) for frame, row in enumerate(weights.tolist())]
+    rows = [
+        ",".join([f"{frame / fps:.6f}", *(f"{value:.5f}" for value in row)])
+        for frame, row in enumerate(weights.tolist())
+    ]
     write_text(path, "\n".join([",".join(["time", *ARKIT]), *rows]) + "\n")
-
-
-def _row(time: float, weights: Sequence[float]) -> str:
-    return ",".join([f"{time:.6f}", *(f"{value:.5f}" for value in weights)])
 
 
 @cache

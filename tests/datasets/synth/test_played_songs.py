@@ -11,8 +11,8 @@ import pytest
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music import band
+from motionloom.datasets.synth.music.band import Instruments, sound_font
 from motionloom.datasets.synth.music.genres import GENRES
-from motionloom.datasets.synth.music.instruments import Instruments, sound_font
 from motionloom.datasets.synth.music.recording import render_song
 from motionloom.datasets.synth.music.scores import excerpt, read_score, scores
 from motionloom.datasets.synth.music.song import Song, draw_song
