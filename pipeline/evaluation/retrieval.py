@@ -90,8 +90,6 @@ def retrieve(
         "threshold": THRESHOLD,
         "seed": seed,
     }
-    if isinstance(model, LoadedEvaluator):
-        facts |= model.facts
     figures = [one for name, by in found_by.items() for one in _figures(name, *by, facts)]
     return FigureFile("retrieval", tuple(figures), facts)
 

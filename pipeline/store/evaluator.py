@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import torch
@@ -75,8 +75,6 @@ class LoadedEvaluator:
     stats: FeatureStats
     """Mean and deviation of its motion."""
     words: CaptionReader
-    facts: dict[str, object] = field(default_factory=dict)
-    """Further facts for the protocol of its figures."""
     part: Part = PART
 
     @property

@@ -48,8 +48,6 @@ _MAKE = "make the folder again by docs/guo_evaluator.py"
 _SEQUENCE = {"input_emb": "project", "output_net.0": "narrow", "output_net.1": "norm", "output_net.3": "out"}
 _MOVEMENT = {"main.0": "first", "main.3": "second", "out_net": "out"}
 
-Untagged = Literal["refuse", "other"]
-
 
 class PublishedFacts(Config):
     """`evaluator.json`."""
@@ -78,8 +76,6 @@ class PublishedWords:
     vectors: Tensor
     """[n, E]"""
     vocabulary: PublishedVocabulary
-    untagged: Untagged = "refuse"
-    """Treatment of captions without `word/POS` tags."""
 
     @cached_property
     def rows(self) -> Mapping[str, int]:
@@ -109,14 +105,10 @@ class PublishedWords:
     def _caption(self, caption: str, tokens: Sequence[str]) -> list[tuple[int, int]]:
         """Row of `vectors` and class of each word."""
         if not tokens:
-            if self.untagged == "refuse":
-                raise UserError(
-                    f"caption '{caption[:80]}' has no word/POS tags, which the published evaluator reads; "
-                    f"judge data that bring them (HumanML3D), or set untagged: other, and compare its "
-                    f"figures with nobody's"
-                )
-            letters = "".join(c if c.isalpha() else " " for c in caption.lower().replace("-", ""))
-            tokens = [f"{word}/{_OTHER}" for word in letters.split()]
+            raise UserError(
+                f"caption '{caption[:80]}' has no word/POS tags, which the published evaluator reads; judge "
+                f"data that bring them (HumanML3D), or train an evaluator on yours (kind: evaluator)"
+            )
         framed = [f"{_FIRST}/{_OTHER}", *tokens[:MAX_WORDS], f"{_LAST}/{_OTHER}"]
         return [self._word(*token.rpartition("/")[::2]) for token in framed]
 
@@ -128,9 +120,7 @@ class PublishedWords:
         return self.rows[word], names.index(kind if kind in names else _OTHER)
 
 
-def load_published(
-    folder: Path, *, untagged: Untagged = "refuse", device: torch.device | None = None
-) -> LoadedEvaluator:
+def load_published(folder: Path, device: torch.device | None = None) -> LoadedEvaluator:
     """The evaluator of a folder, every file checked; a `UserError` of one sentence names what is wrong."""
     facts = check_published(folder)
     layout = MotionLayout.named(facts.layout)
@@ -147,8 +137,7 @@ def load_published(
         net.to(device or torch.device("cpu")).eval().requires_grad_(False),
         layout,
         FeatureStats(stats["mean"].numpy(), stats["std"].numpy(), layout),
-        PublishedWords(vectors, vocabulary, untagged),
-        {"untagged": untagged},
+        PublishedWords(vectors, vocabulary),
     )
 
 

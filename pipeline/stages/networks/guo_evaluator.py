@@ -16,23 +16,14 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.store.evaluator import LoadedEvaluator
 from motionloom.pipeline.store.files import copy_files
-from motionloom.pipeline.store.published_evaluator import (
-    FACTS,
-    FILES,
-    Untagged,
-    check_published,
-    load_published,
-)
+from motionloom.pipeline.store.published_evaluator import FACTS, FILES, check_published, load_published
 
 
 class GuoEvaluatorConfig(StageConfig):
-    """Where the published evaluator lies, and what it makes of captions without tags."""
+    """Where the published evaluator lies."""
 
     folder: Path
     """A folder made by `docs/guo_evaluator.py`: weights, statistics and word vectors."""
-    untagged: Untagged = "refuse"
-    """A caption without the `word/POS` tags that the evaluator reads is refused; `other` reads its words as
-    they stand, without their classes [ours], and its figures cannot be compared with the papers'."""
 
 
 class GuoEvaluatorStage(StageKind[GuoEvaluatorConfig]):
@@ -53,7 +44,7 @@ class GuoEvaluatorStage(StageKind[GuoEvaluatorConfig]):
         copy_files(source, context.folder, (*FILES, FACTS))
 
     def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> LoadedEvaluator:
-        return load_published(stage.folder, untagged=stage.config.untagged, device=device)
+        return load_published(stage.folder, device)
 
     def export(self, stage: CompletedStage, target: Path) -> None:
         copy_files(stage.folder, target, (*FILES, FACTS))

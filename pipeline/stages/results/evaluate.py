@@ -109,8 +109,7 @@ class _Evaluation(EvaluationUnits):
         out = {}
         for role in self.judges:
             stage = self.context.inputs[role]
-            named = {"stage": stage.name, "kind": stage.kind.name, "sha256": self._weights(role)}
-            out[role] = named | (self.context.given[role].facts if role == "evaluator" else {})
+            out[role] = {"stage": stage.name, "kind": stage.kind.name, "sha256": self._weights(role)}
         return out
 
     def _weights(self, role: str) -> str:

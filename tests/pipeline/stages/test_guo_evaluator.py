@@ -154,13 +154,9 @@ def test_captions_are_read_as_published(release: Path, folder: Path) -> None:
         torch.testing.assert_close(found[row], slow_text(weights, words), rtol=1e-5, atol=1e-5)
 
 
-def test_a_caption_without_tags_is_refused_unless_asked_for(release: Path, folder: Path) -> None:
-    with pytest.raises(UserError, match=r"'The person hops' .*untagged: other"):
+def test_a_caption_without_tags_is_refused(folder: Path) -> None:
+    with pytest.raises(UserError, match=r"'The person hops' .*kind: evaluator"):
         load_published(folder).embed_captions(["The person hops"], [()])
-    judge = load_published(folder, untagged="other")
-    found = judge.embed_captions(["The per-son, left!"], [()])
-    tagged = judge.embed_captions([""], [["the/OTHER", "person/OTHER", "left/OTHER"]])
-    assert torch.equal(found, tagged) and judge.facts == {"untagged": "other"}
 
 
 def spoil(folder: Path, name: str, change: Callable[[dict[str, torch.Tensor]], None]) -> None:
@@ -292,9 +288,7 @@ def test_a_run_is_judged_by_it(
     assert done.code == 0, done.err
     file = FigureFile.read(tmp_path / "run/stages/evaluate/metrics.json")
     weights = sha256_of(folder / "model.safetensors")
-    assert file.about["judges"]["evaluator"] == {
-        "stage": "guo", "kind": "guo_evaluator", "sha256": weights, "untagged": "refuse",
-    }  # fmt: skip
+    assert file.about["judges"]["evaluator"] == {"stage": "guo", "kind": "guo_evaluator", "sha256": weights}
     made = {one.name: one for one in file.figures if one.row == MODEL}
     facts = made["evaluator.top-1"].protocol
     assert (facts["clips"], facts["candidates"]) == (10, 4)
