@@ -40,8 +40,7 @@ class Interrupted(BaseException):
 
     @property
     def exit_code(self) -> int:
-        """`SAVED`; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
-        return 0 if _started_by_lead() else SAVED
+        return _joint_exit(SAVED)
 
 
 class JointError(UserError):
@@ -49,8 +48,7 @@ class JointError(UserError):
 
     @property
     def exit_code(self) -> int:
-        """2; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
-        return 0 if _started_by_lead() else 2
+        return _joint_exit(2)
 
 
 def process_rank() -> int:
@@ -65,8 +63,12 @@ def process_rank() -> int:
     return int(os.environ.get("NODE_RANK", 0)) + int(os.environ.get("LOCAL_RANK", 0))
 
 
-def _started_by_lead() -> bool:
-    return "RANK" not in os.environ and srun_tasks() == 1 and int(os.environ.get("LOCAL_RANK", 0)) > 0
+def _joint_exit(code: int) -> int:
+    """The code; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
+    started_by_lead = (
+        "RANK" not in os.environ and srun_tasks() == 1 and int(os.environ.get("LOCAL_RANK", 0)) > 0
+    )
+    return 0 if started_by_lead else code
 
 
 def srun_tasks() -> int:

@@ -131,35 +131,28 @@ def environment() -> ClusterEnvironment | None:
 
 def _require_match(hardware: Hardware) -> None:
     """Refuse to train in processes that do not know of each other: each would write the same files."""
-    world, env = hardware.world(), os.environ
+    world, devices, nodes = hardware.world(), hardware.resolved_devices(), hardware.nodes
+    env, tasks = os.environ, srun_tasks()
+    fix = "set hardware.devices (processes on a node) and hardware.nodes to match it"
     if "RANK" in env:
-        launched = env.get("WORLD_SIZE")
-        if launched is not None and int(launched) != world:
+        launched = env.get("WORLD_SIZE", str(world))
+        if int(launched) != world:
             raise UserError(
-                f"the launcher started {launched} processes and the recipe asks for {world}: set "
-                f"hardware.devices (processes on a node) and hardware.nodes to match it"
+                f"the launcher started {launched} processes and the recipe asks for {world}: {fix}"
             )
         return
     # Without srun one process starts the others on its own machine, and knows none elsewhere.
-    devices, nodes, tasks = hardware.resolved_devices(), hardware.nodes, srun_tasks()
+    start = f"start it with srun --nodes {nodes} --ntasks-per-node {devices}"
     if tasks == 1:
         if nodes > 1 and "SLURM_JOB_ID" in env and "NODE_RANK" not in env:
-            raise UserError(
-                f"hardware.nodes is {nodes} and this process is alone in its SLURM job: start it with "
-                f"srun --nodes {nodes} --ntasks-per-node {devices}"
-            )
+            raise UserError(f"hardware.nodes is {nodes} and this process is alone in its SLURM job: {start}")
         return
-    each, stated_nodes = env.get("SLURM_NTASKS_PER_NODE"), env.get("SLURM_NNODES")
-    if tasks != world or (each or str(devices)) != str(devices) or (stated_nodes or str(nodes)) != str(nodes):
-        where = f" on {stated_nodes} node{'s' if stated_nodes != '1' else ''}" if stated_nodes else ""
+    each, stated_nodes = env.get("SLURM_NTASKS_PER_NODE"), env.get("SLURM_NNODES", str(nodes))
+    if tasks != world or (each or str(devices)) != str(devices) or stated_nodes != str(nodes):
         raise UserError(
-            f"srun started {tasks} processes{where} and the recipe asks for {devices} on "
-            f"{nodes} node{'s' if nodes > 1 else ''}: set hardware.devices (processes on a node) and "
-            f"hardware.nodes to match it, and give each process all GPUs of its node (--gpus-per-node, not "
+            f"srun started {tasks} processes on {stated_nodes} node(s) and the recipe asks for {devices} on "
+            f"{nodes}: {fix}, and give each process all GPUs of its node (--gpus-per-node, not "
             f"--gpus-per-task)"
         )
     if each is None:  # Lightning needs it to number the processes of a node
-        raise UserError(
-            f"srun started {tasks} processes without saying how many on a node: start it with "
-            f"srun --nodes {nodes} --ntasks-per-node {devices}"
-        )
+        raise UserError(f"srun started {tasks} processes without saying how many on a node: {start}")

@@ -38,8 +38,6 @@ Line = Annotated[str, AfterValidator(_one_line)]
 class SlurmOptions(Config):
     """Options of SLURM jobs: `motionloom launch --cluster KEY=VALUE`."""
 
-    name: str | None = Field(None, pattern=r"^[a-z]([a-z0-9-]{0,28}[a-z0-9])?$")
-    """Name of the jobs; by default made from the recipe's."""
     partition: Line | None = None
     """Partition of the groups with GPUs, and of the others if `light_partition` is not given; default the
     cluster's."""
@@ -47,8 +45,6 @@ class SlurmOptions(Config):
     """Partition of the groups without GPUs."""
     account: Line | None = None
     """Account that is charged."""
-    qos: Line | None = None
-    """Quality of service of the jobs."""
     time_minutes: int = Field(1440, ge=1)
     """Time limit of a group that takes all machines."""
     light_minutes: int = Field(240, ge=1)
@@ -66,7 +62,7 @@ class SlurmOptions(Config):
     requeues: int = Field(100, ge=0)
     """Times that one job may be queued again at its time limit; 0 lets it end there."""
     extra: dict[str, Line] = Field(default_factory=dict)
-    """More options of sbatch: `extra.constraint=h100`."""
+    """More options of sbatch: `extra.constraint=h100`, `extra.qos=high`."""
 
     @field_validator("extra")
     @classmethod
@@ -206,7 +202,7 @@ def make_launch_plan(
         # What is installed here says nothing of the cluster, so loggers are not asked after.
         there = {"nodes": group.machines.nodes, "devices": group.machines.processes, "loggers": ()}
         require_fit(map(recipe.stage, group.stages), recipe.hardware.model_copy(update=there))
-    word = options.name or _word(recipe.name, 30)
+    word = _word(recipe.name, 30)
     name = word if word[:1].isalpha() else f"run-{word}"
     return LaunchPlan(name, recipe, shipped, tuple(overrides), str(out), tuple(groups))
 

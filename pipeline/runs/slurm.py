@@ -245,7 +245,6 @@ def _options(
         ("job-name", plan.job(group)),
         ("partition", partition),
         ("account", options.account),
-        ("qos", options.qos),
         ("nodes", str(machines.nodes)),
         ("ntasks-per-node", str(machines.processes)),
         ("cpus-per-task", str(machines.cpus // machines.processes)),

@@ -85,7 +85,7 @@ def cpu(devices: int = 0, nodes: int = 1) -> Hardware:
 def test_tasks_of_srun_do_not_train_alone(srun: Srun, rank: int) -> None:
     srun(2, rank=rank)
     assert process_rank() == rank
-    with pytest.raises(UserError, match=r"started 2 .*1 node .*1 on 1"):
+    with pytest.raises(UserError, match=r"started 2 .*1 node.*1 on 1"):
         Team.start(cpu())
     for per_node, nodes, devices in ((4, 1, 2), (1, 2, 2), (2, 2, 4)):
         srun(per_node, nodes)
