@@ -195,7 +195,7 @@ class Capabilities:
     drive: Callable[[Sequence[Stretch], Sequence[int], SamplingConfig], list[Motion]] | None = None
     """As `generate`, of several stretches one after another, a seed for each motion; [T, C] each."""
     edit: Callable[..., list[Motion]] | None = None
-    """Fills in what an edit leaves free: an `Editor` (`inference/edits/frames.py`)."""
+    """Fills in what an edit leaves free, as `DiffusionMotion.edit` does."""
     denoising: Callable[[SamplingConfig], tuple[Sampler, int]] | None = None
     """Sampler and number of steps of its diffusion model: as asked for, or else the model's own."""
     seed_frames: int = 0

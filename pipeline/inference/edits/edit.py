@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -16,8 +18,8 @@ from motionloom.models.diffusion.observed import known_columns
 from motionloom.models.metrics.dance import foot_skating
 from motionloom.models.metrics.editing import accelerations, seam_acceleration, seams_of
 from motionloom.pipeline.contract.editing import EditReport
-from motionloom.pipeline.contract.generation import MotionGenerator
-from motionloom.pipeline.inference.edits.frames import EditFrames, Editor, RootPath
+from motionloom.pipeline.contract.generation import Motion, MotionGenerator
+from motionloom.pipeline.inference.edits.frames import EditFrames, RootPath
 
 WORDS_EASE = 0.3
 """Seconds in which one stretch of words takes over from another [ours]."""
@@ -25,7 +27,7 @@ _REACH_SECONDS = 0.5
 """In which a figure goes to a pin and comes back [ours]."""
 
 
-def require_editor(generator: MotionGenerator) -> Editor:
+def require_editor(generator: MotionGenerator) -> Callable[..., list[Motion]]:
     """The generator's `edit`, if it can fill in what a clip leaves free."""
     if generator.capabilities.edit is not None:
         return generator.capabilities.edit

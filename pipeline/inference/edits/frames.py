@@ -6,15 +6,12 @@ is put back on the clip's bones.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget
 from motionloom.datasets.motion.features.codec import encode
@@ -32,7 +29,6 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.observed import Places
 from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask, RecordedClip
-from motionloom.pipeline.contract.sampling import SamplingConfig
 
 SAME_BONES = 0.05
 """Mean difference of bone lengths up to which a clip's figure counts as the layout's [ours]."""
@@ -121,24 +117,6 @@ class EditFrames:
             away = (complex(z, x) - self.anchor.place[0]) * np.exp(-1j * self.anchor.heading[0]) * self.scale
             out.append((float(away.imag), (y - self.lift) * self.scale, float(away.real)))
         return out
-
-
-class Editor(Protocol):
-    """The capability of a generator to fill in what a task leaves free."""
-
-    def __call__(
-        self,
-        frames: EditFrames,
-        words: Sequence[tuple[Conditions, NDArray[np.float64]]],
-        seeds: Sequence[int],
-        sampling: SamplingConfig,
-    ) -> list[NDArray[np.float32]]:
-        """Motions [T, C] of the generator's part in their own units, one a seed; what is kept in them is so
-        to the bit, and the rest near what is asked for.
-
-        `words` are encoded, one row each and empty for no words, each with its share of every frame [T];
-        those of all sum to 1 in each frame.
-        """
 
 
 def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> EditFrames:

@@ -83,7 +83,12 @@ class DiffusionMotion(DenoisedMotion):
         seeds: Sequence[int],
         sampling: SamplingConfig,
     ) -> list[NDArray[np.float32]]:
-        """Fill in what an edit leaves free (`Editor`)."""
+        """Fill in what an edit leaves free (`Capabilities.edit`): motions [T, C] of the part in their own
+        units, one a seed; what is kept in them is so to the bit, and the rest near what is asked for.
+
+        `words` are encoded, one row each and empty for no words, each with its share of every frame [T];
+        those of all sum to 1 in each frame.
+        """
         stats: FeatureStats = self.given["stats"]
         layout, columns, device = self.layout, self.layout.part(self.part), device_of(self.net)
         guidance = sampling.guidance_of(self.part)
