@@ -17,8 +17,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import write_motions
-from motionloom.pipeline.inference.writers import WRITERS, Outputs, Writer, default_formats, formats_help
+from motionloom.pipeline.inference.writers import WRITERS, default_formats
 from motionloom.pipeline.serve.requests import MotionRequest
 from motionloom.pipeline.stages.results.generate import GenerateConfig
 
@@ -83,32 +82,6 @@ def test_it_plays_in_the_frame(motion: GeneratedMotion, browser: Any, until: Any
         page.screenshot(path=str(tmp_path / "notebook.png"))
     finally:
         page.close()
-
-
-def write_csv(path: Path, outputs: Outputs) -> None:
-    """A format of somebody else's: a line of root positions a frame."""
-    np.savetxt(path, np.concatenate([clip.shown.joints[:, 0] for clip in outputs.clips]), delimiter=",")
-
-
-@pytest.fixture
-def csv(monkeypatch: pytest.MonkeyPatch) -> None:
-    writer = Writer("root", "_root.csv", "text/csv", "the root's way", write_csv, together="all.csv")
-    monkeypatch.setitem(WRITERS, writer.name, writer)
-
-
-@pytest.mark.usefixtures("csv")
-def test_a_new_format_is_known_everywhere(walk: Callable[..., np.ndarray], tmp_path: Path) -> None:
-    layout = MotionLayout.named("wholebody363", fps=20.0)
-    motions = [
-        GeneratedMotion(Prompt(name), np.zeros((9, 313), np.float32), walk(9), None, layout) for name in "ab"
-    ]
-    paths = write_motions(tmp_path / "out", motions, ["root"], title="t", seed=0)
-    assert [path.name for path in paths] == ["00-a_root.csv", "01-b_root.csv", "all.csv"]
-    assert len(np.loadtxt(paths[-1], delimiter=",")) == 18
-    assert motions[0].save(tmp_path / "one_root.csv").is_file()
-    assert "root (the root's way)" in formats_help()
-    assert GenerateConfig.parse({"formats": ["root"]}, "generate").formats == ["root"]
-    assert MotionRequest(caption="a", format="root").format == "root"
 
 
 def test_formats_are_names_of_the_table() -> None:
