@@ -8,13 +8,12 @@ compares all of it.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
-from motionloom.datasets.base.progress import Meter, duration
+from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.shards.checksums import LocalShard, problems
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.hardware import usable_cores
@@ -25,8 +24,6 @@ from motionloom.pipeline.store.data import Data
 
 _THREADS = 4
 """At most, in a process: more read no disk faster."""
-_WORTH_A_LINE = 5.0
-"""Seconds from which on a comparison is reported."""
 
 
 def verify_shards(context: StageContext, team: Team, run: Path) -> None:
@@ -41,17 +38,9 @@ def verify_shards(context: StageContext, team: Team, run: Path) -> None:
         for stage in context.inputs.values():
             if stage.gives("data") and not stage.exported:
                 shards += Data(stage.folder).local_shards()
-    shards = list({shard.path: shard for shard in shards}.values())
-    if not shards:
-        return
-    begin = time.monotonic()
-    size = compare_shards(shards, run / NOTE, team, context.console, again=how == "always")
-    seconds = time.monotonic() - begin
-    if size and seconds > _WORTH_A_LINE:
-        context.console.print(
-            f"    {len(shards)} shards have the sha256 of their manifest ({size / 1e6:,.0f} MB compared in "
-            f"{duration(seconds)})"
-        )
+    if shards:
+        each = list({shard.path: shard for shard in shards}.values())
+        compare_shards(each, run / NOTE, team, context.console, again=how == "always")
 
 
 def compare_shards(
@@ -73,7 +62,9 @@ def compare_shards(
     for seen in {str(seen): seen for seen, _ in seen_by}.values():
         alike = [rank for rank, (theirs, _) in enumerate(seen_by) if theirs == seen]
         pending = [
-            shard for shard, state in zip(shards, seen, strict=True) if not _known(known, shard, state)
+            shard
+            for shard, state in zip(shards, seen, strict=True)
+            if not known.knows(str(shard.path), shard.info.sha256, state)
         ]
         missing += len(pending)
         if team.rank in alike:
@@ -89,18 +80,10 @@ def compare_shards(
         more = f" ({len(wrong)} such shards; motionloom data check lists them)" if len(wrong) > 1 else ""
         raise JointError(f"{wrong[0]}{more}")
     if team.leads:
-        _note(record, known, shards, [seen for seen, _ in seen_by])
+        # What the files of all machines are like now that they have been compared.
+        compared = {}
+        for place, shard in enumerate(shards):
+            each: list[State] = list({str(seen[place]): seen[place] for seen, _ in seen_by}.values())
+            compared[str(shard.path)] = ComparedFile(sha256=shard.info.sha256, states=each)
+        known.write(record, compared)
     return size
-
-
-def _known(known: Compared, shard: LocalShard, state: State) -> bool:
-    return known.knows(str(shard.path), shard.info.sha256, state)
-
-
-def _note(record: Path, known: Compared, shards: Sequence[LocalShard], seen: Sequence[list[State]]) -> None:
-    """Write down what the files of all machines are like now that they have been compared."""
-    compared = {}
-    for place, shard in enumerate(shards):
-        states = list({str(own[place]): own[place] for own in seen}.values())
-        compared[str(shard.path)] = ComparedFile(sha256=shard.info.sha256, states=states)
-    known.write(record, compared)

@@ -20,7 +20,6 @@ from motionloom.pipeline.results.compare.runs import (
     ABSENT,
     ComparedRun,
     ComparedTable,
-    RunRow,
     StageDifferences,
     compared_tables,
     open_runs,
@@ -50,32 +49,18 @@ def compare_runs(
     console = console or make_console()
     require_file_place(out)
     opened = open_runs(runs)
-    differences, tables = setting_differences(opened), compared_tables(opened)
-    comparison_page(opened, differences, tables).write(out)
+    names = " and ".join((", ".join(run.label for run in opened[:-1]), opened[-1].label))
+    page = Page(f"{names} compared", "Settings that differ, figures on held-out clips, training curves")
+    _who(page, opened)
+    _settings(page, opened, setting_differences(opened))
+    _figures(page, opened, compared_tables(opened))
+    _curves(page, opened)
+    page.write(out)
     for run in opened:
         if lines := missing_lines(run):
             console.print(f"{run.label}: missing {'; '.join(lines)}", markup=False, soft_wrap=True)
     console.print(str(out.resolve()), soft_wrap=True)
     return out
-
-
-def _figure_cell(row: RunRow, name: str) -> Cell | None:
-    """A figure of a run, marked where it is the best; None where it was not measured."""
-    figure, sure = row.figures.get(name), row.best.get(name)
-    return None if figure is None else Cell(figure.text(), best=sure is not None, maybe=sure is False)
-
-
-def comparison_page(
-    runs: Sequence[ComparedRun], differences: Sequence[StageDifferences], tables: Sequence[ComparedTable]
-) -> Page:
-    """The page of `runs`."""
-    names = " and ".join((", ".join(run.label for run in runs[:-1]), runs[-1].label))
-    page = Page(f"{names} compared", "Settings that differ, figures on held-out clips, training curves")
-    _who(page, runs)
-    _settings(page, runs, differences)
-    _figures(page, runs, tables)
-    _curves(page, runs)
-    return page
 
 
 def missing_lines(run: ComparedRun) -> list[str]:
@@ -156,7 +141,13 @@ def _figure_table(page: Page, table: ComparedTable, several: bool, silent: Seque
         cells: list[Value] = [_chip(row.run)]
         if lettered:
             cells.append(f"as {LETTERS[row.protocol]}")
-        rows.append([*cells, *(_figure_cell(row, column.name) for column in table.columns)])
+        for column in table.columns:
+            figure, sure = row.figures.get(column.name), row.best.get(column.name)
+            if figure is None:
+                cells.append(None)
+            else:
+                cells.append(Cell(figure.text(), best=sure is not None, maybe=sure is False))
+        rows.append(cells)
     for reference in table.references:
         name = f"{reference.title} ({', '.join(reference.runs)})" if reference.runs else reference.title
         figures = [reference.figures.get(column.name) for column in table.columns]
