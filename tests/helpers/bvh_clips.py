@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tarfile
 from pathlib import Path
 
 import numpy as np
@@ -37,3 +38,22 @@ def write_map(path: Path) -> Path:
     rows = [[number, name, name] for number, name in enumerate(SKELETON.joints)]
     path.write_text(json.dumps({"smpl22": rows, "unmapped": []}))
     return path
+
+
+BANDAI = (
+    "bow_active", "bow_childish", "bow_chimpira", "bow_angry", "bow_feminine", "bow_giant", "dash_normal",
+)  # fmt: skip
+"""Real clips, the last one of 0.67 s."""
+
+
+def unpack_bandai(shared: Path, folder: Path) -> dict[str, Path]:
+    """Files of the clips `BANDAI` in a folder, by name."""
+    found = {}
+    with tarfile.open(shared / "data/bandai/dataset-1.tar.xz", "r|*") as archive:
+        for member in archive:
+            name = Path(member.name).name.removeprefix("dataset-1_").removesuffix("_001.bvh")
+            file = archive.extractfile(member) if name in BANDAI else None
+            if file is not None:
+                found[name] = folder / Path(member.name).name
+                found[name].write_bytes(file.read())
+    return found

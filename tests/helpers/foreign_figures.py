@@ -144,9 +144,29 @@ def write_figure(
     axes = (
         Rotation.random(count, rng=rng).as_matrix() if twisted else np.broadcast_to(np.eye(3), (count, 3, 3))
     )
-    to_file = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if up == "z" else np.eye(3)
-    scale = UNITS[unit]
     root = np.stack([0.2 * times[:, 0], np.full(frames, 0.95), 0.8 * times[:, 0]], axis=-1) + points[0]
+    text, world = bvh_text(built, local, root, axes, unit=unit, up=up, fps=fps)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return world
+
+
+def bvh_text(
+    built: Built,
+    local: NDArray[np.float64],
+    root: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    *,
+    unit: str = "cm",
+    up: str = "y",
+    fps: float,
+) -> tuple[str, NDArray[np.float64]]:
+    """A BVH file, and its joints [T, N, 3] in metres, Y up, of local rotations [T, N, 3, 3], places of the
+    first joint [T, 3] and rest axes [N, 3, 3].
+    """
+    frames, count = local.shape[:2]
+    points, scale = np.array(built.points), UNITS[unit]
+    to_file = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]) if up == "z" else np.eye(3)
     world, turned = np.empty((frames, count, 3)), np.empty((frames, count, 3, 3))
     offsets, written = np.zeros((count, 3)), np.empty((frames, count, 3, 3))
     for joint, parent in enumerate(built.parents):
@@ -171,9 +191,7 @@ def write_figure(
         f"Frame Time: {1 / fps:.9f}",
     ]
     lines += [" ".join(f"{value:.6f}" for value in row) for row in values[:, columns].tolist()]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return world
+    return "\n".join(lines) + "\n", world
 
 
 def _file_order(parents: list[int], joint: int = 0) -> list[int]:

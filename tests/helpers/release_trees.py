@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,8 @@ from typing import Any
 import numpy as np
 import soundfile
 from amass_clips import walk as walk_z_up
+from foreign_figures import build, bvh_text
+from foreign_tools import FOREIGN
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -18,6 +19,7 @@ from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.skeleton import Skeleton
 
 FPS, SECONDS = 30.0, 3.0
+BY_TOOL = {spec.tool: spec for spec in FOREIGN}
 
 Floats = NDArray[np.float64]
 
@@ -97,143 +99,27 @@ def finedance(root: Path) -> Path:
     return root
 
 
-_FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
-
-
-Naming = tuple[list[tuple[str, str]], dict[str, int]]
-"""Joints with their parents, parents first, and which one of `smplx52` a joint stands for."""
-
-
-def soma() -> Naming:
-    """The 77 joints of SOMA."""
-    body = "Hips: Spine1 Spine2 Chest Neck1 Neck2 Head HeadEnd"
-    chains = [body, "Head: Jaw", "Head: LeftEye", "Head: RightEye"]
-    for side in ("Left", "Right"):
-        chains.append("Chest: " + " ".join(side + name for name in ("Shoulder", "Arm", "ForeArm", "Hand")))
-        for finger in _FINGERS:
-            ends = ("1", "2", "3", "End") if finger == "Thumb" else ("1", "2", "3", "4", "End")
-            chains.append(f"{side}Hand: " + " ".join(f"{side}Hand{finger}{end}" for end in ends))
-        chains.append(
-            "Hips: " + " ".join(side + name for name in ("Leg", "Shin", "Foot", "ToeBase", "ToeEnd"))
-        )
-    ours = {soma_of(name): number for number, name in enumerate(Skeleton.named("smplx52").joints)}
-    return _tree(chains), ours
-
-
-def _tree(chains: list[str]) -> list[tuple[str, str]]:
-    joints = [("Hips", "")]
-    for chain in chains:
-        parent, names = chain.split(": ")
-        for name in names.split():
-            joints.append((name, parent))
-            parent = name
-    return joints
-
-
-def xsens() -> Naming:
-    """The 23 joints of 100STYLE."""
-    chains = ["Hips: Chest Chest2 Chest3 Chest4 Neck Head"]
-    body = {"Hips": "pelvis", "Chest": "spine1", "Chest2": "spine2", "Chest4": "spine3"}
-    names = body | {"Neck": "neck", "Head": "head"}
-    for side in ("Left", "Right"):
-        arm, leg = ("Collar", "Shoulder", "Elbow", "Wrist"), ("Hip", "Knee", "Ankle", "Toe")
-        chains.append("Chest4: " + " ".join(side + part for part in arm))
-        chains.append("Hips: " + " ".join(side + part for part in leg))
-        names |= {side + part: f"{side}_{part}".lower().replace("toe", "foot") for part in (*arm, *leg)}
-    skeleton = Skeleton.named("smplx52")
-    return _tree(chains), {name: skeleton.index(one) for name, one in names.items()}
-
-
-def soma_of(name: str) -> str:
-    """The joint of SOMA that one of `smplx52` is."""
-    side, _, part = name.partition("_")
-    body = {
-        "pelvis": "Hips",
-        "spine1": "Spine1",
-        "spine2": "Spine2",
-        "spine3": "Chest",
-        "neck": "Neck1",
-        "head": "Head",
-    }
-    limb = {"hip": "Leg", "knee": "Shin", "ankle": "Foot", "foot": "ToeBase", "collar": "Shoulder",
-            "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand"}  # fmt: skip
-    if name in body:
-        return body[name]
-    if part in limb:
-        return side.title() + limb[part]
-    finger, number = part[:-1].title(), int(part[-1])
-    return f"{side.title()}Hand{finger}{number + (finger != 'Thumb')}"
-
-
 @lru_cache
-def bvh_file(naming: Callable[[], Naming], fps: float, before: int = 0) -> str:
-    """The walk on another skeleton, in centimetres, in a zero pose that has nothing to do with a T-pose.
+def bvh_file(tool: str, fps: float, before: int = 0) -> str:
+    """The walk on a tool's skeleton, in centimetres, in a zero pose that has nothing to do with a T-pose.
 
     Before and after it the figure stands still for some frames.
     """
-    joints, ours = naming()
     poses, trans = walk()
     at = np.minimum(np.arange(int(SECONDS * fps) + 1) / fps * FPS, len(poses) - 1.0)
+    at = np.concatenate([np.zeros(before), at, np.full(before, len(poses) - 1.0)])
     low = np.minimum(at.astype(int), len(poses) - 2)
     weight = (at - low)[:, None, None]
     poses = (1 - weight) * poses[low] + weight * poses[low + 1]
     trans = (1 - weight[:, 0]) * trans[low] + weight[:, 0] * trans[low + 1]
-    poses = np.concatenate([np.repeat(poses[:1], before, 0), poses, np.repeat(poses[-1:], before, 0)])
-    trans = np.concatenate([np.repeat(trans[:1], before, 0), trans, np.repeat(trans[-1:], before, 0)])
-    local = Rotation.from_rotvec(poses.reshape(-1, 3)).as_matrix().reshape(len(poses), 52, 3, 3)
-    template = BodyModel.neutral("smplx52").template
-    names = [name for name, _ in joints]
-    zero = Rotation.random(len(names), random_state=np.random.default_rng(7)).as_matrix()
-    zero[0] = np.eye(3)
-    rest = {names[0]: template[0]}
-    offsets = {names[0]: np.zeros(3)}
-    turned = {names[0]: local[:, 0]}
-    rotations = {names[0]: local[:, 0]}
-    for number, (name, parent) in enumerate(joints[1:], start=1):
-        above = names.index(parent)
-        rest[name] = template[ours[name]] if name in ours else rest[parent] + [0.0, 0.02, 0.03]
-        turned[name] = turned[parent] @ local[:, ours[name]] if name in ours else turned[parent]
-        offsets[name] = zero[above].T @ (rest[name] - rest[parent])
-        own = (turned[parent] @ zero[above]).transpose(0, 2, 1)
-        rotations[name] = own @ (turned[name] @ zero[number])
-    return _bvh(joints, offsets, rotations, trans + template[0], fps)
-
-
-def _bvh(
-    joints: list[tuple[str, str]],
-    offsets: dict[str, Floats],
-    rotations: dict[str, Floats],
-    root: Floats,
-    fps: float,
-) -> str:
-    """A BVH file in centimetres, every rotation as Z, Y, X."""
-    order: list[str] = []
-
-    def block(name: str, depth: int) -> list[str]:
-        order.append(name)
-        pad = "  " * depth
-        channels = "6 Xposition Yposition Zposition" if not depth else "3"
-        out = [f"{pad}{'JOINT' if depth else 'ROOT'} {name}", f"{pad}{{"]
-        out.append(f"{pad}  OFFSET " + " ".join(f"{value * 100:.9f}" for value in offsets[name]))
-        out.append(f"{pad}  CHANNELS {channels} Zrotation Yrotation Xrotation")
-        below = [child for child, parent in joints if parent == name]
-        for child in below:
-            out += block(child, depth + 1)
-        if not below:
-            out += [f"{pad}  End Site", f"{pad}  {{", f"{pad}    OFFSET 0 0 1", f"{pad}  }}"]
-        return [*out, f"{pad}}}"]
-
-    text = [
-        "HIERARCHY",
-        *block(joints[0][0], 0),
-        "MOTION",
-        f"Frames: {len(root)}",
-        f"Frame Time: {1 / fps:.9f}",
-    ]
-    turns = [Rotation.from_matrix(rotations[name]).as_euler("ZYX", degrees=True) for name in order]
-    for row in np.concatenate([root * 100, *turns], axis=1):
-        text.append(" ".join(f"{value:.9f}" for value in row))
-    return "\n".join(text) + "\n"
+    built, skeleton = build(BY_TOOL[tool]), Skeleton.named("smplx52")
+    local = np.broadcast_to(np.eye(3), (len(poses), len(built.names), 3, 3)).copy()
+    for joint, sources in built.ours.items():
+        turns = Rotation.from_rotvec(poses[:, skeleton.index(joint)]).as_matrix()
+        local[:, built.names.index(sources[0])] = turns
+    pelvis = built.points[built.names.index("Hips")] - built.points[0]
+    axes = Rotation.random(len(built.names), random_state=np.random.default_rng(7)).as_matrix()
+    return bvh_text(built, local, trans + skeleton.rest_joints[0] - pelvis, axes, fps=fps)[0]
 
 
 def bones_seed(root: Path) -> Path:
@@ -250,7 +136,7 @@ def bones_seed(root: Path) -> Path:
     put(root / "metadata/seed_metadata_v002_temporal_labels.jsonl", record + "\n")
     for number, name in enumerate(("walk_001__A1", "walk_001__A1_M", "talk_002__A2")):
         lines = "\n" * number  # no two files have the same bytes
-        put(root / f"soma_uniform/bvh/24010{number}/{name}.bvh", bvh_file(soma, 120.0) + lines)
+        put(root / f"soma_uniform/bvh/24010{number}/{name}.bvh", bvh_file("BONES, SOMA 77", 120.0) + lines)
     return root
 
 
@@ -346,7 +232,7 @@ def style100(root: Path) -> Path:
     """Three movements of two styles, of which one has no frames in the list of cuts."""
     for style, movement in (("ArmsAboveHead", "FW"), ("ArmsAboveHead", "ID"), ("Old", "FW")):
         lines = "\n" * (len(style) + len(movement + style) * (movement == "ID"))  # no two are the same
-        put(root / f"{style}/{style}_{movement}.bvh", bvh_file(xsens, 60.0, 40) + lines)
+        put(root / f"{style}/{style}_{movement}.bvh", bvh_file("Xsens MVN", 60.0, 40) + lines)
     cuts = ["STYLE_NAME,FW_START,FW_STOP,ID_START,ID_STOP", "ArmsAboveHead,40,221,N/A,N/A", "Old,40,221,,"]
     put(root / "Frame_Cuts.csv", "\n".join(cuts) + "\n")
     styles = ["Style Name,Description", "Arms Above Head,Both arms held up.", "Old,Slow and bent."]

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bvh_clips import unpack_bandai
 
 from motionloom.datasets.base.lock import LOCK_FILE
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
@@ -27,28 +28,13 @@ from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.writer import WORK_FOLDER
 
-NAMES = (
-    "bow_active",
-    "bow_childish",
-    "bow_chimpira",
-    "bow_angry",
-    "bow_feminine",
-    "bow_giant",
-    "dash_normal",
-)
-
 
 @pytest.fixture(scope="module")
 def clips(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of seven real clips (one of 0.67 s) with their lines of captions.jsonl."""
     folder = tmp_path_factory.mktemp("clips")
     (folder / "dataset-1").mkdir()
-    wanted = {f"dataset-1/dataset-1_{name}_001.bvh" for name in NAMES}
-    with tarfile.open(shared / "data/bandai/dataset-1.tar.xz", "r|*") as archive:
-        for member in archive:
-            file = archive.extractfile(member) if member.name in wanted else None
-            if file is not None:
-                (folder / "dataset-1" / Path(member.name).name).write_bytes(file.read())
+    wanted = {f"dataset-1/{path.name}" for path in unpack_bandai(shared, folder / "dataset-1").values()}
     lines = (shared / "data/bandai/captions.jsonl").read_text().splitlines()
     kept = [line for line in lines if json.loads(line)["file"] in wanted]
     (folder / "captions.jsonl").write_text("\n".join(kept))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import re
-import tarfile
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bvh_clips import unpack_bandai
 
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.bvh.convert import BvhConfig
@@ -20,33 +21,16 @@ from motionloom.datasets.convert.common.look import MOST_CLIPS, Look, SourceJoin
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.schema import Manifest, UserError
 
-CLIPS = 7
-"""The first ones of the archive, one of them cut to half a second below."""
-
 
 @pytest.fixture(scope="module")
 def source(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Seven real clips in two folders, one of 0.5 s, and their joint map."""
+    """Seven real clips in two folders, one of 0.67 s, and their joint map."""
     folder = tmp_path_factory.mktemp("source")
-    with tarfile.open(shared / "data/bandai/dataset-1.tar.xz", "r|*") as archive:
-        count = 0
-        for member in archive:
-            file = archive.extractfile(member) if member.name.endswith(".bvh") else None
-            if file is None:
-                continue
-            place = folder / ("one" if count < 3 else "two") / Path(member.name).name
-            place.parent.mkdir(exist_ok=True)
-            place.write_bytes(file.read())
-            count += 1
-            if count == CLIPS:
-                break
-    path = sorted((folder / "two").iterdir())[0]
-    text = path.read_text()
-    head, _, body = text.partition("Frames:")
-    lines = body.splitlines(keepends=True)
-    path.write_text(f"{head}Frames: 16\n{''.join(lines[1 : 2 + 16])}")
-    rows = json.loads((shared / "data/bandai/joint_map.json").read_text())
-    (folder / "joint_map.json").write_text(json.dumps(rows))
+    for number, path in enumerate(unpack_bandai(shared, folder).values()):
+        place = folder / ("one" if number < 3 else "two")
+        place.mkdir(exist_ok=True)
+        path.rename(place / path.name)
+    shutil.copy(shared / "data/bandai/joint_map.json", folder)
     return folder
 
 

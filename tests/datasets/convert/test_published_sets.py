@@ -47,8 +47,8 @@ def planned(name: str, source: Path, **options: Any) -> Conversion[Any]:
     return prepare(converter_named(name).config_class.parse(given, name))
 
 
-def make(name: str, source: Path, out: Path, workers: int = 1, **options: Any) -> Manifest:
-    return run_conversion(planned(name, source, **options), out, workers=workers, progress=False)
+def make(name: str, source: Path, out: Path, **options: Any) -> Manifest:
+    return run_conversion(planned(name, source, **options), out, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -83,15 +83,6 @@ def test_a_set_gives_the_walk_it_was_made_from(
     limbs = [number for number in range(22) if number not in (3, 6, 9)] if name == "style100" else slice(None)
     np.testing.assert_allclose(joints[:, limbs], wanted[:, limbs], atol=5e-4)
     assert meta_of(tmp_path / "out", case["clip"])[0].has_hands == (layout.num_joints > 22)
-
-
-@pytest.mark.parametrize("name", ["motion272"])  # BVH has the same test for itself
-def test_two_workers_write_the_same_bytes(built: Callable[[str], Path], name: str, tmp_path: Path) -> None:
-    for workers in (1, 2):
-        make(name, built(name), tmp_path / str(workers), workers)
-    for path in sorted((tmp_path / "1").glob("*.tar")):
-        assert path.read_bytes() == (tmp_path / "2" / path.name).read_bytes()
-    assert list((tmp_path / "1").glob("*.tar"))
 
 
 def test_motionhub_joins_what_its_lists_say_of_a_motion(built: Callable[[str], Path], tmp_path: Path) -> None:
