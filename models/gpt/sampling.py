@@ -47,7 +47,14 @@ class Drawing:
 
     def __call__(self, logits: Tensor, uniform: Tensor) -> Tensor:
         """Tokens int64 [B] from logits [B, V] and uniform float64 [B]."""
-        return draw(logits, uniform, temperature=self.temperature, top_k=self.top_k, top_p=self.top_p)
+        best = logits.argmax(-1)
+        if self.temperature == 0:
+            return best
+        scaled = filter_logits(logits.double() / self.temperature, top_k=self.top_k, top_p=self.top_p)
+        mass = scaled.softmax(-1).cumsum(-1)
+        at = torch.searchsorted(mass, uniform[:, None] * mass[:, -1:], right=True)[:, 0]
+        # Rounding can push the last number onto the total; there is no token after it.
+        return torch.where(at < logits.shape[-1], at, best)
 
 
 def guide(logits: Tensor, legal: Tensor, scale: Tensor) -> Tensor:
@@ -97,20 +104,6 @@ def uniform_numbers(seeds: Sequence[int], count: int, device: torch.device) -> T
         return torch.zeros(0, 0)
     rows = [np.random.Generator(np.random.Philox(key=seed)).random(count) for seed in seeds]
     return torch.from_numpy(np.stack(rows)).to(device)
-
-
-def draw(
-    logits: Tensor, uniform: Tensor, *, temperature: float = 1.0, top_k: int | None = None, top_p: float = 1.0
-) -> Tensor:
-    """Tokens int64 [B] from logits [B, V] and uniform float64 [B]; temperature 0 takes the largest."""
-    best = logits.argmax(-1)
-    if temperature == 0:
-        return best
-    scaled = filter_logits(logits.double() / temperature, top_k=top_k, top_p=top_p)
-    mass = scaled.softmax(-1).cumsum(-1)
-    at = torch.searchsorted(mass, uniform[:, None] * mass[:, -1:], right=True)[:, 0]
-    # Rounding can push the last number onto the total; there is no token after it.
-    return torch.where(at < logits.shape[-1], at, best)
 
 
 def next_token(
@@ -221,9 +214,7 @@ def generate(
     *,
     max_groups: int | None = None,
     groups: Tensor | None = None,
-    temperature: float = 1.0,
-    top_k: int | None = None,
-    top_p: float = 1.0,
+    how: Drawing = Drawing(),
     cfg_scale: float = 1.0,
     seed: int | Sequence[int] = 0,
 ) -> Codes:
@@ -235,8 +226,7 @@ def generate(
         max_groups: Longest result in groups (default: what the block size allows).
         groups: int64 [B], requested lengths: End is forbidden before and forced there. None: the model
             decides.
-        temperature: 0 is greedy.
-        top_p: Keep the smallest set of tokens with this mass.
+        how: How each token is drawn.
         cfg_scale: Guidance; 1 is off. Needs a model trained with condition dropout.
         seed: One seed, from which `sample_seeds` makes one per row, or one per sample. Pass slices of
             `sample_seeds` to get the same results whatever the batch size is.
@@ -249,7 +239,6 @@ def generate(
     most_groups = gpt.max_groups if max_groups is None else max_groups
     allowed = min(most_groups, gpt.max_groups)
     limit = requested_groups(groups, batch, most=most_groups, limit=allowed, device=device)
-    how = Drawing(temperature, top_k, top_p)
     gpt.require_guidance(cfg_scale)
     size, most = len(gpt.pattern), int(limit.max()) if batch else 0
     # All numbers are drawn before the loop, so that a row does not depend on the others' lengths.

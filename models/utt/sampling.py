@@ -89,9 +89,7 @@ def generate(
     context: int | None = None,
     max_groups: int | None = None,
     groups: Tensor | None = None,
-    temperature: float = 1.0,
-    top_k: int | None = None,
-    top_p: float = 1.0,
+    how: Drawing = Drawing(),  # noqa: B008 - frozen
     cfg_scale: float | Sequence[float] = 1.0,
     seed: int | Sequence[int] = 0,
     drawn: int = 0,
@@ -109,8 +107,7 @@ def generate(
         max_groups: Most new groups (default: what one block holds). Longer ones slide.
         groups: int64 [B], requested numbers of new groups: End is forbidden before and forced there. None:
             the model decides.
-        temperature: 0 is greedy.
-        top_p: Keep the smallest set of tokens with this mass.
+        how: How each token is drawn.
         cfg_scale: Guidance, one for all rows or one each; 1 is off. Needs a model trained with condition
             dropout.
         seed: One seed, from which `sample_seeds` makes one per row, or one per sample.
@@ -124,7 +121,6 @@ def generate(
     scales = [cfg_scale] * batch if isinstance(cfg_scale, (int, float)) else list(cfg_scale)
     if len(scales) != batch:
         raise UserError(f"{len(scales)} strengths of guidance were given for {batch} conditions")
-    how = Drawing(temperature, top_k, top_p)
     guided = any(scale != 1 for scale in scales)
     _check(utt, guided, null, max_groups, context)
     most_groups = max_groups or utt.max_groups

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config
-from motionloom.models.gpt.sampling import draw
+from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.layers.transformer import StackConfig, Transformer
 
 
@@ -93,7 +93,7 @@ class CrossGpt(nn.Module):
             begin = max(0, end - self.config.context)
             logits = self(codes[:, begin:], music[:, begin + 1 : end + 1])[:, -1].flatten(0, 1)
             uniform = torch.rand(len(logits), dtype=torch.float64, device=logits.device)
-            new = draw(logits, uniform, temperature=temperature).view(-1, 1, 2)
+            new = Drawing(temperature)(logits, uniform).view(-1, 1, 2)
             codes = torch.cat([codes, new], dim=1)
         return codes
 

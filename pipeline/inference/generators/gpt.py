@@ -118,9 +118,7 @@ class GptGenerator(OfTokens):
             self.gpt.net,
             prior,
             groups=groups,
-            temperature=sampling.temperature,
-            top_k=sampling.top_k or None,
-            top_p=sampling.top_p,
+            how=Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
             cfg_scale=sampling.guidance_of(self.part),
             seed=list(seeds),
         )

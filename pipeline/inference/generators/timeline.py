@@ -19,6 +19,7 @@ from torch import Tensor
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
+from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.utt.network import ConditionedUtt
@@ -130,9 +131,7 @@ class TokenTimeline:
             context=self.context + drawn,
             max_groups=min(self.window_groups, self.net.utt.max_groups) if groups is None else None,
             groups=groups,
-            temperature=sampling.temperature,
-            top_k=sampling.top_k or None,
-            top_p=sampling.top_p,
+            how=Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
             cfg_scale=scales,
             seed=list(seeds),
             drawn=drawn,

@@ -8,7 +8,7 @@ from toy_gpt import STREAMS, toy_gpt
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.network import InterleavedGPT
-from motionloom.models.gpt.sampling import draw, filter_logits, generate, sample_seeds
+from motionloom.models.gpt.sampling import Drawing, filter_logits, generate, sample_seeds
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_requested_lengths_are_kept(gpt: InterleavedGPT) -> None:
 
 def test_cached_sampling_equals_greedy_without_cache(gpt: InterleavedGPT) -> None:
     text = torch.randn(3, 6)
-    out = generate(gpt, text, groups=torch.tensor([4, 4, 4]), temperature=0)
+    out = generate(gpt, text, groups=torch.tensor([4, 4, 4]), how=Drawing(0))
     tokens = torch.zeros(3, 12, dtype=torch.int64)
     kinds = gpt.slots.repeat(4).expand(3, -1)
     with torch.no_grad():
@@ -101,7 +101,7 @@ def test_guidance_mixes_the_two_distributions(gpt: InterleavedGPT) -> None:
         on = gpt(tokens, kinds, text)[:, 0, :7]
         off = gpt(tokens, kinds, text, drop_text=torch.ones(50, dtype=torch.bool))[:, 0, :7]
     for scale in (0.0, 1.0, 3.0):
-        out = generate(gpt, text, groups=groups, temperature=0, cfg_scale=scale)
+        out = generate(gpt, text, groups=groups, how=Drawing(0), cfg_scale=scale)
         assert torch.equal(out.codes["body"][:, 0], (off + scale * (on - off)).argmax(-1))
 
 
@@ -109,10 +109,10 @@ def test_draws_follow_the_distribution() -> None:
     logits = torch.tensor([0.5, -torch.inf, 2.0, 1.0, -1.0]).expand(20_000, -1)
     uniform = (torch.arange(20_000, dtype=torch.float64) + 0.5) / 20_000
     for temperature in (1.0, 0.5):
-        share = torch.bincount(draw(logits, uniform, temperature=temperature), minlength=5) / 20_000
+        share = torch.bincount(Drawing(temperature)(logits, uniform), minlength=5) / 20_000
         torch.testing.assert_close(share, (logits[0] / temperature).softmax(-1), rtol=0, atol=1e-4)
     ends = torch.tensor([0.0, 1 - 2**-53], dtype=torch.float64)
-    assert draw(torch.tensor([[-torch.inf, 1.0, 1.0, -torch.inf]] * 2), ends).tolist() == [1, 2]
+    assert Drawing()(torch.tensor([[-torch.inf, 1.0, 1.0, -torch.inf]] * 2), ends).tolist() == [1, 2]
 
 
 def test_top_k_and_top_p() -> None:

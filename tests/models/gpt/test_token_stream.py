@@ -104,8 +104,7 @@ def test_one_block_is_a_motion_of_that_length(scale: float) -> None:
     stream.condition(text(0))
     made = drawn(stream, gpt.max_groups)
     whole = generate(
-        gpt, text(0), groups=torch.tensor([gpt.max_groups]), temperature=0.9, top_k=6, top_p=0.95,
-        cfg_scale=scale, seed=[11],
+        gpt, text(0), groups=torch.tensor([gpt.max_groups]), how=HOW, cfg_scale=scale, seed=[11]
     )  # fmt: skip
     assert [token for a, b, _ in made for token in (a, b)] == whole.codes["body"][0].tolist()
     assert [hand for _, _, hand in made] == whole.codes["hand"][0].tolist()

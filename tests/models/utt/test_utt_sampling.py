@@ -10,7 +10,7 @@ from toy_gpt import PATTERN, STREAMS, random_codes
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.sampling import draw, sample_seeds
+from motionloom.models.gpt.sampling import Drawing, sample_seeds
 from motionloom.models.gpt.tokens import Codes, interleave
 from motionloom.models.utt.network import Utt, UttConfig
 from motionloom.models.utt.sampling import draw_z, generate, join, last_groups, window_start
@@ -76,7 +76,7 @@ def slow(
         logits = [x.scatter(1, utt.ends[kinds[:, -1:]], -torch.inf) for x in logits]
         mixed = logits[0] if guide is None else logits[1] + scale * (logits[0] - logits[1])
         mixed = torch.where(torch.isfinite(logits[0]), mixed, -torch.inf)
-        tokens.append(int(draw(mixed, torch.tensor([uniform[i]]), **settings)))
+        tokens.append(int(Drawing(**settings)(mixed, torch.tensor([uniform[i]]))))
     return tokens[len(start) :]
 
 
@@ -96,7 +96,7 @@ def test_window_slides_by_halves_when_full() -> None:
 @pytest.mark.parametrize("settings", [{}, {"temperature": 0}, {"top_k": 3, "top_p": 0.8, "temperature": 1.3}])
 def test_cached_equals_uncached_over_several_windows(utt: Utt, groups: int, settings: dict[str, Any]) -> None:
     condition, seeds = conditions(2, [5, 2]), sample_seeds(7, 2)
-    out = generate(utt, condition, groups=torch.full((2,), groups), seed=7, **settings)
+    out = generate(utt, condition, groups=torch.full((2,), groups), seed=7, how=Drawing(**settings))
     sequence = interleave(out.codes, PATTERN, groups=out.groups)
     for index in range(2):
         mine = condition.rows(slice(index, index + 1))
@@ -169,7 +169,7 @@ def test_alone_equals_in_a_batch(utt: Utt, scale: float | list[float]) -> None:
 def test_guidance_equals_the_slow_mix(utt: Utt) -> None:
     condition, seeds = conditions(1), sample_seeds(2, 1)
     out = generate(
-        utt, condition, null=null(1), cfg_scale=3.0, groups=torch.tensor([6]), seed=2, temperature=0.8
+        utt, condition, null=null(1), cfg_scale=3.0, groups=torch.tensor([6]), seed=2, how=Drawing(0.8)
     )
     expected = slow(utt, condition, seeds[0], 6, start=[], guide=null(1), scale=3.0, temperature=0.8)
     assert interleave(out.codes, PATTERN).tokens[0].tolist() == expected
@@ -183,8 +183,8 @@ def test_z_makes_samples_differ_and_is_the_seeds_alone(utt: Utt) -> None:
         utt.z_in[-1].weight.mul_(30)
         if utt.frame_condition_in is not None:
             utt.frame_condition_in.weight.mul_(0.1)
-    noisy = generate(utt, condition, groups=groups, temperature=0)
-    still = generate(utt, condition, groups=groups, temperature=0, inject_z=False)
+    noisy = generate(utt, condition, groups=groups, how=Drawing(0))
+    still = generate(utt, condition, groups=groups, how=Drawing(0), inject_z=False)
     assert len({str(row(noisy, i)) for i in range(8)}) > 2
     assert len({str(row(still, i)) for i in range(8)}) == 1
     seeds = sample_seeds(0, 8)
@@ -197,9 +197,6 @@ def test_z_makes_samples_differ_and_is_the_seeds_alone(utt: Utt) -> None:
 def test_bad_settings_are_refused(utt: Utt) -> None:
     condition = conditions(2)
     for settings, message in (
-        ({"temperature": -1.0}, "temperature"),
-        ({"top_k": 0}, "top_k"),
-        ({"top_p": 0.0}, "top_p"),
         ({"max_groups": 0}, "max_groups 0"),
         ({"context": -1}, "context -1"),
         ({"seed": [1]}, "1 seeds were given for 2"),
@@ -212,3 +209,6 @@ def test_bad_settings_are_refused(utt: Utt) -> None:
     ):
         with pytest.raises(UserError, match=message):
             generate(utt, condition, **settings)
+    for name, value in (("temperature", -1.0), ("top_k", 0), ("top_p", 0.0)):
+        with pytest.raises(UserError, match=name):
+            Drawing(**{name: value})  # type: ignore[arg-type]

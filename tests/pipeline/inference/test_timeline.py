@@ -12,6 +12,7 @@ from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import MateConfig
+from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import Stream
 from motionloom.models.utt.network import ConditionedUtt, UttConfig
@@ -86,7 +87,7 @@ def test_free_length_is_a_plain_generate_and_stands_alone(
     timeline: TokenTimeline, net: ConditionedUtt
 ) -> None:
     made = timeline.tokens([Stretch(text(4), None)], SEEDS, SamplingConfig())
-    plain = generate(net.utt, net.mate(text(4)), max_groups=WINDOW, top_p=0.95, seed=SEEDS)
+    plain = generate(net.utt, net.mate(text(4)), max_groups=WINDOW, how=Drawing(top_p=0.95), seed=SEEDS)
     assert all(codes_of(made, row) == codes_of(plain, row) for row in range(4))
     for stretches in (
         [Stretch(text(4), None), Stretch(text(4), [8] * 4)],
@@ -140,7 +141,7 @@ def slow(
             )
             made = generate(
                 net.utt, net.mate(here), inject_z=inject_z, z=z, start=start, groups=torch.tensor([new]),
-                temperature=0, seed=[seed],
+                how=Drawing(0), seed=[seed],
             )  # fmt: skip
             body, hand = made.codes["body"][0].tolist(), made.codes["hand"][0].tolist()
             groups += [[body[2 * k], body[2 * k + 1], hand[k]] for k in range(new)]
