@@ -7,8 +7,9 @@ import json
 import sys
 import traceback
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import resources
-from typing import TypeVar
+from typing import Any, TypeVar
 from urllib.parse import quote
 
 from starlette.applications import Starlette
@@ -28,7 +29,6 @@ from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, why_not
 from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
-from motionloom.pipeline.serve.work import Busy, Worker
 
 T = TypeVar("T")
 RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
@@ -43,6 +43,43 @@ _UPLOADS = 4
 
 _LOOK = 0.25
 """Seconds after which a waiting request looks whether its client is still there."""
+
+
+class Busy(Exception):  # noqa: N818 - an answer, not a fault
+    """The largest allowed number of requests waits."""
+
+
+class Worker:
+    """Runs calls one after another in a thread of its own, that of the model, first come first served.
+
+    Each call has a future of its own, so answers cannot be mixed up. Asked by one thread alone.
+
+    Args:
+        waiting: Calls that may wait, besides the one that runs.
+    """
+
+    def __init__(self, waiting: int) -> None:
+        self.waiting = waiting
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="model")
+        self._calls: list[Future[Any]] = []
+
+    def submit(self, call: Callable[[], T], *, begun: bool = False) -> Future[T]:
+        """The future of a call; `Busy` where too many wait, unless it goes on with one that was begun."""
+        if self.length >= self.waiting and not begun:
+            raise Busy(f"{self.waiting} requests are waiting already; try again in a moment")
+        future = self._pool.submit(call)
+        self._calls.append(future)
+        return future
+
+    @property
+    def length(self) -> int:
+        """Calls that wait."""
+        self._calls = [future for future in self._calls if not future.done()]
+        return sum(not future.running() for future in self._calls)
+
+    def stop(self) -> None:
+        """Drop all that wait; what runs is let finish."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 class Site:

@@ -15,10 +15,9 @@ from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import find_model
-from motionloom.pipeline.serve.app import Site
+from motionloom.pipeline.serve.app import Site, Worker
 from motionloom.pipeline.serve.guard import HEADERS, is_loopback
 from motionloom.pipeline.serve.requests import ServeConfig
-from motionloom.pipeline.serve.work import Worker
 
 _GRACE = 5
 """Seconds that open requests have to end in when the server stops."""

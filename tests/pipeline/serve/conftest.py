@@ -22,10 +22,9 @@ from motionloom.pipeline.contract.generation import Capabilities, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
-from motionloom.pipeline.serve.app import Site
+from motionloom.pipeline.serve.app import Site, Worker
 from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.server import listen, server_of
-from motionloom.pipeline.serve.work import Worker
 from motionloom.pipeline.store.known_captions import Unknown
 
 LAYOUT = MotionLayout.named("wholebody363", fps=20.0)
