@@ -32,23 +32,14 @@ class Table(dict[str, T]):
     def __init__(self, of: type, called: str, *, classes: bool = False) -> None:
         super().__init__()
         self.called, self.classes = called, classes
-        self._followers: list[Callable[[T], object]] = []
+        self.followers: list[Callable[[T], object]] = []
         _TABLES[of] = self
 
     def follow(self, do: Callable[[T], object]) -> None:
         """Call `do` with each thing that is there and each that comes; a `UserError` of it refuses one."""
         for thing in list(self.values()):
             do(thing)
-        self._followers.append(do)
-
-    def enter(self, name: str, thing: T) -> None:
-        """Add a thing; `UserError` where another one has its name."""
-        if self.get(name, thing) is not thing:
-            raise UserError(f"{self.called} '{name}': another one has this name; choose a new one")
-        if name not in self:
-            for do in self._followers:
-                do(thing)
-            self[name] = thing
+        self.followers.append(do)
 
 
 _TABLES: dict[type, Table[Any]] = {}
@@ -67,7 +58,12 @@ def register(thing: T) -> T:
     if table is None or table.classes != classes:
         known = ", ".join(one.called + " (its class)" * one.classes for one in _TABLES.values())
         raise UserError(f"register: {named!r} is nothing that can be added; known: {known}")
-    table.enter(named.name, thing)
+    if table.get(named.name, thing) is not thing:
+        raise UserError(f"{table.called} '{named.name}': another one has this name; choose a new one")
+    if named.name not in table:
+        for do in table.followers:
+            do(thing)
+        table[named.name] = thing
     return thing
 
 

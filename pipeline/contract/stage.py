@@ -299,10 +299,6 @@ class StageKind(ABC, Generic[C]):
         """Sizes of a kind that trains; None for the others."""
         return None
 
-    def disk(self, config: C) -> int | None:
-        """Bytes of what it leaves on disk, where that is much and can be said."""
-        return None
-
     def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
         """Figures of the finished stage for the report, beside its curves."""
         return []

@@ -121,9 +121,7 @@ def say_estimate(
     times = {} if run is None or todo is None else training_times(run, todo)
     console.print(estimate_table(cards, times))
     total = sum(times.values())
-    sizes = [size for stage in named if (size := stage.kind.disk(stage.config)) is not None]
     lines = [f"disk: {_size(sum(card.checkpoint_bytes for card in cards.values()))} for checkpoints"]
-    lines += [f"about {_size(sum(sizes))} for data"] if sizes else []
     lines += [f"trainings: about {duration(total)} on {recipe.hardware.describe()}"] if times else []
     console.print("; ".join(lines), markup=False)
 

@@ -73,12 +73,6 @@ class SynthStage(DataStage):
         rhythm = config.dances is not None and config.dances.columns == "rhythm"
         return {WEIGHTS.name: sha256_of(WEIGHTS)} if rhythm else {}
 
-    def disk(self, config: SynthConfig) -> int:
-        """Motion in float32, of clips of the mean length."""
-        layout = config.motion_layout
-        seconds = (config.min_seconds + config.max_seconds) / 2
-        return round(4 * layout.dim * config.clips * seconds * layout.fps)
-
 
 class SynthStageConfig(SynthConfig, StageConfig):
     """Synthetic whole-body shards."""
