@@ -1,7 +1,7 @@
 """Recognise hand shapes on joints: finger curl, fan, thumb distance and rhythm.
 
 Finger order is SMPL-X's: index, middle, pinky, ring, thumb, three joints each. Limits lie between the shapes
-of the synthetic source (`datasets/synth/hands.py`), the only clips whose shapes are known.
+of the synthetic source (`datasets/synth/hands_and_face.py`), the only clips whose shapes are known.
 """
 
 from __future__ import annotations

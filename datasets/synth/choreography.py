@@ -1,7 +1,7 @@
 """Choreography: the body, hands and face of somebody who dances to a song, every pose on a beat.
 
 A dance is made of phrases of two bars, and a break is a phrase of its own. Each phrase draws a move of the
-legs, a pair of arm poses and how the arms share it (`moves.py`), so that it is unlike the one before; the
+legs, a pair of arm poses and how the arms share it (`genres.py`), so that it is unlike the one before; the
 poses alternate from beat to beat. Between two beats the body eases from pose to pose with a minimum-jerk
 curve, which has no speed at its ends: every beat is a minimum of the body's speed, which is what Beat Align
 looks for (UDE section 4.3).
@@ -24,10 +24,18 @@ from motionloom.datasets.actions.dances import Style
 from motionloom.datasets.synth.actions.arms import Hold, play
 from motionloom.datasets.synth.actions.maths import Array, ease, keys
 from motionloom.datasets.synth.actions.pose import Track
-from motionloom.datasets.synth.face import express_with
-from motionloom.datasets.synth.hands import grip_hand
-from motionloom.datasets.synth.moves import ACCENTS, ARM_WAYS, FREEZES, LEGS, LEGS_OF, MORE_ARMS, QUIET_LEGS
-from motionloom.datasets.synth.music.genres import ArmPair, ArmPose
+from motionloom.datasets.synth.hands_and_face import express_with, grip_hand
+from motionloom.datasets.synth.music.genres import (
+    ACCENTS,
+    ARM_WAYS,
+    FREEZES,
+    LEGS,
+    LEGS_OF,
+    MORE_ARMS,
+    QUIET_LEGS,
+    ArmPair,
+    ArmPose,
+)
 from motionloom.datasets.synth.music.song import Song
 
 _T = TypeVar("_T")

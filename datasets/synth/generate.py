@@ -36,8 +36,7 @@ from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, Span, Truth,
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
 from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
 from motionloom.datasets.synth.dances import Dance, DanceConfig, DanceTruth, dance, plan_dance
-from motionloom.datasets.synth.face import express
-from motionloom.datasets.synth.hands import grip_hand, shape_hand
+from motionloom.datasets.synth.hands_and_face import express, grip_hand, shape_hand
 from motionloom.datasets.synth.music.recording import render_song, song_features
 
 CONVERTER_VERSION = 2  # the face's words are about the body's person

@@ -14,12 +14,11 @@ from motionloom.datasets.actions.hands import HANDS, hand_shape
 from motionloom.datasets.actions.signals import signals_of, tempo
 from motionloom.datasets.motion.body.expressions import BASIS, FACES, emotion_of
 from motionloom.datasets.motion.kinematics import forward_kinematics
-from motionloom.datasets.synth import face
 from motionloom.datasets.synth.actions.pose import OFFSETS, SKELETON
 from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, Span, Truth, draw
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions, words
 from motionloom.datasets.synth.dances import dance
-from motionloom.datasets.synth.hands import shape_hand
+from motionloom.datasets.synth.hands_and_face import express, shape_hand
 
 TIMES = {1: "once|one time", 2: "twice|two|2", 3: "three|3|thrice", 4: "four|4", 5: "five|5"}
 
@@ -88,7 +87,7 @@ def test_face_basis_is_orthonormal_and_values_have_unit_order() -> None:
     values = []
     for seed in range(60):
         emotion = FACES[seed % 5]
-        x = face.express(emotion, t, np.random.default_rng(seed))
+        x = express(emotion, t, np.random.default_rng(seed))
         assert x.shape == (120, 50)
         assert emotion_of(x) == emotion
         values.append(x)

@@ -22,7 +22,6 @@ from motionloom.datasets.motion.body.rigid import fit_rigid, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.embed import mesh_data, pack_turns, pose_data
 from motionloom.pipeline.render.body.face import (
     ARKIT,
     CONTROLS,
@@ -46,7 +45,14 @@ from motionloom.pipeline.render.body.mesh import (
     single_bones,
 )
 from motionloom.pipeline.render.scene import Actor
-from motionloom.pipeline.render.viewer import ViewerMotion, has_bodies, viewer_script
+from motionloom.pipeline.render.viewer import (
+    ViewerMotion,
+    has_bodies,
+    mesh_data,
+    pack_turns,
+    pose_data,
+    viewer_script,
+)
 
 SMPLX = Skeleton.named("smplx52")
 Walk = Callable[..., NDArray[np.float64]]
@@ -168,7 +174,7 @@ def test_synthetic_faces_become_the_arkit_shapes_that_mean_them() -> None:
 
 
 def unpacked(packed: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Rotation matrices of 32-bit numbers, one at a time, from the words of `embed`'s docstring."""
+    """Rotation matrices of 32-bit numbers, one at a time, from the words of `viewer`'s docstring."""
     out = []
     for value in packed.ravel().tolist():
         left, quaternion = value >> 30, np.zeros(4)

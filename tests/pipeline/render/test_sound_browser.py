@@ -131,23 +131,6 @@ def test_a_pause_stands_where_the_sound_stopped(visit: Make, until: Make, dance:
     assert abs(stopped[0] - stopped[1]) < 1.5 / FPS
 
 
-def test_scrubbing_silences_and_a_new_round_starts_the_sound_again(
-    visit: Make, until: Make, dance: Path
-) -> None:
-    page = visit(dance, plays=True)
-    turn_on(page, until)
-    box = page.get_by_label("Time").bounding_box()
-    page.mouse.click(box["x"] + box["width"] * 0.75, box["y"] + 12)
-    until(page, "__viewer.audio.paused")
-    assert page.evaluate("__viewer.playing") is False and 112 <= page.evaluate("__viewer.frame") <= 126
-    page.evaluate("() => { __viewer.setFrame(154); __viewer.play(true); }")
-    until(page, "__viewer.audio.currentTime > 7.6 && !__viewer.audio.paused")
-    until(
-        page, "__viewer.audio.currentTime > 0.1 && __viewer.audio.currentTime < 3 && !__viewer.audio.paused"
-    )
-    assert_in_step(moments(page, 10))
-
-
 def test_another_motions_music_is_heard_in_its_place(visit: Make, until: Make, songs: Path) -> None:
     page = visit(songs, plays=True)
     assert page.locator(".mlv-hear:visible").count() == 2

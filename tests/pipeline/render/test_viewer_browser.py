@@ -138,19 +138,6 @@ def test_scrub_bar_and_buttons(visit: Any, until: Any, single: Path, pixels: Any
     assert page.evaluate("__viewer.follow") is False
 
 
-def test_without_follow_the_whole_way_is_in_view(visit: Any, single: Path, pixels: Any) -> None:
-    page = visit(single)
-    page.keyboard.press("f")
-    boxes = []
-    for frame in (0, 59):
-        still(page, frame)
-        image = pixels(page)
-        left, top, right, bottom = figure_box(image)
-        assert left >= 0 and right < image.shape[1] and top > 0 and bottom < image.shape[0] - 1
-        boxes.append((left + right) / 2)
-    assert abs(boxes[0] - boxes[1]) > 20
-
-
 def test_rows_share_one_clock_and_short_ones_hold(visit: Any, until: Any, rows: Path) -> None:
     page = visit(rows, width=1280, height=1000)
     assert page.locator("canvas").count() == 6
@@ -171,17 +158,6 @@ def test_untrusted_captions_stay_text(visit: Any, rows: Path) -> None:
     assert page.locator("figcaption").nth(3).text_content() == f"{NASTY} (truth)"
     assert page.locator("img, b").count() == 0
     assert page.evaluate("window.hacked") is None
-
-
-def test_dark_and_light(visit: Any, single: Path, pixels: Any) -> None:
-    light, dark = (visit(single, color_scheme=scheme) for scheme in ("light", "dark"))
-    back = "getComputedStyle(document.body).backgroundColor"
-    assert light.evaluate(back) != dark.evaluate(back)
-    dark.get_by_role("button", name="Dark or light").click()
-    assert light.evaluate(back) == dark.evaluate(back)
-    for page in (light, dark):
-        still(page, 5)
-    assert changed(pixels(light), pixels(dark)) < 0.002
 
 
 def test_unknown_skeletons_and_single_poses_draw(visit: Any, tmp_path: Path, pixels: Any) -> None:

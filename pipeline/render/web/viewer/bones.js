@@ -26,7 +26,7 @@ function openPose(raw, joints) {
   return pose;
 }
 
-/* Quaternions x, y, z, w of rotations packed as `body/embed.py` does it. */
+/* Quaternions x, y, z, w of rotations packed as `viewer.py` does it. */
 function unpackTurns(packed) {
   const out = new Float32Array(4 * packed.length), wide = Math.SQRT2 / 1022, low = Math.SQRT1_2;
   packed.forEach((value, k) => {
