@@ -51,8 +51,13 @@ def predicted(tokens: Tensor, logits: Tensor, known: Tensor | None = None) -> Te
 
 def cross_entropy(logits: Tensor, tokens: Tensor, known: Tensor | None = None) -> Tensor:
     """Mean over the `predicted` tokens of all ranks; logits [B, L, V], tokens int64 [B, L] padded with -1."""
+    return masked_mean(token_errors(logits, tokens), predicted(tokens, logits, known))
+
+
+def token_errors(logits: Tensor, tokens: Tensor) -> Tensor:
+    """Cross-entropy of each token [B, L]; 0 at padding."""
     each = F.cross_entropy(logits.flatten(0, 1), tokens.flatten(), ignore_index=PAD, reduction="none")
-    return masked_mean(each.view_as(tokens), predicted(tokens, logits, known))
+    return each.view_as(tokens)
 
 
 def accuracy(logits: Tensor, tokens: Tensor, kinds: Tensor, kind: int, known: Tensor | None = None) -> Tensor:

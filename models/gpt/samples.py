@@ -17,10 +17,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from motionloom.models.gpt.losses import predicted
+from motionloom.models.gpt.losses import predicted, token_errors
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import generate
-from motionloom.models.gpt.tokens import PAD, Codes, TokenSequence, interleave
+from motionloom.models.gpt.tokens import Codes, TokenSequence, interleave
 from motionloom.models.layers.frozen import evaluating
 from motionloom.models.tma.losses import false_negatives
 from motionloom.models.tma.network import Tma
@@ -95,14 +95,13 @@ def log_likelihood(
     empty = torch.zeros(logits.shape[1:], dtype=torch.bool, device=logits.device)
     empty[0, gpt.ends[gpt.slots[0]]] = True
     logits = logits.masked_fill(empty, -torch.inf)
-    value = -F.cross_entropy(logits.flatten(0, 1), tokens.flatten(), ignore_index=PAD, reduction="none")
     drawn = predicted(tokens, logits)
     # At the longest length End is no draw of the model's.
     drawn = drawn & (torch.arange(tokens.shape[1], device=tokens.device) < gpt.max_groups * len(gpt.pattern))
     if lacking is not None:
         rows = lacking.repeat_interleave(len(tokens) // len(lacking), dim=0)
         drawn = drawn & ~rows.gather(1, kinds)
-    return value.view_as(tokens), drawn
+    return -token_errors(logits, tokens), drawn
 
 
 def policy_loss(reward: Tensor, likelihood: Tensor, drawn: Tensor, count: int) -> Tensor:

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.gpt.losses import accuracy, cross_entropy, group_counts, predicted
+from motionloom.models.gpt.losses import accuracy, cross_entropy, group_counts, predicted, token_errors
 from motionloom.models.layers.frozen import Frozen
 from motionloom.models.layers.strided import SLOPE
 from motionloom.models.layers.transformer import length_mask
@@ -119,9 +119,7 @@ class Seq2SeqModule(StageModule):
 
         logits = net.roll(batch["words"], batch["mask"], kinds, net.legal(tokens, kinds), read)
         ce = cross_entropy(logits, tokens, known)
-        each = functional.cross_entropy(
-            logits.flatten(0, 1), tokens.flatten(), ignore_index=-1, reduction="none"
-        ).view_as(tokens)
+        each = token_errors(logits, tokens)
         counted = predicted(tokens, logits, known)
         # The release sums errors; the mean is logged either way, so that runs compare.
         values = {"loss": summed_or_mean(each, counted, summed=self.loss_config.summed), "ce": ce}
