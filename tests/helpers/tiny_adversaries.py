@@ -26,8 +26,12 @@ GENERATOR = OptimConfig(optimizer="adam", lr=1e-2, grad_clip=0.3, warmup_steps=3
 CRITIC = OptimConfig(lr=2e-2, grad_clip=0.2, schedule="cosine", weight_decay=0.1)
 
 
-class Vectors(Dataset[dict[str, Tensor]]):
-    """Item k is this rank's rows of batch k."""
+class Steps(Dataset[dict[str, Any]]):
+    """Item k is this rank's rows of a part of batch k // parts, which `made` gives whole.
+
+    `dies_at` a step all ends with an error, at `hangs_at` nothing goes on, and with a step of `signalled`
+    that signal comes.
+    """
 
     def __init__(
         self,
@@ -37,7 +41,7 @@ class Vectors(Dataset[dict[str, Tensor]]):
         *,
         parts: int = 1,
         size: int = 10**6,
-        dtype: Any = None,
+        dtype: Any = torch.float32,
         dies_at: int | None = None,
         signalled: dict[int, signal.Signals] | None = None,
         hangs_at: int | None = None,
@@ -49,7 +53,7 @@ class Vectors(Dataset[dict[str, Tensor]]):
     def __len__(self) -> int:
         return self.size
 
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
+    def __getitem__(self, index: int) -> dict[str, Any]:
         if index >= self.size:
             raise IndexError(index)
         step, part = divmod(index, self.parts)
@@ -59,10 +63,19 @@ class Vectors(Dataset[dict[str, Tensor]]):
             os.kill(os.getpid(), self.signalled[step])
         if step == self.hangs_at:
             time.sleep(3600)
+        return self.made(step, part)
+
+    def made(self, step: int, part: int) -> dict[str, Any]:
+        raise NotImplementedError
+
+
+class Vectors(Steps):
+    """Random vectors; the same whether they come at once or in parts."""
+
+    def made(self, step: int, part: int) -> dict[str, Any]:
         generator = torch.Generator().manual_seed(step)
-        # The same rows whether they come at once or in parts.
         rows = torch.randn(self.parts * self.batch, DIM, generator=generator, dtype=torch.float64)
-        rows = rows[part * self.batch :][: self.batch][self.rows].to(self.dtype or torch.float32)
+        rows = rows[part * self.batch :][: self.batch][self.rows].to(self.dtype)
         return {"x": rows, "length": torch.ones(len(rows)), "reader": torch.tensor(os.getpid())}
 
 

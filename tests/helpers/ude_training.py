@@ -7,7 +7,6 @@ rank takes its rows. So two ranks and one process can be compared.
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,9 +16,8 @@ from unittest import mock
 
 import torch
 from rich.console import Console
-from tiny_adversaries import context
+from tiny_adversaries import Steps, context
 from torch import Tensor, nn
-from torch.utils.data import Dataset
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
@@ -52,29 +50,11 @@ OPTIM = OptimConfig(optimizer="adam", lr=3e-3, warmup_steps=3)
 NAMES = ("mq", "tm2t", "utt", "dmd", "fact", "dance_vq", "cross_gpt", "actor_critic")
 
 
-class Clips(Dataset[dict[str, Any]]):
-    """Item k is this rank's rows of batch k: motion, text and music; lengths differ."""
+class Clips(Steps):
+    """Motion, text and music; lengths differ."""
 
-    def __init__(
-        self, batch: int, rank: int = 0, world: int = 1, *, size: int = 10**6, dtype: Any = torch.float32,
-        parts: int = 1, dies_at: int | None = None, signalled: dict[int, signal.Signals] | None = None,
-    ) -> None:  # fmt: skip
-        self.batch, self.size, self.dtype = batch, size, dtype
-        self.parts, self.dies_at, self.signalled = parts, dies_at, signalled or {}
-        self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
-
-    def __len__(self) -> int:
-        return self.size
-
-    def __getitem__(self, k: int) -> dict[str, Any]:
-        if k >= self.size:
-            raise IndexError(k)
-        step, part = divmod(k, self.parts)
-        if step == self.dies_at:
-            raise ConnectionResetError("killed")
-        if part == 0 and step in self.signalled:
-            os.kill(os.getpid(), self.signalled[step])
-        generator = torch.Generator().manual_seed(k)
+    def made(self, step: int, part: int) -> dict[str, Any]:
+        generator = torch.Generator().manual_seed(self.parts * step + part)
 
         def numbers(*shape: int) -> Tensor:
             return torch.randn(self.batch, *shape, generator=generator, dtype=torch.float64).to(self.dtype)

@@ -18,8 +18,8 @@ import torch
 from pydantic import ValidationError
 from rich.console import Console
 from safetensors.torch import load_file, save_file
+from tiny_adversaries import Steps
 from torch import Tensor
-from torch.utils.data import Dataset
 from two_ranks import run_two_ranks
 
 from motionloom.datasets.motion.layout import MotionLayout
@@ -44,18 +44,15 @@ STEPS, BATCH = 8, 8
 CLIP = 0.5  # below the norms met here
 
 
-class Tokens(Dataset[dict[str, Tensor]]):
-    """Random token sequences; item k is this rank's part of batch k."""
+class Tokens(Steps):
+    """Random token sequences of a network."""
 
-    def __init__(self, net: InterleavedGPT, batch: int, rank: int, world: int, size: int = 10**6) -> None:
-        self.net, self.batch, self.size = net, batch, size
-        self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
+    def __init__(self, net: InterleavedGPT, *place: int, **options: Any) -> None:
+        super().__init__(*place, **options)
+        self.net = net
 
-    def __len__(self) -> int:
-        return self.size
-
-    def __getitem__(self, index: int) -> dict[str, Tensor]:
-        generator = torch.Generator().manual_seed(index)
+    def made(self, step: int, part: int) -> dict[str, Tensor]:
+        generator = torch.Generator().manual_seed(step)
         codes = {
             "body": torch.randint(9, (self.batch, 8), generator=generator),
             "hand": torch.randint(9, (self.batch, 4), generator=generator),
