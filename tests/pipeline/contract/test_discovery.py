@@ -14,6 +14,7 @@ from motionloom.datasets.base import register
 from motionloom.pipeline import baselines
 from motionloom.pipeline.contract import stage
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.store.artifact import Artifact
 
 ARCHITECTURE = Path(__file__).resolve().parents[3] / "docs/architecture.md"
 
@@ -54,3 +55,5 @@ def test_the_example_of_the_documents_runs_from_its_file(
     )
     run = run_recipe(tmp_path / "mine.yaml", tmp_path / "run", console=Console(quiet=True))
     assert (run / "stages/clips/clips.txt").read_text() == "4 training clips"
+    made = {name: Artifact.load_json(run / f"stages/{name}/artifact.json").code for name in ("data", "clips")}
+    assert not made["data"] and list(made["clips"]) == ["count_clips"]
