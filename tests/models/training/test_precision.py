@@ -88,9 +88,9 @@ def autocast(half: torch.dtype) -> torch.autocast:
 
 @pytest.mark.parametrize("half", HALVES, ids=str)
 def test_codes_are_assigned_in_float32(half: torch.dtype) -> None:
-    """Codes a thousandth apart, far from zero: bfloat16 and float16 would call them the same."""
+    """Codes four thousandths apart, far from zero: bfloat16 and float16 would call them the same."""
     quantizer = EmaQuantizer(QuantizerConfig(num_codes=16, dim=4)).eval()
-    quantizer.codebook.copy_(1 + torch.arange(16)[:, None] * 1e-3)
+    quantizer.codebook.copy_(1 + torch.arange(16)[:, None] * 4e-3)
     z = quantizer.codebook[None] + 2e-4
     fsq = FsqQuantizer(4, (5, 4))
     wide = torch.randn(1, 200, 4) * 3
