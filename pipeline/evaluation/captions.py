@@ -14,7 +14,6 @@ from functools import cached_property
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from motionloom.datasets.actions.measure import find_mismatch
 from motionloom.datasets.shards.clips import ClipDataset
@@ -32,8 +31,10 @@ from motionloom.pipeline.evaluation.figures import (
     Protocol,
     group_figures,
 )
+from motionloom.pipeline.evaluation.judges import Judge
+from motionloom.pipeline.evaluation.latent_metrics import unit_length
 from motionloom.pipeline.evaluation.truth import Truth, has_caption, truth_of
-from motionloom.pipeline.store.networks import LoadedTma, TokensOfCaptions, embed_motions
+from motionloom.pipeline.store.networks import LoadedTma, TokensOfCaptions
 
 _TOP, _AT_ONCE = 3, 256
 
@@ -95,7 +96,9 @@ class CaptionedClips:
         }
         if self.tma is not None:
             latents = self.tma.embed_captions(list(captions), self.tma.given["text"])
-            found_by = r_precision(_unit(latents), self.motions, batch=self.size, top=_TOP, seed=self.seed)
+            found_by = r_precision(
+                unit_length(latents), self.motions, batch=self.size, top=_TOP, seed=self.seed
+            )
             top = found_by.tolist()
             out |= {f"captions.R-precision-{k}": Estimate(value) for k, value in enumerate(top, start=1)}
         return out
@@ -104,7 +107,7 @@ class CaptionedClips:
     def motions(self) -> Tensor:
         """TMA's unit-length latents of the clips [n, Z]."""
         assert self.tma is not None
-        return _latents(self.tma, self.truths)
+        return unit_length(Judge(self.tma).recorded(self.truths))
 
 
 def caption_figures(rows: Mapping[str, Mapping[str, Estimate]], protocol: Protocol) -> list[Figure]:
@@ -123,14 +126,6 @@ def _states(text: TokensOfCaptions, captions: Iterable[str]) -> dict[str, Tensor
     return out
 
 
-def _unit(latents: Tensor) -> Tensor:
-    return functional.normalize(latents.double(), dim=-1)
-
-
-def _latents(tma: LoadedTma, truths: Sequence[Truth]) -> Tensor:
-    return _unit(embed_motions(tma, [t.features for t in truths], [t.present for t in truths]))
-
-
 def trivial_captions(train: ClipDataset, clips: CaptionedClips) -> dict[str, list[str]]:
     """Return for each reference row a caption of the training set for each clip."""
     usable = np.flatnonzero(has_caption(train)).tolist()
@@ -139,6 +134,7 @@ def trivial_captions(train: ClipDataset, clips: CaptionedClips) -> dict[str, lis
     common = min(counts, key=lambda text: (-counts[text], text))
     out = {COMMON_CAPTION: [common] * len(clips.truths)}
     if clips.tma is not None:
-        near = (clips.motions @ _latents(clips.tma, truths).t()).argmax(1).tolist()
+        trained = unit_length(Judge(clips.tma).recorded(truths))
+        near = (clips.motions @ trained.t()).argmax(1).tolist()
         out[NEAREST] = [truths[clip].caption for clip in near]
     return out

@@ -94,7 +94,7 @@ def tma_alignment(row: LatentRow) -> Values:
     """`recalls`, and the mean distance of each caption's latent from its motion's, both of length 1, and as
     they are.
     """
-    unit = matching_score(_unit(row.text), _unit(row.motion))
+    unit = matching_score(unit_length(row.text), unit_length(row.motion))
     plain_score = matching_score(row.text, row.motion)
     return recalls(row) | {"matching_score": float(unit), "latent_distance": float(plain_score)}
 
@@ -120,7 +120,7 @@ def spread(row: LatentRow) -> Values:
         return {}
     return {
         "fid": float(fid(row.real, row.motion)),
-        "fid_unit": float(fid(_unit(row.real), _unit(row.motion))),
+        "fid_unit": float(fid(unit_length(row.real), unit_length(row.motion))),
         "diversity": float(diversity(row.motion, seed=row.seed)),
     }
 
@@ -319,9 +319,10 @@ def _measured(
 
 def caption_distances(text: Tensor, motion: Tensor) -> Tensor:
     """Distances [n], 0 to 2, of the texts' latents [n, Z] from their motions', all scaled to length 1."""
-    out: Tensor = torch.linalg.vector_norm(_unit(text) - _unit(motion), dim=-1)
+    out: Tensor = torch.linalg.vector_norm(unit_length(text) - unit_length(motion), dim=-1)
     return out
 
 
-def _unit(x: Tensor) -> Tensor:
+def unit_length(x: Tensor) -> Tensor:
+    """Latents [..., Z] in float64, scaled to length 1."""
     return normalize(x.double(), dim=-1)

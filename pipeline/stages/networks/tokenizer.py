@@ -160,18 +160,10 @@ def window_batches(
     data, stats = inputs.data, inputs.stats
     dataset = data.split("train", training=True)
 
+    cut = {"window": config.window, "windows_per_clip": config.windows_per_clip, "seed": seed}
+
     def train(batch: int, rank: int, world: int) -> Dataset[object]:
-        return WindowBatches(
-            dataset,
-            stats,
-            window=config.window,
-            batch_size=batch,
-            windows_per_clip=config.windows_per_clip,
-            seed=seed,
-            rank=rank,
-            world=world,
-            columns=columns,
-        )
+        return WindowBatches(dataset, stats, batch_size=batch, rank=rank, world=world, columns=columns, **cut)
 
     return Batches(train, lambda: EvalBatches(data.held_out(), stats, columns=columns, **validation))
 

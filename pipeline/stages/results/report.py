@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -232,19 +233,10 @@ def _rows(
     if made is not None:
         controls = None if made.face is None else synthetic_face_controls(made.face)
         rows.append(("generated", shown(made).joints, controls))
+    figure = (layout.fps, layout.skeleton.parents)
+    music: dict[str, Any] = {"sound": score.sound, "beats": score.beats, "segments": score.segments}
     return [
-        ViewerMotion(
-            joints,
-            layout.fps,
-            layout.skeleton.parents,
-            label,
-            words,
-            group,
-            controls,
-            sound=score.sound,
-            beats=score.beats,
-            segments=score.segments,
-        )
+        ViewerMotion(joints, *figure, label, words, group, controls, **music)
         for label, joints, controls in rows
     ]
 
