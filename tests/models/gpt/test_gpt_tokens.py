@@ -1,4 +1,4 @@
-"""Interleaving: against a slow reference for any pattern, and the paper's 149 tokens."""
+"""Interleaving: against a slow reference for any pattern."""
 
 from __future__ import annotations
 
@@ -80,15 +80,6 @@ def test_interleave_equals_reference_and_inverts(
         assert (some.tokens[row, size:] == PAD).all() and (some.kinds[row, size:] == 0).all()
     opened = interleave(codes, pattern, groups=torch.tensor(groups))
     assert torch.equal(opened.length + len(ends), out.length)
-
-
-def test_paper_length() -> None:
-    codes = {"body": torch.zeros(1, 98, dtype=torch.int64), "hand": torch.zeros(1, 49, dtype=torch.int64)}
-    out = interleave(codes, ("body", "body", "hand"), ends={"body": 512, "hand": 512})
-    assert out.tokens.shape == (1, 149)
-    assert out.length.tolist() == [149]
-    assert out.tokens[0, -2:].tolist() == [512, 512]
-    assert out.kinds[0, -5:].tolist() == [0, 0, 1, 0, 1]
 
 
 def test_mistakes_are_named() -> None:
