@@ -16,6 +16,7 @@ from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, STILL, THROUGH, TRAINING, FigureFile
 from motionloom.pipeline.evaluation.reconstruction import face_errors, read_basis
 from motionloom.pipeline.evaluation.truth import reconstruct_all, spread_any, truth_of
+from motionloom.pipeline.results.paper.compare import compare_with_paper
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
 
@@ -30,6 +31,19 @@ stages:
     loss: {contrastive: 0.1}
     train: {steps: 4, batch_size: 8, checkpoint_every: 4, validate_every: 4}
   evaluate: {clips: 9, repeats: 2, size: 4, face_basis: BASIS}
+  # As in the recipes of the baselines.
+  evaluate_face_vae:
+    kind: evaluate
+    clips: 9
+    repeats: 1
+    size: 4
+    inputs: {tokenizer: null, face_tokenizer: null, tma: null, generators: [gpt, face_vae]}
+  evaluate_face_diffusion:
+    kind: evaluate
+    clips: 9
+    repeats: 1
+    size: 4
+    inputs: {tokenizer: null, face_tokenizer: null, tma: null, generators: [gpt, face_diffusion]}
 """
 
 
@@ -41,9 +55,8 @@ def judged(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     np.save(root / "head.npy", np.random.default_rng(0).normal(size=(5, 3, 50)) * 0.01)
     (root / "faces.yaml").write_text(RECIPE.replace("BASIS", str(root / "head.npy")))
     shutil.copytree(small_run.folder, root / "run")
-    run_recipe(
-        root / "faces.yaml", root / "run", select=Selection(until="evaluate"), console=Console(quiet=True)
-    )
+    wanted = "evaluate,evaluate_face_vae,evaluate_face_diffusion"
+    run_recipe(root / "faces.yaml", root / "run", select=Selection(until=wanted), console=Console(quiet=True))
     return root
 
 
@@ -89,6 +102,16 @@ def test_motion_stands_beside_what_was_recorded(judged: Path) -> None:
         found = file.of(f"movement.{name}", row)
         assert found is not None and found.value > 0
     assert found.note, "seven motions for 66 columns"
+
+
+@pytest.mark.slow
+def test_each_facial_generator_has_a_row(judged: Path) -> None:
+    (found,) = compare_with_paper("humantomato/4", [judged / "run"])
+    ours = {row.method: row for row in found.rows if row.source == "ours"}
+    assert set(ours) == {"cVAE", "Diffusion", "Ours"}
+    for row in ours.values():
+        assert all(cell is not None for cell in row.cells[:6]), row
+    assert len({ours[method].cells[0].text for method in ours}) == 3  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
