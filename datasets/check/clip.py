@@ -17,6 +17,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, ClipMeta, ShardInfo
 from motionloom.datasets.shards.sample import captions_from_json, meta_from_json, require_finite
@@ -79,10 +80,6 @@ def beyond(
         unit = " rad/s" if part == "root_yaw_velocity" else " m/s"
         value, most = value * layout.fps, most * layout.fps
     return f"{part}[{at}] is {value:.4g}{unit} at frame {frame}; at most {most:.4g} is sensible"
-
-
-END_TOLERANCE = 0.5
-"""Seconds a caption may reach past its clip: sources round their times."""
 
 
 @dataclass(frozen=True)

@@ -46,14 +46,7 @@ class Group:
         first = self.members[0]
         if self.count == 1:
             return f"{first.source}: {first.reason}"
-        return f"{self.count} x {self._common()} (the first: {first.source})"
-
-    def _common(self) -> str:
-        first, *others = [member.reason.split(" ") for member in self.members]
-        if any(len(words) != len(first) for words in others):
-            return self.kind
-        same = [len(set(words)) == 1 for words in zip(first, *others, strict=True)]
-        return " ".join(word if agrees else "…" for word, agrees in zip(first, same, strict=True))
+        return f"{self.count} x {self.kind} (the first: {first.source})"
 
 
 def kind_of_reason(reason: str, source: str = "") -> str:

@@ -41,8 +41,6 @@ from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 
-_NAMED_JOINTS = 12
-"""Joints without a row that are named; a hand alone has twenty."""
 _QUICK = 1
 """Level of zlib: text of joints shrinks to a third, and little more with more effort."""
 
@@ -100,22 +98,13 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         return Sample(meta=self.meta(clip, motion, hands=hands), motion=motion, texts=list(clip.texts))
 
     def joints(self, clip: BvhClip) -> SourceJoints:
-        """The joints as the map reads them, and the joints that no row of it names."""
+        """The joints as the map reads them."""
         motion = self._motion(self._read(clip), clip.label())
         joint_map = self._map_of(motion)
         joints = self._world(motion, joint_map)
-        used = {name for names in joint_map.sources for name in names}
-        free = [name for name in motion.joints if name not in used and name not in joint_map.unmapped]
-        twice = sorted({name for name in free if motion.joints.count(name) > 1})
-        remarks = []
-        if free:
-            more = f" and {len(free) - _NAMED_JOINTS} more" if len(free) > _NAMED_JOINTS else ""
-            remarks.append(f"joints that no row of the map names: {', '.join(free[:_NAMED_JOINTS])}{more}")
-        if twice:
-            remarks.append(f"joints that appear more than once, which no row can name: {', '.join(twice)}")
         names = tuple(names[0] if len(names) == 1 else names for names in joint_map.sources)
         up = joint_map.up or self.config.up
-        return SourceJoints(joints, self.config.source_fps or motion.fps, names, tuple(remarks), up)
+        return SourceJoints(joints, self.config.source_fps or motion.fps, names, up)
 
     def encode(self, label: str, data: bytes) -> NDArray[np.float32]:
         """Features [T', D] of one file; `label` names it in errors."""

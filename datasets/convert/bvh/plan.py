@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, ClassVar, Literal
+from typing import ClassVar, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
@@ -39,11 +39,6 @@ from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Split, UserError
-
-MapChoice = Annotated[
-    Path | Literal["auto"], BeforeValidator(lambda given: "auto" if str(given) == "auto" else given)
-]
-"""A map file or a folder of them, or `auto` (from the command line also as a path) for guesses."""
 
 MAPS_FOLDER = "joint_maps"
 """In the folder of the shards: the maps that were guessed, one for each skeleton."""
@@ -204,7 +199,7 @@ class BvhConfig(CaptionConfig):
 
     source: Path
     """A folder of .bvh files and/or tar archives of them, or one such file."""
-    joint_map: MapChoice = "auto"
+    joint_map: Path | Literal["auto"] = "auto"
     """A JSON file that says which joints of the files stand for ours, or a folder of such files, each for its
     own skeleton (docs/sources.md). Where none fits, and with `auto`, the map is guessed from the names."""
     name: str = "bvh"

@@ -14,12 +14,10 @@ import math
 import re
 from pathlib import Path
 
+from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.text.clean import clean_caption, usable_caption
-
-END_TOLERANCE = 0.5
-"""Seconds that a segment may reach past the clip."""
 
 _TOKEN = re.compile(r"\S+/[A-Z]+")
 

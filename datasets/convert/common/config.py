@@ -12,6 +12,9 @@ from motionloom.datasets.convert.common.facts import parse_where
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import Config, MotionType, UserError
 
+END_TOLERANCE = 0.5
+"""Seconds that a caption may reach past its clip: sources round their times."""
+
 
 class ConvertConfig(Config):
     """Options that every converter has. The docstrings of the fields are the command line's help."""

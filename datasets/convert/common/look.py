@@ -145,8 +145,6 @@ class SourceJoints:
     fps: float
     names: Names = ()
     """Name in the file of each joint (several: their mean), where a joint map is used."""
-    remarks: tuple[str, ...] = ()
-    """Remarks for the user about the file, in equal words for equal things, which are counted."""
     up: str = "y"
     """The upward axis of the file."""
 
@@ -185,7 +183,6 @@ class Look:
     warnings: tuple[str, ...] = ()
     """Odd measurements that may be meant."""
     suggestions: tuple[Suggestion, ...] = ()
-    remarks: tuple[str, ...] = ()
     all_subsets: int = field(default=0)
     """Subsets of the source, those not looked at too."""
 
@@ -221,7 +218,6 @@ class Look:
             *(f"problem: {text}" for text in self.problems),
             *(f"try: {suggestion}" for suggestion in self.suggestions),
             *(f"warning: {text}" for text in self.warnings),
-            *(f"note: {text}" for text in self.remarks),
         ]
 
     def require_people(self, source: str) -> None:
@@ -251,7 +247,6 @@ def look_at(
     chosen, subsets = _choose(items, subset_of, config.look, label, in_order)
     clips: list[SeenClip] = []
     failed: list[tuple[str, Dropped]] = []
-    remarks: Counter[str] = Counter()
     rates: list[str] = []
     names: Names = ()
     for name, item in chosen:
@@ -268,7 +263,6 @@ def look_at(
         clips.append(SeenClip(name, body, seen.fps / step, seen.fps, seen.up))
         if wrong := wrong_rate(np.asarray(seen.joints, dtype=np.float64), seen.fps):
             rates.append(f"{label(item)}: {wrong}")
-        remarks.update(seen.remarks)
         names = names or seen.names
     unreadable = Counter(name for name, _ in failed)
     found = [
@@ -288,7 +282,6 @@ def look_at(
         problems=tuple(problems),
         warnings=tuple(warnings),
         suggestions=tuple(suggestions),
-        remarks=tuple(f"{text} ({count} of {len(clips)} clips)" for text, count in remarks.most_common()),
         all_subsets=subsets,
     )
 

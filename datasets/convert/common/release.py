@@ -16,7 +16,7 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.common.config import ConvertConfig
+from motionloom.datasets.convert.common.config import END_TOLERANCE, ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.features import features_of, frames_after
@@ -31,9 +31,6 @@ from motionloom.datasets.convert.common.splits import (
 )
 from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
 from motionloom.datasets.shards.sample import Sample
-
-_END_TOLERANCE = 0.5
-"""Seconds that a caption may reach past its clip."""
 
 
 class ReleaseConfig(ConvertConfig):
@@ -262,7 +259,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         texts = []
         # Which frames a caption beyond the clip describes is unknown; a little beyond is rounding.
         for text in entry.texts:
-            if text.start < seconds and (text.end is None or text.end <= seconds + _END_TOLERANCE):
+            if text.start < seconds and (text.end is None or text.end <= seconds + END_TOLERANCE):
                 end = None if text.end is None else min(text.end, seconds)
                 texts.append(text.model_copy(update={"end": end}))
             else:

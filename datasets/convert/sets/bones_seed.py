@@ -31,10 +31,7 @@ _FACTS = (
 _CAPTIONS = {
     "natural": [f"content_natural_desc_{number}" for number in range(1, 5)],
     "short": ["content_short_description", "content_short_description_2"],
-    "technical": ["content_technical_description"],
 }
-
-Kind = Literal["natural", "short", "technical", "timeline"]
 
 
 class BonesSeedConfig(BvhSetConfig):
@@ -44,10 +41,6 @@ class BonesSeedConfig(BvhSetConfig):
     licence: str | None = "bones-seed-license"
     variant: Literal["uniform", "proportional"] = "uniform"
     """Motion on one skeleton for all, or on each actor's own."""
-    kinds: tuple[Kind, ...] = ("natural", "short", "timeline")
-    """Captions to keep: natural, short and technical descriptions, and the sentences of the timeline."""
-    split_by: Literal["actor_uid", "take_org_name", "move_name"] = "actor_uid"
-    """The column that a split never tears apart: by default nobody who is tested was trained on."""
 
     def batches(self) -> list[Batch]:
         name = f"soma_{self.variant}"
@@ -58,19 +51,19 @@ class BonesSeedConfig(BvhSetConfig):
         return list_batches(place)
 
     def rows(self) -> dict[str, Row]:
-        return _rows(self.source, self.kinds, self.split_by, state(*(self.source / "metadata").glob("*")))
+        return _rows(self.source, state(*(self.source / "metadata").glob("*")))
 
 
 @lru_cache(maxsize=2)
-def _rows(source: Path, kinds: tuple[Kind, ...], split_by: str, made: tuple[int, ...]) -> dict[str, Row]:
-    """The metadata by file name."""
+def _rows(source: Path, made: tuple[int, ...]) -> dict[str, Row]:
+    """The metadata by file name; clips of one actor stay in one split."""
     folder = source / "metadata"
     tables = sorted(folder.glob("seed_metadata_v*.csv"))
     if not tables:
         parquet = sorted(folder.glob("*.parquet"))
         hint = f"; save {parquet[-1].name} as CSV" if parquet else "; give the folder of the release"
         raise UserError(f"{folder}: no seed_metadata_v00N.csv in it{hint}")
-    labels = sorted(folder.glob("*temporal_labels.jsonl")) if "timeline" in kinds else []
+    labels = sorted(folder.glob("*temporal_labels.jsonl"))
     timeline = _timeline(labels[-1]) if labels else {}
     found: dict[str, Row] = {}
     for _, row in read_csv(tables[-1], ("filename", "move_duration_frames", "is_mirror", "actor_uid")):
@@ -80,15 +73,15 @@ def _rows(source: Path, kinds: tuple[Kind, ...], split_by: str, made: tuple[int,
         seconds = int(frames) / FPS
         texts = [
             text
-            for kind in kinds
-            for column in _CAPTIONS.get(kind, ())
+            for kind, columns in _CAPTIONS.items()
+            for column in columns
             for text in captions_of(row.get(column), kind)
         ]
         for text in timeline.get(name, ()):
             if text.start < seconds:
                 texts.append(text.model_copy(update={"end": min(text.end or seconds, seconds)}))
         facts = {key: sys.intern(row[key]) for key in _FACTS if row.get(key)}
-        found[name] = Row(tuple(texts), facts.get(split_by) or name, facts)
+        found[name] = Row(tuple(texts), facts.get("actor_uid") or name, facts)
     return found
 
 
