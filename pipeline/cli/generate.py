@@ -138,7 +138,6 @@ def _generate_files(
     from motionloom.pipeline.inference.edits.clip_file import read_seed_motion
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.outputs import page_note, page_title
-    from motionloom.pipeline.inference.requests import remarks_of
     from motionloom.pipeline.inference.script import Script, read_music
     from motionloom.pipeline.inference.shown import FigureOptions
     from motionloom.pipeline.launch.hardware import threads_for
@@ -180,11 +179,8 @@ def _generate_files(
                     f"the first {start:.2g} s are of a training dance; --set seed_motion=FILE takes yours",
                 )
         prompts = [one.prompt for one in (segments or motions)]
-        notes = [
-            *bundle.unknown_captions([one.text for one in prompts], faces or (), sampling.face_model),
-            *bundle.find_mismatches(motions),
-        ]
-        for note in (*notes, *remarks_of(prompts)):
+        notes = bundle.notes(prompts, motions, sampling.face_model)
+        for note in notes:
             print_note(aside, note)
         songs = [path.name for path in asked.songs]
         write_files(

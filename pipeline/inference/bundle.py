@@ -257,6 +257,20 @@ class Bundle:
             out += unknown_captions(source, texts, face=texts is face)
         return out
 
+    def notes(
+        self,
+        prompts: Iterable[Prompt],
+        motions: Iterable[GeneratedMotion] = (),
+        face_model: str | None = None,
+    ) -> list[Unknown | str]:
+        """Return what a person should know of prompts and of their motions: captions unlike all that were
+        trained on, sounds without a beat, and motions that show something else than was asked for.
+        """
+        prompts = list(prompts)
+        texts, faces = [prompt.text for prompt in prompts], [prompt.face_text for prompt in prompts]
+        remarks = dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark)
+        return [*self.unknown_captions(texts, faces, face_model), *remarks, *self.find_mismatches(motions)]
+
     def find_mismatches(self, motions: Iterable[GeneratedMotion]) -> list[str]:
         """Return a sentence for each caption, scripts apart, of which its motions show something else."""
         source = self.generator.prepared.get("text")
@@ -298,15 +312,7 @@ class Bundle:
         faces = self._faces(segments, frames, seeds[samples:], sampling)
         # Segments last whole units of the generator, so the time line goes by frames, not by what was asked.
         starts = np.concatenate([[0], np.cumsum(frames)]) / fps
-        bands = tuple(
-            Segment(
-                float(a),
-                float(b),
-                f"{s.label} ({s.prompt.remark})" if s.prompt.remark else s.label,
-                "text" if s.prompt.sound is None else "music",
-            )
-            for s, a, b in zip(segments, starts, starts[1:], strict=False)
-        )
+        bands = tuple(s.band(a, b) for s, a, b in zip(segments, starts, starts[1:], strict=False))
         beats = tuple(
             float(start + tick)
             for segment, stretch, start, count in zip(segments, stretches, starts, frames, strict=False)

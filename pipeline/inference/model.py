@@ -33,7 +33,7 @@ from motionloom.pipeline.inference.edits.edit import finish, require_editor, req
 from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
-from motionloom.pipeline.inference.requests import caption_list, remarks_of, require_seed, weight_bytes
+from motionloom.pipeline.inference.requests import require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.inference.stream import MotionStream, segments_of
@@ -100,17 +100,14 @@ class MotionModel(
         """
         if isinstance(seed_motion, Path | str):
             seed_motion = read_seed_motion(Path(seed_motion), self.bundle.layout)
-        for unknown in self.unknown(caption_list(captions or ()), caption_list(face or ())):
-            warnings.warn(str(unknown), stacklevel=2)
         with threads_for(len(sounds or captions or ()), weight_bytes(self.bundle.stages)):
             motions = self.bundle.generate(
                 captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
                 sampling=SamplingConfig.of(sampling), strict=True,
                 seed_motions=None if seed_motion is None else [seed_motion],
             )  # fmt: skip
-        remarks = remarks_of(motion.prompt for motion in motions)
-        for remark in (*remarks, *self.bundle.find_mismatches(motions)):
-            warnings.warn(remark, stacklevel=2)
+        for note in self.bundle.notes((motion.prompt for motion in motions), motions):
+            warnings.warn(str(note), stacklevel=2)
         return motions
 
     def examples(self, count: int = 6) -> list[str]:
@@ -136,9 +133,11 @@ class MotionModel(
         `script` is a file, or a `Script` whose sound files are seen from the current folder.
         """
         segments = script.open() if isinstance(script, Script) else Script.read(Path(script))
-        for remark in remarks_of(segment.prompt for segment in segments):
-            warnings.warn(remark, stacklevel=2)
-        return self.bundle.perform(segments, samples=samples, seed=seed, sampling=SamplingConfig.of(sampling))
+        drawn = SamplingConfig.of(sampling)
+        motions = self.bundle.perform(segments, samples=samples, seed=seed, sampling=drawn)
+        for note in self.bundle.notes(segment.prompt for segment in segments):
+            warnings.warn(str(note), stacklevel=2)
+        return motions
 
     def stream(
         self,

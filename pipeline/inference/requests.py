@@ -50,11 +50,6 @@ def require_words(captions: Iterable[str], name: str = "captions") -> None:
             raise UserError(f"{name}[{row}] is empty; say what the person does")
 
 
-def remarks_of(prompts: Iterable[Prompt]) -> list[str]:
-    """Return the remarks on the prompts' sounds, each once."""
-    return list(dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark))
-
-
 def require_seed(seed: int) -> None:
     """Refuse what is no seed."""
     if not isinstance(seed, Integral) or seed < 0:

@@ -22,6 +22,7 @@ from pydantic import Field, model_validator
 from motionloom.datasets.audio.sound import Excerpt, Sound
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
+from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.yaml import read_yaml
 
 
@@ -88,6 +89,11 @@ class DrivenSegment:
     prompt: Prompt
     seconds: float
     label: str
+
+    def band(self, start: float, end: float) -> Segment:
+        """The segment on the time line of the whole motion, from one second to another."""
+        label = f"{self.label} ({self.prompt.remark})" if self.prompt.remark else self.label
+        return Segment(float(start), float(end), label, "text" if self.prompt.sound is None else "music")
 
 
 def segment_frames(generator: MotionGenerator, segment: DrivenSegment, number: int) -> int:

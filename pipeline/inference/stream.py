@@ -181,16 +181,12 @@ class MotionStream(Iterator[MotionChunk]):
             self._face.condition(segment.prompt, segment.prompt.words)
 
     def _look(self, prompt: Prompt) -> None:
-        """Give notice of words that the model does not know, and of a sound without a beat."""
-        if self._notice is None:
-            return
-        if prompt.remark and prompt.remark not in self._noticed:
-            self._noticed.add(prompt.remark)
-            self._notice(prompt.remark)
-        for unknown in self._bundle.unknown_captions([prompt.text], [prompt.face_text], self._face_model):
-            if unknown.caption not in self._noticed:
-                self._noticed.add(unknown.caption)
-                self._notice(unknown)
+        """Give notice of words that the model does not know, and of a sound without a beat, each once."""
+        for note in () if self._notice is None else self._bundle.notes([prompt], (), self._face_model):
+            key = note.caption if isinstance(note, Unknown) else note
+            if key not in self._noticed and self._notice is not None:
+                self._noticed.add(key)
+                self._notice(note)
 
     def _check(self, segment: DrivenSegment, number: int) -> int | None:
         require_driven(self._body.generator, [segment.prompt])

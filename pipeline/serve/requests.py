@@ -22,10 +22,10 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
-from motionloom.pipeline.inference.requests import remarks_of
 from motionloom.pipeline.inference.stream import MotionStream, segments_of
 from motionloom.pipeline.inference.writers import WRITERS, cell_of, frame_lines, heading, rounded
 from motionloom.pipeline.render.viewer import viewer_data
+from motionloom.pipeline.store.known_captions import Unknown
 
 
 class ServeConfig(Config):
@@ -141,11 +141,11 @@ def notes_of(
     """Notes for the person on the motion: captions that are unlike all that the model knows, what could
     be said of the body instead, that a sound has no beat, and that the motion does something else.
     """
-    unknown = model.unknown(asked.captions, asked.faces)
-    nearest = [text for one in unknown if one.caption in asked.captions for text in one.nearest]
-    remarks = remarks_of([Prompt(asked.caption, sound=sound)])
-    seen = model.bundle.find_mismatches([] if motion is None else [motion])
-    return {"notes": [*(one.what for one in unknown), *remarks, *seen], "nearest": nearest}
+    prompt = Prompt(asked.caption, asked.face, sound)
+    found = model.bundle.notes([prompt], [] if motion is None else [motion])
+    unknown = [one for one in found if isinstance(one, Unknown)]
+    nearest = [text for one in unknown if one.caption == asked.caption for text in one.nearest]
+    return {"notes": [one.what if isinstance(one, Unknown) else one for one in found], "nearest": nearest}
 
 
 def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:

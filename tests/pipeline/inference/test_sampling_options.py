@@ -215,8 +215,7 @@ def test_the_commands_settings_reach_the_sampling(
     watching = SimpleNamespace(
         generate=lambda captions, **options: seen.update(options) or [],
         generator=SimpleNamespace(capabilities=Capabilities()),
-        unknown_captions=lambda *_: [],
-        find_mismatches=lambda _: [],
+        notes=lambda *_: [],
     )
     monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: watching)
     asked = {"sampler": "dpm++", "denoising_steps": 7, "cfg_scale": 3.0, "temperature": 0.0}

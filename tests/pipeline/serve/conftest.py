@@ -74,8 +74,7 @@ class QuickModel:
             encode=lambda *_: {},
             choose_face=lambda name: None,
             drawing=lambda sampling: sampling,
-            unknown_captions=lambda *_: [],
-            find_mismatches=lambda _: [],
+            notes=self.notes,
             stages=(),
         )
 
@@ -88,10 +87,12 @@ class QuickModel:
     def examples(self) -> list[str]:
         return ["a person stretches"]
 
-    def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
-        """All that is said of a violin."""
+    def notes(self, prompts: Sequence[Prompt], motions: Sequence[GeneratedMotion] = ()) -> list[Any]:
+        """All that is said of a violin, and remarks on sounds."""
         known = ("a person <b>claps</b>", "a person stretches")
-        return [Unknown(caption, known) for caption in (*captions, *face) if "violin" in caption]
+        words = [text for prompt in prompts for text in (prompt.text, prompt.face_text)]
+        unknown = [Unknown(text, known) for text in words if "violin" in text]
+        return [*unknown, *(prompt.remark for prompt in prompts if prompt.remark)]
 
     def generate(
         self,
