@@ -24,9 +24,10 @@ from starlette.types import ASGIApp
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import MAX_HEIGHT, MAX_SPEED
+from motionloom.pipeline.inference.edits.edit import require_editor, why_no_edits
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
-from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips, why_not
+from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips
 from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
 
@@ -132,7 +133,7 @@ class Site:
     async def info(self, http: Request) -> Response:
         bundle, limits = self.model.bundle, self.config
         longest = min(limits.max_seconds, self.model.max_seconds)
-        skeleton, why = bundle.layout.skeleton, why_not(self.model)
+        skeleton, why = bundle.layout.skeleton, why_no_edits(self.model.bundle.generator)
         return JSONResponse(
             {
                 "model": self.name,
@@ -218,8 +219,7 @@ class Site:
 
     async def add_clip(self, http: Request) -> Response:
         """Keep the motion file that the body is, under a name for later requests."""
-        if (why := why_not(self.model)) is not None:
-            raise HTTPException(400, why)
+        require_editor(self.model.bundle.generator)
         data = await self._upload(http, CLIP, self.config.max_clip_mb)
         return JSONResponse(await asyncio.to_thread(self.clips.add, data))
 

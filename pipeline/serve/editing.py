@@ -14,11 +14,11 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.inference.edits.clip_file import read_clip
+from motionloom.pipeline.inference.edits.edit import require_editor
 from motionloom.pipeline.inference.edits.frames import edit_frames
 from motionloom.pipeline.inference.model import MotionModel, original_of
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of
-from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.inference.writers import cell_of
 from motionloom.pipeline.render.viewer import viewer_data
 from motionloom.pipeline.serve.requests import (
@@ -35,8 +35,6 @@ from motionloom.pipeline.serve.requests import (
 CLIP = "the clip"
 _KINDS = {b"PK": ".npz", b"glTF": ".glb"}
 """First bytes and the file's ending; what begins otherwise is tried as BVH."""
-_EDITOR = "inbetween"
-"""The package's model that edits."""
 
 
 class ChangeRequest(Config):
@@ -59,21 +57,12 @@ class ChangeRequest(Config):
 
     def require_within(self, limits: ServeConfig, model: MotionModel) -> None:
         """Refuse what is too much; `UserError` in one sentence."""
-        if (why := why_not(model)) is not None:
-            raise UserError(why)
+        require_editor(model.bundle.generator)
         task = self.task
         texts = [task.caption, task.face, *(said.text for said in task.words)]
         limits.require_small(texts, task.lead + (task.seconds or 0.0))
         if isinstance(self.clip, MotionRequest):
             self.clip.require_within(limits, model)
-
-
-def why_not(model: MotionModel) -> str | None:
-    """Why a model edits no clips, and which one does; None where it does."""
-    if model.bundle.generator.capabilities.edit is not None:
-        return None
-    other = f"; motionloom serve {_EDITOR} changes them" if _EDITOR in shipped_models() else ""
-    return f"this model makes motions and changes none{other}"
 
 
 class Clips:

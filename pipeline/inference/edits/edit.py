@@ -27,14 +27,21 @@ _REACH_SECONDS = 0.5
 """In which a figure goes to a pin and comes back [ours]."""
 
 
-def require_editor(generator: MotionGenerator) -> Callable[..., list[Motion]]:
-    """The generator's `edit`, if it can fill in what a clip leaves free."""
+def why_no_edits(generator: MotionGenerator) -> str | None:
+    """Why a generator cannot fill in what a clip leaves free; None where it can."""
     if generator.capabilities.edit is not None:
-        return generator.capabilities.edit
-    raise UserError(
+        return None
+    return (
         f"this model ({generator.method}) makes whole motions and edits none; take one whose body is made by "
         f"diffusion, such as the package's `inbetween`"
     )
+
+
+def require_editor(generator: MotionGenerator) -> Callable[..., list[Motion]]:
+    """The generator's `edit`, if it has one."""
+    if generator.capabilities.edit is None:
+        raise UserError(why_no_edits(generator))
+    return generator.capabilities.edit
 
 
 def require_work(frames: EditFrames) -> None:

@@ -63,16 +63,16 @@ def open_runs(folders: Sequence[Path]) -> list[ComparedRun]:
     for folder, place in zip(folders, places, strict=True):
         if places.count(place) > 1:
             raise UserError(f"{folder}: is named twice; compare it with another run")
-    names = _labels(places)
+    names = run_labels(places)
     return [
         ComparedRun(label, number, run_state(folder))
         for number, (label, folder) in enumerate(zip(names, folders, strict=True))
     ]
 
 
-def _labels(places: Sequence[Path]) -> list[str]:
+def run_labels(places: Sequence[Path]) -> list[str]:
     """The last names of the folders, and as many of those above as tell them apart."""
-    for depth in range(1, max(len(place.parts) for place in places) + 1):
+    for depth in range(1, max((len(place.parts) for place in places), default=0) + 1):
         names = ["/".join(place.parts[-depth:]) for place in places]
         if len(set(names)) == len(names):
             return names

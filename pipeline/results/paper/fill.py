@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, ROWS, Figure, Protocol, say_difference
+from motionloom.pipeline.results.compare.runs import run_labels
 from motionloom.pipeline.results.paper.evaluations import Evaluation, evaluations_of
 from motionloom.pipeline.results.paper.filled import (
     FilledRow,
@@ -43,10 +44,7 @@ class _Filling:
         self.name, self.table = name, table
         runs = list(dict.fromkeys(runs))
         self.evaluations = {run: evaluations_of(run, table.measures) for run in runs if table.measures}
-        names = [run.resolve().name for run in runs]
-        self.labels = {
-            run: str(run) if names.count(short) > 1 else short for run, short in zip(runs, names, strict=True)
-        }
+        self.labels = dict(zip(runs, run_labels([run.resolve() for run in runs]), strict=True))
         self.decimals = [self._decimals(at) for at in range(len(table.columns))]
         self.used: dict[tuple[Path, str], Evaluation] = {}
         self.compared: set[tuple[Path, str]] = set()

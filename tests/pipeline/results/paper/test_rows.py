@@ -217,7 +217,9 @@ def test_dances_and_texts_of_one_model_share_a_row(tmp_path: Path, records: Modu
 def test_runs_of_one_name_are_told_apart_by_their_paths(baselines: Make) -> None:
     one, other = baselines("x/run"), baselines("y/run")
     labels = ours(filled("humantomato/7", one, other, one))
-    assert set(labels) == {f"{run} {stage}" for run in (one, other) for stage in ("vq", "rvq", "tokenizer")}
+    assert set(labels) == {
+        f"{run} {stage}" for run in ("x/run", "y/run") for stage in ("vq", "rvq", "tokenizer")
+    }
 
 
 def retrieval(records: ModuleType, **about: Any) -> FigureFile:
