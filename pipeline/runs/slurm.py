@@ -35,7 +35,7 @@ from motionloom.pipeline.runs.dry_run import (
     training_times,
 )
 from motionloom.pipeline.runs.launch_plan import Group, LaunchPlan, SlurmOptions, make_launch_plan
-from motionloom.pipeline.runs.plan import make_plan
+from motionloom.pipeline.runs.plan import PlannedStage, make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.files import require_folder
 from motionloom.pipeline.store.run_folder import require_own
@@ -134,10 +134,16 @@ def launch_recipe(
     for what, place in (("--out", run), ("the current folder", Path.cwd())):
         if not str(place).isprintable():  # a batch script must not get another line
             raise UserError(f"{what} {str(place)!r}: has characters that are not printable; choose another")
-    if (run / "recipe.yaml").is_file():
-        refusal = explain_replacements(run, loaded.name, replaced_stages(run, make_plan(loaded, run)))
-        if refusal is not None:
-            raise UserError(refusal)
+    rows: list[PlannedStage] = []
+    try:
+        rows = make_plan(loaded, run)
+    except UserError as error:
+        if not dry_run or (run / "recipe.yaml").is_file():
+            raise
+        # The data may be on another machine.
+        console.print(f"time and disk not estimated: {error}", soft_wrap=True, markup=False)
+    if (refusal := explain_replacements(run, loaded.name, replaced_stages(run, rows))) is not None:
+        raise UserError(refusal)
     plan = make_launch_plan(
         loaded,
         slurm,
@@ -149,13 +155,7 @@ def launch_recipe(
     )
     for line in plan.lines():
         console.print(line, soft_wrap=True, markup=False)
-    try:
-        planned = [row for row in make_plan(loaded, run) if row.action in {"run", "resume"}]
-    except UserError as error:
-        if not dry_run or (run / "recipe.yaml").is_file():
-            raise
-        planned = []  # the data may be on another machine
-        console.print(f"time and disk not estimated: {error}", soft_wrap=True, markup=False)
+    planned = [row for row in rows if row.action in {"run", "resume"}]
     _require_time(plan, slurm, training_times(run, planned))
     if dry_run:
         say_estimate(loaded, console, run, planned)
