@@ -31,7 +31,7 @@ for words in commands:
 """
 
 
-WITHOUT = ("version", "help", "run help", "convert help", "tables", "table of a run", "compare", "check")
+WITHOUT = ("version", "help", "run help", "convert help", "tables", "table of a run", "compare")
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +68,13 @@ def test_without_any_of_them(command: str, imported: dict[str, set[str]]) -> Non
     assert not imported[command]
 
 
+def test_a_check_looks_for_repeated_recordings_with_scipy_alone(imported: dict[str, set[str]]) -> None:
+    assert imported["check"] == {"scipy"}
+
+
 @pytest.mark.parametrize("command", ["info", "nothing to do", "dry run"])
 def test_with_torch_alone(command: str, imported: dict[str, set[str]]) -> None:
-    assert imported[command] == {"torch"}
+    assert imported[command] - imported["check"] == {"torch"}
 
 
 def test_a_motion_needs_none_of_what_trains_or_loads_other_encoders(imported: dict[str, set[str]]) -> None:
