@@ -28,6 +28,7 @@ THROUGH_LIGHTNING = {"tensorboard", "wandb", "mlflow"}
 BROUGHT = {
     "tokenizers": "transformers",
     "soxr": "librosa",
+    "lazy-loader": "librosa",
     "numba": "librosa",
     "llvmlite": "numba",
     "pydantic-core": "pydantic",

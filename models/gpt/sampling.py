@@ -24,6 +24,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
 from motionloom.models.layers.frozen import evaluating
+from motionloom.models.layers.seeds import sample_seeds as sample_seeds
 
 
 @dataclass(frozen=True)
@@ -67,13 +68,6 @@ def guide(logits: Tensor, legal: Tensor, scale: Tensor) -> Tensor:
     strength = scale.to(logits.dtype)[:, None]
     mixed = torch.where(strength == 1, on, off + strength * (on - off))
     return torch.where(legal, mixed, -torch.inf)
-
-
-def sample_seeds(seed: int, count: int) -> list[int]:
-    """One independent seed per sample; the first n are the same whatever `count` is."""
-    return [
-        int(np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)[0]) for index in range(count)
-    ]
 
 
 def filter_logits(logits: Tensor, *, top_k: int | None = None, top_p: float = 1.0) -> Tensor:

@@ -21,7 +21,7 @@ from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.sampling import sample_seeds
+from motionloom.models.layers.seeds import sample_seeds
 from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator, Prompt, Stretch
 from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported

@@ -22,7 +22,7 @@ from huggingface_hub import ModelHubMixin
 from numpy.typing import NDArray
 
 from motionloom.datasets.conditions import Conditions
-from motionloom.models.gpt.sampling import sample_seeds
+from motionloom.models.layers.seeds import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from motionloom.datasets.motion.features.joints import JointFlow
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.sampling import sample_seeds
+from motionloom.models.layers.seeds import sample_seeds
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import CompletedStage

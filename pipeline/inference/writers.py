@@ -57,7 +57,8 @@ class OutputClip:
 
     def arkit_weights(self) -> NDArray[np.float64]:
         """Weights of ARKit's shapes [T, 52], by the user's bases where there are any."""
-        from motionloom.pipeline.render.body.face import ArkitBases, synthetic_arkit
+        from motionloom.pipeline.render.body.face import ArkitBases
+        from motionloom.pipeline.render.body.mesh import synthetic_arkit
 
         if self.face is None:
             raise UserError("this model makes no face: leave the format arkit out")

@@ -18,7 +18,6 @@ without effect at rest.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +26,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.npz import NpzFile
-from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.mesh import body_for
 
 Floats = NDArray[np.float64]
 Values = NDArray[np.floating]
@@ -180,15 +177,3 @@ def write_arkit_csv(path: Path, weights: NDArray[np.floating], fps: float) -> No
         for frame, row in enumerate(weights.tolist())
     ]
     write_text(path, "\n".join([",".join(["time", *ARKIT]), *rows]) + "\n")
-
-
-@cache
-def own_bases() -> ArkitBases:
-    """The body's expressions and its ARKit shapes, both on its head."""
-    shapes = body_for(Skeleton.named("smplx52"), (*EXPRESSIONS, *ARKIT)).shapes
-    return ArkitBases(np.stack([shapes[n] for n in EXPRESSIONS]), np.stack([shapes[n] for n in ARKIT]))
-
-
-def synthetic_arkit(expression: Values) -> Floats:
-    """ARKit weights [T, 52] of synthetic expression values [T, 50], by the bases of the body's own head."""
-    return own_bases().weights(expression_weights(expression))

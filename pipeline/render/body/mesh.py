@@ -24,6 +24,7 @@ from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS, ArkitBases, expression_weights
 
 Floats = NDArray[np.float64]
 Detail = Literal["near", "far", "shadow"]
@@ -249,3 +250,15 @@ def posing_of(joints: NDArray[np.floating], skeleton: Skeleton, figure: RigidMot
         root = np.asarray(joints, np.float64)[:, 0]
     places, turns = forward_kinematics(local, root, own.offsets, own.parents)
     return Posing(own, places if figure is not None else np.asarray(joints, np.float64), turns)
+
+
+@cache
+def own_bases() -> ArkitBases:
+    """The body's expressions and its ARKit shapes, both on its head."""
+    shapes = body_for(Skeleton.named("smplx52"), (*EXPRESSIONS, *ARKIT)).shapes
+    return ArkitBases(np.stack([shapes[n] for n in EXPRESSIONS]), np.stack([shapes[n] for n in ARKIT]))
+
+
+def synthetic_arkit(expression: NDArray[np.floating]) -> Floats:
+    """ARKit weights [T, 52] of synthetic expression values [T, 50], by the bases of the body's own head."""
+    return own_bases().weights(expression_weights(expression))

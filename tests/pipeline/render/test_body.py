@@ -30,8 +30,6 @@ from motionloom.pipeline.render.body.face import (
     bounded_least_squares,
     control_weights,
     expression_weights,
-    own_bases,
-    synthetic_arkit,
     synthetic_face_controls,
     write_arkit_csv,
 )
@@ -41,8 +39,10 @@ from motionloom.pipeline.render.body.mesh import (
     body_for,
     human_skeleton,
     neutral_body,
+    own_bases,
     posing_of,
     single_bones,
+    synthetic_arkit,
 )
 from motionloom.pipeline.render.scene import Actor
 from motionloom.pipeline.render.viewer import (
