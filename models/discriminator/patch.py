@@ -28,7 +28,6 @@ from motionloom.datasets.schema import Config
 from motionloom.models.layers.strided import StridedEncoder
 from motionloom.models.layers.transformer import StackConfig, Transformer, length_mask, sinusoid
 from motionloom.models.training.distributed import masked_mean
-from motionloom.models.training.optim import OptimConfig
 
 PATCH = 4
 """Frames of a patch."""
@@ -117,22 +116,3 @@ def discriminator_loss(real: Validity, fake: Validity) -> dict[str, Tensor]:
 def generator_loss(fake: Validity) -> Tensor:
     """-E D(G(p), q), mean over the real patches of all ranks (equation 6)."""
     return masked_mean(-fake.score, fake.mask)
-
-
-class UttLossConfig(Config):
-    """The loss of MATE and UTT."""
-
-    adversarial: AdversarialConfig = AdversarialConfig()
-    adversarial_start: int = Field(0, ge=0)
-    """First step with the adversarial term, and the discriminator's first step."""
-    adversarial_ramp: int = Field(0, ge=0)
-    """Steps over which its weight rises from 0."""
-    discriminator: DiscriminatorConfig = DiscriminatorConfig()
-    discriminator_optim: OptimConfig = OptimConfig(optimizer="adam", betas=(0.5, 0.99))
-
-    def weight(self, step: int) -> float:
-        since = step - self.adversarial_start
-        if since < 0:
-            return 0.0
-        rise = 1.0 if self.adversarial_ramp == 0 else min(1.0, (since + 1) / self.adversarial_ramp)
-        return self.adversarial.weight * rise

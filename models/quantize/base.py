@@ -84,7 +84,7 @@ class LearntCodebook(nn.Module):
     initialised: Tensor
     draws: Tensor
     usage_eps: ClassVar[float] = 1e-7
-    """Of `usage_metrics`."""
+    """The `eps` of `usage_metrics`."""
 
     def __init__(self, config: QuantizerConfig, codebook: Tensor, *, initialised: bool, salt: int) -> None:
         super().__init__()

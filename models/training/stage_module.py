@@ -85,7 +85,7 @@ class StageModule(L.LightningModule, ABC):
         self.gauges: dict[str, float | Tensor] = {}
         """Learning rate and gradient norm of the step that the newest row of the log ends with."""
         self.figures: list[StepFigures] = []
-        """Return the means over all parts of steps since these lists were last cleared."""
+        """Figures of all parts of steps since these lists were last cleared."""
         self.norms: list[tuple[int, Tensor]] = []
         """(step, norm of the gradients) likewise, where a norm was computed."""
         self._sums: dict[tuple[str, ...], tuple[Tensor, int]] = {}

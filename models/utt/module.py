@@ -16,12 +16,7 @@ import torch
 from torch import Tensor
 
 from motionloom.models.condition.mate import Encoded, drop_conditions
-from motionloom.models.discriminator.patch import (
-    PatchDiscriminator,
-    UttLossConfig,
-    discriminator_loss,
-    generator_loss,
-)
+from motionloom.models.discriminator.patch import PatchDiscriminator, discriminator_loss, generator_loss
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.tokens import TokenSequence, interleave
 from motionloom.models.layers.frozen import Frozen
@@ -29,7 +24,7 @@ from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import Batch
-from motionloom.models.utt.network import ConditionedUtt
+from motionloom.models.utt.network import ConditionedUtt, UttLossConfig
 
 
 class UttModule(AlternatingModule):

@@ -28,12 +28,33 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import Config, UserError
 from motionloom.models.condition.mate import Encoded, Mate, MateConfig
+from motionloom.models.discriminator.patch import AdversarialConfig, DiscriminatorConfig
 from motionloom.models.gpt.tokens import TokenNetwork
 from motionloom.models.layers.transformer import StackConfig, Transformer
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Stream
+from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.backbone import PrefixGru, PrefixTransformer, State
+
+
+class UttLossConfig(Config):
+    """The loss of MATE and UTT."""
+
+    adversarial: AdversarialConfig = AdversarialConfig()
+    adversarial_start: int = Field(0, ge=0)
+    """First step with the adversarial term, and the discriminator's first step."""
+    adversarial_ramp: int = Field(0, ge=0)
+    """Steps over which its weight rises from 0."""
+    discriminator: DiscriminatorConfig = DiscriminatorConfig()
+    discriminator_optim: OptimConfig = OptimConfig(optimizer="adam", betas=(0.5, 0.99))
+
+    def weight(self, step: int) -> float:
+        since = step - self.adversarial_start
+        if since < 0:
+            return 0.0
+        rise = 1.0 if self.adversarial_ramp == 0 else min(1.0, (since + 1) / self.adversarial_ramp)
+        return self.adversarial.weight * rise
 
 
 class UttConfig(StackConfig):

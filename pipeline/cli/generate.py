@@ -113,7 +113,7 @@ def generate(
 
 @dataclass(frozen=True)
 class _Request:
-    """What drives the motions, as the command line has it."""
+    """Conditions of the motions, as the command line has them."""
 
     model: str
     device: str

@@ -64,7 +64,7 @@ class ClipMetric:
     """Values by the names of the columns, each a float or `weighted`, such as by frames; what a motion does
     not show is left out."""
     columns: tuple[Metric, ...]
-    """What it measures, each with a name like `feet.skating` that no other metric has."""
+    """Names of its values, each with a name like `feet.skating` that no other metric has."""
     of: tuple[Of, ...] = ("captions", "dances")
     """Measured of motions for captions (`evaluate`), of dances to music (`evaluate_dances`), or of both."""
 

@@ -179,7 +179,7 @@ class Site:
         return Response(answer.body, media_type=answer.kind, headers=headers)
 
     async def _result(self, http: Request, call: Callable[[], T]) -> T:
-        """What the model's thread returns; nothing is made for a client that has left before it was begun."""
+        """Return the result of the model's thread; nothing is begun for a client that has left by then."""
         result = asyncio.wrap_future(self.worker.submit(call))
         while not (await asyncio.wait({result}, timeout=_LOOK))[0]:
             if await http.is_disconnected():

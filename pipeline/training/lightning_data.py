@@ -13,7 +13,7 @@ from motionloom.datasets.loading.steps import Steps
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.contract.lookup import outside_stage
-from motionloom.pipeline.contract.stage import CompletedStage, StageCache, stage_kind
+from motionloom.pipeline.contract.stage import CompletedStage, Inputs, StageCache, stage_kind
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.execution import every_batch, loader, prepare_module, set_threads
@@ -60,13 +60,21 @@ def open_training(
     hardware: Hardware | None = None,
 ) -> tuple[StageModule, StageData]:
     """Return the module and the batches of a stage's training, untrained; `given` are its inputs by role."""
+    module, inputs = _open_module(kind, config, given, seed)
+    batches = kind.batches(config, module.net, inputs, seed, lambda _: None)
+    return module, StageData(batches, config.train, hardware)
+
+
+def _open_module(
+    kind: TrainedStage[Any, Any, Any], config: Any, given: Mapping[str, CompletedStage], seed: int
+) -> tuple[StageModule, Inputs]:
     inputs = kind.inputs.of(StageCache().given(given))
     net, _ = kind.build(config, inputs, seed)
     module = kind.module(config, net, inputs, seed)
     prepare_module(module, config.train)
     folders = {role: str(stage.folder.resolve()) for role, stage in given.items()}
     module.save_hyperparameters(hyper_parameters(kind.name, config, seed, folders))
-    return module, StageData(kind.batches(config, net, inputs, seed, lambda _: None), config.train, hardware)
+    return module, inputs
 
 
 def rebuild(content: object, path: object, inputs: Mapping[str, str | Path]) -> StageModule:
@@ -88,4 +96,4 @@ def rebuild(content: object, path: object, inputs: Mapping[str, str | Path]) -> 
                 f'{path}: input {place} is no finished stage; give inputs={{"{role}": its folder}}'
             )
         given[role] = found
-    return open_training(kind, config, given, int(hyper["seed"]))[0]
+    return _open_module(kind, config, given, int(hyper["seed"]))[0]

@@ -24,7 +24,6 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import DmdModule
-from motionloom.models.discriminator.patch import UttLossConfig
 from motionloom.models.layers.frozen import Frozen
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.tokenizer.single import MqConfig
@@ -32,7 +31,7 @@ from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import StageModule
 from motionloom.models.utt.module import UttModule
-from motionloom.models.utt.network import ConditionedUtt, UttConfig
+from motionloom.models.utt.network import ConditionedUtt, UttConfig, UttLossConfig
 from motionloom.pipeline.baselines.bailando.codes import DanceVq, DanceVqConfig
 from motionloom.pipeline.baselines.bailando.module import ActorCriticModule, CrossGptModule, DanceVqModule
 from motionloom.pipeline.baselines.bailando.network import ActorCritic, CrossGpt, CrossGptConfig, RewardConfig

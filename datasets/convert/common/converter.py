@@ -144,4 +144,4 @@ class Converter(ABC, Generic[Cfg, C]):
 AnyConverter = Converter[Any, Any]
 
 CONVERTERS: Table[type[AnyConverter]] = Table(Converter, "converter", classes=True)
-"""Those that other packages have registered; `convert/registry.py` finds ours."""
+"""Converters that other packages have registered; `convert/registry.py` finds ours."""

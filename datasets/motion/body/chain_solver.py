@@ -71,7 +71,7 @@ class _Solver:
         self.parents = parents
         self.weights = np.ascontiguousarray(weights.T, dtype=np.float64)
         self.levels: list[tuple[list[int], list[int], list[int]]] = []
-        """Of each depth the joints that have children, these, and the row of each child's parent."""
+        """Joints with children, by depth; their children, and the row of each child's parent."""
         for level in [[0], *levels(parents)]:
             if joints := [joint for joint in level if joint in parents]:
                 children = [child for child, above in enumerate(parents) if above in joints]

@@ -59,7 +59,7 @@ class Arm:
 
 BODY = ("root", "yaw", "pelvis", "spine", "head")
 FEET = ("ball", "foot_yaw", "foot_pitch", "knee_out")
-"""What a track holds over time [T, ...], and for both feet [2, T, ...]."""
+"""A value over time [T, ...], and for both feet [2, T, ...]."""
 
 
 class Track:

@@ -17,7 +17,7 @@ class SwayModule(StageModule):
     net: Sway
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Of "motion" [B, T, D], "length" [B] and "conditions" with "text"; draws noise."""
+        """Return the losses of "motion" [B, T, D], "length" [B] and "conditions" with "text"."""
         motion, sentence = batch["motion"], batch["conditions"]["text"].pooled
         noise = torch.randn(len(motion), self.net.noise, device=motion.device)
         off = (self.net(sentence, noise, motion.shape[1]) - motion).abs()

@@ -13,10 +13,9 @@ from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import MateConfig
-from motionloom.models.discriminator.patch import UttLossConfig
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig
-from motionloom.models.utt.network import ConditionedUtt, UttConfig
+from motionloom.models.utt.network import ConditionedUtt, UttConfig, UttLossConfig
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Every, Inputs, Role, Stage, register
 from motionloom.pipeline.stages.networks.clips import clip_batches, motion_example

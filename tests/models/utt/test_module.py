@@ -11,19 +11,14 @@ from torch import Tensor, nn
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.models.condition.mate import MateConfig
-from motionloom.models.discriminator.patch import (
-    AdversarialConfig,
-    DiscriminatorConfig,
-    UttLossConfig,
-    generator_loss,
-)
+from motionloom.models.discriminator.patch import AdversarialConfig, DiscriminatorConfig, generator_loss
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.single import MqConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.module import UttModule
-from motionloom.models.utt.network import ConditionedUtt, UttConfig
+from motionloom.models.utt.network import ConditionedUtt, UttConfig, UttLossConfig
 
 # ---- the weight
 
