@@ -34,7 +34,6 @@ from slurm_cluster import Cluster, why_not  # noqa: E402
 
 from motionloom.datasets.schema import UserError  # noqa: E402
 from motionloom.datasets.shards.checksums import LocalShard  # noqa: E402
-from motionloom.datasets.shards.options import Reading  # noqa: E402
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest  # noqa: E402
 from motionloom.pipeline.launch.team import Team  # noqa: E402
 from motionloom.pipeline.runs.verify_shards import compare_shards  # noqa: E402
@@ -190,16 +189,12 @@ def _damaged_shard(run: Path, folder: Path, rng: np.random.Generator) -> dict[st
     record = folder / "compared.json"
     path = next(folder.glob("*-train-*.tar"))
     raw = path.read_bytes()
-    streamed = Reading(mode="streamed", order="streamed")
     ways: dict[str, Callable[[], object]] = {
         "shard, one bit flipped: opened with `verify`": lambda: ShardDataset.open(
             folder, "train", verify=True
         ),
         "the same, before a stage reads it (default)": lambda: compare_shards(
             shards, record, Team(), Console(quiet=True)
-        ),
-        "the same, by the streamed reader": lambda: _read(
-            ShardDataset.open(folder, "train", reading=streamed)
         ),
         "the same, by the indexed reader alone": lambda: _read(ShardDataset.open(folder, "train")),
     }

@@ -89,7 +89,6 @@ class WindowBatches(Dataset[MotionBatch]):
         per_clip = self.windows_per_clip
         motion = np.empty((len(clips) * per_clip, self.window, self.crops.width), dtype=np.float32)
         present = self.dataset.present[clips]
-        self.dataset.prefetch(clips.tolist(), ("motion.npy",))
         for row, clip in enumerate(clips.tolist()):
             source = self.dataset.motion(clip)
             for j in range(per_clip):

@@ -107,9 +107,6 @@ class ConditionedClips:
     def names(self) -> list[str]:
         return list(self.readers)
 
-    def prefetch(self, clips: NDArray[np.int64]) -> None:
-        self.dataset.prefetch(clips.tolist(), ["motion.npy", *self.members.values()])
-
     def spans(
         self, clips: NDArray[np.int64], present: NDArray[np.bool_], draws: NDArray[np.float64]
     ) -> list[CaptionSpan]:
@@ -201,7 +198,6 @@ class ConditionBatches(Dataset[ConditionBatch]):
     def __getitem__(self, k: int) -> ConditionBatch:
         turns, clips = self.plan.local(k, self.rank, self.world)
         source = self.source
-        source.prefetch(clips)
         # Each purpose draws by a counter of its own, so that a change of one leaves the others as they were.
         draws = uniform(self.seed, _DROP, turns, clips)
         present = drop_some(self.drop, source.present[clips], source.names, draws)
@@ -251,7 +247,6 @@ class EvalBatches(Dataset[ConditionBatch]):
         valid = np.concatenate([np.ones(len(rows), bool), np.zeros(missing, bool)])[self.rank :: self.world]
         rows = np.concatenate([rows, np.repeat(rows[-1:], missing)])[self.rank :: self.world]
         clips, source = self.clips[rows], self.source
-        source.prefetch(clips)
         present, first = source.present[clips], np.zeros(len(clips))
         batch = source.make(clips, present, source.spans(clips, present, first), first)
         batch["valid"] = torch.from_numpy(valid)

@@ -11,7 +11,7 @@ clip of every data set once.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import accumulate
@@ -84,10 +84,6 @@ class MixedDataset:
     def wav(self, i: int) -> tuple[NDArray[np.float32], int] | None:
         dataset, own = self._find(i)
         return dataset.wav(own)
-
-    def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        for dataset, begin, end in self._ranges():
-            dataset.prefetch([i - begin for i in clips if begin <= i < end], members)
 
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
         """One source for each data set that has any of `clips`; the others' weight goes to those."""

@@ -25,7 +25,7 @@ from torch import Tensor
 from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
 from motionloom.datasets.motion.layout import ROOT, Family, MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.clips import ClipDataset, in_order
+from motionloom.datasets.shards.clips import ClipDataset
 
 STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
@@ -182,8 +182,7 @@ def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -
     layout = dataset.layout
 
     def moments_of(part: ClipDataset) -> Iterator[Moments]:
-        clips = in_order(part, "motion.npy")
-        for i in track(clips, "feature statistics", total=len(part), disable=not progress):
+        for i in track(range(len(part)), "feature statistics", disable=not progress):
             yield Moments.of(part.motion(i), layout.present_columns[part.present[i]])
 
     return from_moments(_pooled(dataset, moments_of) or Moments.none(layout.dim), layout, group=group)
@@ -235,8 +234,7 @@ def frame_statistics(dataset: ClipDataset, modality: Modality, progress: bool = 
 
     def moments_of(part: ClipDataset) -> Iterator[Moments]:
         present = np.flatnonzero(part.has(member)).tolist()
-        clips = in_order(part, member, clips=present)
-        for i in track(clips, f"{modality.name} statistics", total=len(present), disable=not progress):
+        for i in track(present, f"{modality.name} statistics", disable=not progress):
             rows = part.array(i, member)
             if rows is None:
                 continue

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -64,10 +64,6 @@ class ClipDataset(Protocol):
         """Sound of clip `i`: (mono samples [S], rate in Hz)."""
         ...
 
-    def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        """Announce what a batch will read, so that a server is asked for it at once; changes no result."""
-        ...
-
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
         """Return the order and mix of a batch plan over `clips` (ascending numbers; all when None)."""
         ...
@@ -75,15 +71,3 @@ class ClipDataset(Protocol):
     def parts(self) -> Sequence[tuple[ClipDataset, float]]:
         """(data set, weight) of what it is made of; itself when it is one."""
         ...
-
-
-def in_order(dataset: ClipDataset, *members: str, clips: Sequence[int] | None = None) -> Iterator[int]:
-    """The numbers of all clips (or `clips`), with `members` of the next ones read ahead."""
-    clips = range(len(dataset)) if clips is None else clips
-    for start in range(0, len(clips), _AHEAD):
-        block = clips[start : start + _AHEAD]
-        dataset.prefetch(block, members)
-        yield from block
-
-
-_AHEAD = 64

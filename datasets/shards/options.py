@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Self
+from typing import Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SCHEMA_VERSION, Config, Dropped, MotionType, UserError
@@ -89,17 +89,9 @@ class WriteOptions:
 class Reading(Config):
     """Reader and order of one data set."""
 
-    mode: Literal["indexed", "streamed"] = "indexed"
-    """`indexed` reads clips where they lie; `streamed` reads whole shards front to back (WebDataset)."""
     order: Literal["global", "streamed"] = "global"
     """`global` shuffles all clips each epoch; `streamed` shuffles shards, and the clips of
-    `shards_per_group` shards at a time. Both readers give the same batches in the streamed order."""
+    `shards_per_group` shards at a time, so that a small cache or a slow disk serves a large data set."""
     shards_per_group: int = Field(8, ge=1)
-    """Shards whose clips are mixed in the streamed order; the streaming reader holds two groups in memory."""
+    """Shards whose clips are mixed in the streamed order."""
     cache: CacheConfig = CacheConfig()
-
-    @model_validator(mode="after")
-    def _streams_need_their_order(self) -> Self:
-        if self.mode == "streamed" and self.order != "streamed":
-            raise ValueError("mode: streamed reads shard after shard and needs order: streamed")
-        return self

@@ -13,9 +13,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import mmap
 import re
 from bisect import bisect_right
-from collections.abc import Collection, Sequence
+from collections import OrderedDict
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
@@ -33,13 +34,13 @@ from motionloom.datasets.schema import (
     Caption,
     ClipMeta,
     Manifest,
+    ShardInfo,
     Split,
     UserError,
 )
-from motionloom.datasets.shards.access import Access, MappedShards, StreamedShards
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.index import read_index
+from motionloom.datasets.shards.index import SplitIndex, read_index
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.order import Source
 from motionloom.datasets.shards.sample import MEMBERS, captions_from_json, meta_from_json
@@ -48,6 +49,9 @@ from motionloom.datasets.shards.tar import npy_from_bytes
 
 _MOTION = MEMBERS.index("motion.npy")
 _SHARD_NAME = re.compile(r"[A-Za-z0-9_-]+-(?:train|val|test)-(\d{6,})\.tar")
+
+OPEN_SHARDS = 256
+"""Shards mapped at a time in one process; the least recently used is let go."""
 
 
 def load_manifest(root: Path) -> Manifest:
@@ -85,6 +89,43 @@ def manifest_layout(manifest: Manifest) -> MotionLayout:
     return MotionLayout.named(manifest.layout, fps=manifest.fps, family=manifest.family)
 
 
+class MappedShards:
+    """Files of this machine, memory-mapped: the page cache is the only cache and all processes share it."""
+
+    def __init__(self, store: Store, shards: list[ShardInfo], index: SplitIndex, room: int = 0) -> None:
+        self.maps: OrderedDict[int, mmap.mmap] = OrderedDict()
+        self._store, self._shards, self._offsets = store, shards, index.offsets
+        self._most = OPEN_SHARDS
+        if room:  # a deleted file takes disk space while it is mapped: at most an eighth of the cache may
+            self._most = max(1, min(OPEN_SHARDS, room // (8 * max(shard.bytes for shard in shards))))
+
+    def member(self, shard: int, clip: int, column: int) -> tuple[mmap.mmap, int]:
+        """(buffer, its byte where the member starts). Views keep a map that is let go alive."""
+        mapped = self.maps.get(shard)
+        if mapped is None:
+            mapped = self._map(shard)
+        else:
+            self.maps.move_to_end(shard)
+        return mapped, int(self._offsets[clip, column])
+
+    def _map(self, shard: int) -> mmap.mmap:
+        info = self._shards[shard]
+        where = self._store.where(info.name)
+        with self._store.open_shard(info) as file:
+            try:
+                mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            except (OSError, ValueError) as error:
+                raise UserError(f"{where}: cannot be read ({error})") from None
+        if len(mapped) != info.bytes:
+            raise UserError(
+                f"{where}: {len(mapped)} bytes, the manifest says {info.bytes}: truncated while in use"
+            )
+        self.maps[shard] = mapped
+        while len(self.maps) > self._most:
+            self.maps.popitem(last=False)
+        return mapped
+
+
 class ShardDataset:
     """The clips of one split, in shard order (already shuffled). Cheap to pickle into loader workers."""
 
@@ -117,14 +158,8 @@ class ShardDataset:
         if manifest.excluded and not every:
             kept = [self._index.id(row) not in manifest.excluded for row in self._rows.tolist()]
             self._rows = self._rows[np.array(kept, dtype=np.bool_)]
-        self._access: Access
-        if reading.mode == "streamed":
-            self._access = StreamedShards(
-                store, self._shards, self._index, self._first, reading.shards_per_group
-            )
-        else:
-            room = 0 if isinstance(store, LocalStore) else reading.cache.limit
-            self._access = MappedShards(store, self._shards, self._index, room)
+        room = 0 if isinstance(store, LocalStore) else reading.cache.limit
+        self._access = MappedShards(store, self._shards, self._index, room)
 
     @staticmethod
     def open(
@@ -213,10 +248,6 @@ class ShardDataset:
     def _captions(self, i: int, member: str) -> list[Caption]:
         raw = self._member(i, member)
         return captions_from_json(raw, self._where(i, member)) if raw else []
-
-    def prefetch(self, clips: Sequence[int], members: Collection[str]) -> None:
-        if isinstance(self._access, StreamedShards):
-            self._access.prefetch({self._shard_of(self._row(i)) for i in clips}, members)
 
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
         """One source: `clips` (all when None), with their shards if the order is the streamed one."""

@@ -38,7 +38,6 @@ class Reference(Config):
 class Reader(Config):
     """`reader.json` beside it: what the recipe says now about how to read, which changes no result."""
 
-    mode: Literal["indexed", "streamed"]
     cache: CacheConfig
 
 
@@ -79,24 +78,17 @@ class Data:
     def layout(self) -> MotionLayout:
         return self.split(self.splits[0]).layout
 
-    def split(self, name: str, *, training: bool = False) -> ClipDataset:
-        """One split.
-
-        `training` says that batches are drawn from it by a plan: only then does the streaming reader serve,
-        as the other stages visit clips in orders of their own.
-        """
+    def split(self, name: str) -> ClipDataset:
+        """One split."""
         if self._mixed:
             parts = [(data, weight) for data, weight in self._mixed if name in data.splits]
-            opened = [(data.split(name, training=training), weight) for data, weight in parts]
+            opened = [(data.split(name), weight) for data, weight in parts]
             return opened[0][0] if len(opened) == 1 else MixedDataset(opened)
         if not (self.folder / REFERENCE).is_file():
             return ShardDataset.open(self.folder / SHARDS, name)
         reference, reader = self._elsewhere
         reading = Reading(
-            mode=reader.mode if training else "indexed",
-            order=reference.order,
-            shards_per_group=reference.shards_per_group,
-            cache=reader.cache,
+            order=reference.order, shards_per_group=reference.shards_per_group, cache=reader.cache
         )
         return ShardDataset.open(reference.path, name, reading=reading)
 

@@ -30,7 +30,7 @@ from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.clips import ClipDataset, in_order
+from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.order import Source
 from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences, stream_names
 from motionloom.models.tokenizer.base import Tokenizer
@@ -268,7 +268,7 @@ def gpt_clips(
     own = store.of(chosen)
     rows: dict[str, int] = {}
     captions = []
-    for number, index in enumerate(in_order(dataset, member, clips=clips.tolist())):
+    for number, index in enumerate(clips.tolist()):
         clip_captions, frames = captions_of(dataset, index, face=face), int(dataset.frames[index])
         spans = caption_spans(clip_captions, dataset.layout.fps, frames, min_frames)
         groups = int(own.groups[number])

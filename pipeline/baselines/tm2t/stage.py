@@ -13,7 +13,6 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.cache import TextCache
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.tm2t.generator import (
@@ -303,11 +302,7 @@ def _vocabulary(config: CaptionerStageConfig, data: Data | DataPreview) -> Vocab
         return Vocabulary(tuple(f"word{number}" for number in range(config.vocabulary)))
     train = data.split("train")
     captioned = [int(clip) for clip in train.has("texts.json").nonzero()[0]]
-    found = [
-        caption.text
-        for clip in in_order(train, "texts.json", clips=captioned)
-        for caption in captions_of(train, clip, face=False)
-    ]
+    found = [caption.text for clip in captioned for caption in captions_of(train, clip, face=False)]
     return Vocabulary.of(found, most=config.vocabulary, least_uses=config.least_uses)
 
 

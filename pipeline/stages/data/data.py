@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from pydantic import Field
@@ -91,9 +91,7 @@ class ShardsStageConfig(Reading, StageConfig):
     """Refuse shards of another layout. Dry runs go by it while the shards are not there yet."""
     verify: bool = True
     """Check folders from end to end, when the stage runs. Shards on a server are checked as they arrive."""
-    # These change no result, so a finished run is not thrown away for them.
-    mode: Literal["indexed", "streamed"] = Field("indexed", json_schema_extra=RUNTIME)
-    """`indexed` reads clips where they lie; `streamed` has training read whole shards front to back."""
+    # It changes no result, so a finished run is not thrown away for it.
     cache: CacheConfig = Field(CacheConfig(), json_schema_extra=RUNTIME)
 
     @property
@@ -159,7 +157,7 @@ def run_shards(context: StageContext) -> None:
 
 def settle_shards(config: ShardsStageConfig, folder: Path) -> None:
     """Write down how the recipe wants the shards read now; done again whenever the recipe runs."""
-    write_json(folder / READER, Reader(mode=config.mode, cache=config.cache).dump())
+    write_json(folder / READER, Reader(cache=config.cache).dump())
 
 
 def say_shards(context: StageContext, manifest: Manifest) -> None:

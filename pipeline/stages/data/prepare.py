@@ -12,7 +12,6 @@ from motionloom.datasets.actions.measure import actions_of
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.schema import Split, UserError
-from motionloom.datasets.shards.clips import in_order
 from motionloom.datasets.text.build import build_text_cache
 from motionloom.datasets.text.vocabulary import word_counts
 from motionloom.pipeline.contract.stage import (
@@ -132,7 +131,7 @@ class TextStage(StageKind[TextConfig]):
         said = defaultdict[tuple[Split, bool], set[str]](set)
         for split in data.splits:
             dataset = data.split(split)
-            for index in in_order(dataset, "meta.json", "texts.json", "face_texts.json"):
+            for index in range(len(dataset)):
                 for face in (False, True):
                     said[split, face] |= {caption.text for caption in captions_of(dataset, index, face=face)}
                 if split == "train":

@@ -50,7 +50,7 @@ def clip_batches(
         dataset: Trained on in place of the training split.
         draws: How clips are drawn in training alone.
     """
-    dataset = data.split("train", training=True) if dataset is None else dataset
+    dataset = data.split("train") if dataset is None else dataset
 
     def of(some: ClipDataset) -> FeatureStats | Crops:
         return read(some) if callable(read) else read

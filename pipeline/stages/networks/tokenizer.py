@@ -158,7 +158,7 @@ def window_batches(
 ) -> Batches:
     """Windows of the training split; validation on held-out clips, as `EvalBatches` takes it."""
     data, stats = inputs.data, inputs.stats
-    dataset = data.split("train", training=True)
+    dataset = data.split("train")
 
     cut = {"window": config.window, "windows_per_clip": config.windows_per_clip, "seed": seed}
 

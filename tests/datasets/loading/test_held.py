@@ -56,7 +56,7 @@ def openings(root: Path, *kinds: str) -> list[ClipDataset]:
 
     known: dict[str, ClipDataset] = {
         "indexed": opened(),
-        "streamed": opened(mode="streamed", order="streamed", shards_per_group=2),
+        "streamed": opened(order="streamed", shards_per_group=2),
         "mixed": MixedDataset([(opened(), 1.0), (opened("test"), 2.0)]),
     }
     return [known[kind] for kind in kinds or known]

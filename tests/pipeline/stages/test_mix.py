@@ -64,7 +64,7 @@ def test_it_is_the_clips_of_both(run: Path) -> None:
 
 def test_training_draws_by_weight(run: Path) -> None:
     """A quarter of what an epoch draws is text clips, whatever their number (its places divide by four)."""
-    dataset = Data(stage(run, "data")).split("train", training=True)
+    dataset = Data(stage(run, "data")).split("train")
     texts = len(Data(stage(run, "texts")).split("train"))
     sources = dataset.sources()
     assert [source.weight for source in sources] == [1.0, 3.0]

@@ -60,7 +60,7 @@ def recipe(folder: Path, name: str, data: dict[str, Any]) -> Path:
     return path
 
 
-def test_reader_and_cache_may_change_without_training_again(
+def test_the_cache_may_change_without_training_again(
     shards: Path, loopback: ModuleType, tmp_path: Path, call: Call
 ) -> None:
     with loopback.web(shards) as (url, _):
@@ -68,7 +68,7 @@ def test_reader_and_cache_may_change_without_training_again(
         old, new = ({"folder": str(tmp_path / name)} for name in "ab")
         first = recipe(tmp_path, "one", {**common, "cache": old})
         assert call("run", first, "--out", tmp_path / "run", "--until", "stats").code == 0
-        second = recipe(tmp_path, "two", {**common, "mode": "streamed", "cache": new})
+        second = recipe(tmp_path, "two", {**common, "cache": new})
         done = call("run", second, "--out", tmp_path / "run", "--until", "tokenizer", "--replace")
         assert done.code == 0 and "1 of 5 " in done.out, done.out
         assert list((tmp_path / "b").glob("*.tar")), "the finished data stage hands the new cache on"
