@@ -14,14 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Self, get_args
 
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    SerializerFunctionWrapHandler,
-    ValidationError,
-    model_serializer,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
 
 SCHEMA_VERSION = 2
 
@@ -222,16 +215,6 @@ class Manifest(Config):
     notes: list[str] = []
     excluded: dict[str, str] = {}
     """Ids of clips that readers skip, and why: what `motionloom data clean` was told to leave out."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_audit(cls, data: Any) -> Any:
-        """Older sets have a table of what is now a note."""
-        return (
-            {name: value for name, value in data.items() if name != "audit"}
-            if isinstance(data, dict)
-            else data
-        )
 
     @model_serializer(mode="wrap")
     def _without_no_excluded(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -6,7 +6,7 @@
 | `.npy` | a motion array of the layout asked for (Motion-X's `smplx322` unless given), or joints |
 | `.npz` | SMPL parameters as AMASS publishes them |
 | `.pkl` | an AIST++ annotation, through the restricted unpickler |
-| `.bvh`, `.amc` | BVH; AMC with its ASF beside it; the frame rate is judged by falls and steps |
+| `.bvh`, `.amc` | BVH; AMC with its ASF beside it |
 | `.wav`, `.flac`, `.ogg`, `.mp3` | sound |
 | `.txt` | ids, by the name of file or folder; captions in HumanML3D's grammar or, without any `#`, plain |
 
@@ -29,7 +29,6 @@ from motionloom.datasets.check.clip import ABSURD, beyond, human_limits, require
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.bvh.plan import read_motion as read_mocap
-from motionloom.datasets.convert.bvh.settle import doubted_rate
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import load_array, read_array_header
 from motionloom.datasets.convert.common.features import require_human
@@ -214,9 +213,8 @@ def _check_mocap(path: Path, rules: FileRules) -> Verdict:
     if file.error:
         raise UserError(f"{path}: {file.error}")
     motion = read_mocap(file.data, str(path))
-    kind, doubt = path.suffix[1:].upper(), doubted_rate(motion)
-    what = f"{kind}, {len(motion.joints)} joints, {motion.frames} frames, {motion.fps:g} fps"
-    return Verdict(path, what, notes=[doubt] if doubt else [])
+    kind = path.suffix[1:].upper()
+    return Verdict(path, f"{kind}, {len(motion.joints)} joints, {motion.frames} frames, {motion.fps:g} fps")
 
 
 def _check_sound(path: Path, rules: FileRules) -> Verdict:

@@ -12,11 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
 from motionloom.datasets.convert.common.look import ADULT_METRES, named_unit
 from motionloom.datasets.motion.bvh.joint_map import JointMap, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
-from motionloom.datasets.motion.plausibility import measure, wrong_rate
+from motionloom.datasets.motion.plausibility import measure
 from motionloom.datasets.motion.skeleton import Skeleton
 
 _ABOVE = 0.8
@@ -36,17 +35,6 @@ _ARMS, _LEGS = (
     for joints in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 )
 _PELVIS, _HEAD = _NAMED.index("pelvis"), _NAMED.index("head")
-
-
-def doubted_rate(motion: BvhMotion) -> str:
-    """Return the reason that a frame rate cannot be true; empty without one, or without a known figure."""
-    guess = guess_joint_map(motion, _NAMED)
-    if not guess.certain:
-        return ""
-    joint_map = guess.joint_map(motion.name)
-    unit, up, _ = settled(joint_map, [motion])
-    joints = joint_map.apply(motion, unit=unit, up=up)
-    return wrong_rate(joints[added_frames(joints) :], motion.fps)
 
 
 def up_of(clips: Sequence[NDArray[np.floating]]) -> Up:

@@ -24,13 +24,7 @@ from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.motion.bvh.joint_map import METRES, NamedUnit, metres
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.motion.plausibility import (
-    MOST,
-    PERSON_METRES,
-    PlausibilityStats,
-    measure,
-    wrong_rate,
-)
+from motionloom.datasets.motion.plausibility import MOST, PERSON_METRES, PlausibilityStats, measure
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import drop, grouped
 
@@ -247,7 +241,6 @@ def look_at(
     chosen, subsets = _choose(items, subset_of, config.look, label, in_order)
     clips: list[SeenClip] = []
     failed: list[tuple[str, Dropped]] = []
-    rates: list[str] = []
     names: Names = ()
     for name, item in chosen:
         try:
@@ -261,8 +254,6 @@ def look_at(
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))
         body = np.asarray(seen.joints[::step, :BODY_JOINTS], dtype=np.float64)
         clips.append(SeenClip(name, body, seen.fps / step, seen.fps, seen.up))
-        if wrong := wrong_rate(np.asarray(seen.joints, dtype=np.float64), seen.fps):
-            rates.append(f"{label(item)}: {wrong}")
         names = names or seen.names
     unreadable = Counter(name for name, _ in failed)
     found = [
@@ -270,7 +261,6 @@ def look_at(
         for name in dict.fromkeys(name for name, _ in chosen)
     ]
     problems, warnings, suggestions = _judge(clips, config, names)
-    warnings += rates
     # One reason for every clip is a wrong option or map; several reasons are damaged files.
     groups = grouped([drop for _, drop in failed])
     if failed and not clips and len(groups) == 1:

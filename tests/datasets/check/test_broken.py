@@ -120,13 +120,6 @@ def test_a_folder_is_checked_file_by_file_and_the_table_has_every_one(broken: Pa
     assert there - {"EXPECT.md"} == set(REJECTED) and len(REJECTED) == 62
 
 
-def test_a_rate_that_cannot_be_true_is_a_note(shared: Path) -> None:
-    odd = shared / "data/real/odd_bvh"
-    notes = {verdict.path.stem: verdict.notes for verdict in check_folder(odd, RULES) if verdict.ok}
-    (doubt,) = notes.pop("virvig_dancedb_metres")
-    assert "60" in doubt and "120" in doubt and len(notes) == 4 and not any(notes.values())
-
-
 def test_an_amc_is_checked_with_its_skeleton(tmp_path: Path) -> None:
     path = tmp_path / "07_01.amc"
     path.write_text("1\nroot 0 0 0 0 0 0\n2\nroot 0 1 0 0 0 0\n")
