@@ -6,7 +6,12 @@ The flight logs hold times and are no output.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from rich.console import Console
+from rich.markup import escape
 
 from motionloom.datasets.schema import UserError
 
@@ -15,6 +20,16 @@ FLIGHT = "flight"
 """Folder of the flight logs, in a stage's."""
 CRASHES = "crash"
 """Folder of what failed steps have read, in a stage's."""
+
+
+@contextmanager
+def optional(what: str, console: Console) -> Iterator[None]:
+    """Keep an error in what no result depends on from ending a training: one warning says what and why."""
+    try:
+        yield
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".partition("\n")[0]
+        console.print(f"[yellow]    {escape(f'{what} is left out: {reason}')}[/]", soft_wrap=True)
 
 
 def read_training_log(folder: Path) -> list[dict[str, float]]:

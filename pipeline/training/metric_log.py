@@ -1,7 +1,8 @@
 """The log of a training: `metrics.jsonl`, and Lightning's loggers, which get the same rows.
 
 A row reaches file and loggers only once the checkpoint that holds it is on disk: none of the loggers can take
-a row back, and after a kill all of them show every step once.
+a row back, and after a kill all of them show every step once. A logger that fails is dropped with a warning:
+no result depends on it, and a resumed training sends it the rows that it lacks.
 """
 
 from __future__ import annotations
@@ -10,23 +11,28 @@ import errno
 import json
 import os
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict, cast
 
 from lightning.pytorch.loggers.logger import Logger
+from rich.console import Console
 
 from motionloom.datasets.base.files import write_text
 from motionloom.models.training.distributed import rank
 from motionloom.pipeline.launch.hardware import LoggerName
 from motionloom.pipeline.store.files import open_own, read_record, write_json
-from motionloom.pipeline.store.training_log import FILE_NAME
+from motionloom.pipeline.store.training_log import FILE_NAME, optional
 
 FOLDER = "logs"
 """Folder of the loggers in a stage's folder; no result depends on it."""
 
 _SENT = "sent.json"
-"""In that folder: the last step the loggers have. A kill may come between a checkpoint and the sending."""
+"""In that folder: how many rows each logger has. A kill may come between a checkpoint and the sending."""
+
+_MLFLOW_SERVER = os.environ.get("MLFLOW_TRACKING_URI")
+"""As the user has set it: mlflow itself writes there which one it uses."""
 
 Row = dict[str, float]
 """Figures by name, and "step"."""
@@ -46,16 +52,20 @@ class MetricLog:
     runs have equal ones. Loggers are made when the training begins, so that an import costs nothing before.
     """
 
-    def __init__(self, folder: Path, names: Sequence[LoggerName], project: str, title: str) -> None:
+    def __init__(
+        self, folder: Path, names: Sequence[LoggerName], project: str, title: str, console: Console
+    ) -> None:
         self.path, self.folder = folder / FILE_NAME, folder / FOLDER
         self.names = tuple(dict.fromkeys(names))
-        self.project, self.title = project, title
+        self.project, self.title, self.console = project, title, console
         self.rows: list[Row] = []
-        self._loggers: list[Logger] = []
+        self._loggers: dict[LoggerName, Logger] = {}
+        self._sent: dict[str, int] = {}
+        """Rows that each logger has."""
         self._texts: list[tuple[str, str]] = []
         """Each row and what only the loggers get, as JSON: a checkpoint takes the text as it is."""
         self._written = 0
-        """Rows in the file and in the loggers."""
+        """Rows in the file."""
 
     def state_dict(self) -> LogState:
         """Rows so far, as text (plain types only in checkpoints)."""
@@ -71,15 +81,15 @@ class MetricLog:
         """Open the loggers and the file with the rows up to the checkpoint."""
         if rank() != 0:
             return
-        # Rows up to `sent` are on the servers, which cannot take any back.
-        path = self.folder / _SENT
-        sent = int(str(read_record(path)["step"])) if path.is_file() else -1
-        rows = self._logged(0, len(self.rows))
+        with optional(f"logs of {self.title}", self.console):
+            path = self.folder / _SENT
+            found = read_record(path) if path.is_file() else {}
+            self._sent = {name: int(str(count)) for name, count in found.items()}
         for name in self.names:
-            logger = _MAKERS[name](self)
-            self._loggers.append(logger)
-            # The CSV file is written anew.
-            _log(logger, [row for row in rows if name == "csv" or row["step"] > sent])
+            with optional(f"logger {name} of {self.title}", self.console):
+                self._loggers[name] = _MAKERS[name](self)
+        self._sent["csv"] = 0  # its file is written anew
+        self._send(len(self.rows))
         if self.rows or self.path.is_file():
             self._write()
 
@@ -96,12 +106,7 @@ class MetricLog:
         while count > self._written and self.rows[count - 1]["step"] > step:
             count -= 1
         _append(self.path, self._lines(self._written, count).encode())
-        rows = self._logged(self._written, count)
-        for logger in self._loggers:
-            _log(logger, rows)
-            logger.save()
-        if self._loggers and rows:
-            write_json(self.folder / _SENT, {"step": int(rows[-1]["step"])})
+        self._send(count)
         self._written = count
 
     def finish(self) -> None:
@@ -122,13 +127,36 @@ class MetricLog:
             write_json(path, {"id": make()})
         return str(read_record(path)["id"])
 
-    def _close(self, status: str) -> None:
-        for logger in self._loggers:
-            logger.finalize(status)
-        self._loggers = []
+    @contextmanager
+    def _kept(self, name: LoggerName) -> Iterator[Logger]:
+        """A logger, which is dropped if the block fails."""
+        with optional(f"logger {name} of {self.title}", self.console):
+            yield self._loggers[name]
+            return
+        del self._loggers[name]
 
-    def _logged(self, first: int, last: int) -> list[Row]:
-        return [json.loads(row) | json.loads(gauges) for row, gauges in self._texts[first:last]]
+    def _send(self, count: int) -> None:
+        """Bring the loggers up to the first `count` rows."""
+        for name in tuple(self._loggers):
+            texts = self._texts[self._sent.get(name, 0) : count]
+            if not texts:
+                continue
+            with self._kept(name) as logger:
+                for row, gauges in texts:
+                    figures = json.loads(row) | json.loads(gauges)
+                    step = int(figures.pop("step"))
+                    logger.log_metrics(figures, step=step)
+                logger.save()
+                self._sent[name] = count
+                write_json(self.folder / _SENT, self._sent)
+
+    def _close(self, status: str) -> None:
+        for name in tuple(self._loggers):
+            with self._kept(name) as logger:
+                logger.finalize(status)
+                if name == "wandb":  # Lightning leaves the run open until the process ends
+                    cast(Any, logger).experiment.finish(exit_code=int(status != "success"))
+        self._loggers = {}
 
     def _lines(self, first: int, last: int) -> str:
         return "".join(json.dumps(row, sort_keys=True) + "\n" for row in self.rows[first:last])
@@ -145,11 +173,6 @@ def _append(path: Path, lines: bytes) -> None:
         if file.write(lines) != len(lines):
             file.truncate(size)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-
-
-def _log(logger: Logger, rows: Sequence[Row]) -> None:
-    for row in rows:
-        logger.log_metrics({k: v for k, v in row.items() if k != "step"}, step=int(row["step"]))
 
 
 def _csv(log: MetricLog) -> Logger:
@@ -169,15 +192,28 @@ def _tensorboard(log: MetricLog) -> Logger:
 def _wandb(log: MetricLog) -> Logger:
     from lightning.pytorch.loggers import WandbLogger
 
-    name, id_ = log.title, log.identity("wandb")
-    return WandbLogger(project=log.project, name=name, id=id_, resume="allow", save_dir=log.folder)
+    # A run of its own: the trainings of one process follow each other.
+    return WandbLogger(
+        project=log.project,
+        name=log.title,
+        id=log.identity("wandb"),
+        resume="allow",
+        save_dir=log.folder,
+        reinit="create_new",
+    )
 
 
 def _mlflow(log: MetricLog) -> Logger:
     from lightning.pytorch.loggers import MLFlowLogger
 
+    # MLflow refuses folders of files since 3.17, and asks for a database where there is no server.
+    log.folder.mkdir(parents=True, exist_ok=True)
+    server = _MLFLOW_SERVER or f"sqlite:///{log.folder.resolve()}/mlflow.db"
+
     def logger(run_id: str | None = None) -> MLFlowLogger:
-        return MLFlowLogger(experiment_name=log.project, run_name=log.title, run_id=run_id)
+        return MLFlowLogger(
+            experiment_name=log.project, run_name=log.title, tracking_uri=server, run_id=run_id
+        )
 
     return logger(log.identity("mlflow", lambda: str(logger().run_id)))  # the server gives the name
 

@@ -122,7 +122,7 @@ class Training:
         self.execution = Execution(fabric, module, config)
         self.average = AveragedWeights(module.net, config.ema) if config.ema else None
         title = f"{context.recipe}/{name}"
-        self.log = MetricLog(context.folder, hardware.loggers, context.recipe, title)
+        self.log = MetricLog(context.folder, hardware.loggers, context.recipe, title, console)
         self.validation_is_due = False
         # Loaded before telemetry and writer begin: both go on from the module's step.
         if resume.checkpoint is not None:

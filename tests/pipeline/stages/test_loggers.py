@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
 from lightning.pytorch.loggers.logger import Logger
+from rich.console import Console
 from tiny_adversaries import train
 
 from motionloom.datasets.schema import UserError
@@ -79,13 +81,14 @@ def test_all_get_the_rows_of_the_metrics_file_and_more(tmp_path: Path) -> None:
 
 
 class Noted(Logger):
-    """Notes what it gets."""
+    """Notes the steps that it gets; what `fails` names ends with an error."""
 
     name, version = "noted", "0"
 
-    def __init__(self, rows: list[int]) -> None:
+    def __init__(self, rows: list[int], fails: str = "") -> None:
         super().__init__()
-        self.rows = rows
+        self.rows, self.fails = rows, fails
+        self._act("open")
 
     def log_hyperparams(self, *_: Any, **__: Any) -> None:
         """Nothing."""
@@ -93,26 +96,118 @@ class Noted(Logger):
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         """Note the step."""
         assert step is not None
+        self._act("log" if step > 12 else "")
         self.rows.append(step)
+
+    def save(self) -> None:
+        """Nothing."""
+        self._act("save")
+
+    def finalize(self, status: str) -> None:
+        """Nothing."""
+        self._act("finalize")
+
+    def _act(self, name: str) -> None:
+        if name and name == self.fails:
+            raise ConnectionError("no route [to host]\nand more")
+
+
+def use(monkeypatch: pytest.MonkeyPatch, rows: list[int], fails: str = "") -> None:
+    """Have a `Noted` stand for TensorBoard's logger."""
+    monkeypatch.setitem(metric_log._MAKERS, "tensorboard", lambda *_: Noted(rows, fails))
 
 
 def test_a_logger_gets_rows_with_their_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It cannot take one back: what a kill has undone must not have been sent."""
     sent: list[int] = []
-    monkeypatch.setitem(metric_log._MAKERS, "wandb", lambda *_: Noted(sent))
-    server = {"loggers": ("wandb",)}
+    use(monkeypatch, sent)
     with pytest.raises(ConnectionResetError):
-        train(tmp_path, hardware=server, dies_at=23, **STEPS)
+        train(tmp_path, hardware=FILES, dies_at=23, **STEPS)
     assert sent == [10, 12]
     # As if the kill had come when the checkpoint was on disk and its last row not yet sent.
-    (tmp_path / "logs/sent.json").write_text('{"step": 10}')
-    train(tmp_path, hardware=server, **STEPS)
+    (tmp_path / "logs/sent.json").write_text('{"tensorboard": 1}')
+    train(tmp_path, hardware=FILES, **STEPS)
     assert sent == [10, 12, 12, 20, 24, 30]
 
 
+@pytest.mark.parametrize("fails", ["open", "log", "save", "finalize"])
+def test_a_logger_that_fails_is_dropped(fails: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One warning; the training and the other logs go on, and a resumed one sends what is missing."""
+    sent: list[int] = []
+    use(monkeypatch, sent, fails)
+    said = StringIO()
+    with pytest.raises(ConnectionResetError):
+        train(tmp_path, hardware=FILES, dies_at=29, console=Console(file=said, width=500), **STEPS)
+    (line,) = [line for line in said.getvalue().splitlines() if "ConnectionError" in line]
+    assert "logger tensorboard of test/duel" in line and line.endswith("no route [to host]")
+    assert [row["step"] for row in read_training_log(tmp_path)] == [10, 12, 20, 24]
+    assert [row["step"] for row in csv_rows(tmp_path)] == [10, 12, 20, 24]
+    use(monkeypatch, sent)
+    train(tmp_path, hardware=FILES, **STEPS)
+    assert sorted({*sent}) == [row["step"] for row in csv_rows(tmp_path)] == [10, 12, 20, 24, 30]
+    assert sent[-1] == 30 and (fails == "save" or len(sent) == 5)
+
+
 def test_a_server_knows_a_training_that_goes_on(tmp_path: Path) -> None:
-    first, again = (MetricLog(tmp_path, (), "p", "t").identity("wandb") for _ in range(2))
-    assert first == again != MetricLog(tmp_path / "other", (), "p", "t").identity("wandb")
+    console = Console(quiet=True)
+    first, again = (MetricLog(tmp_path, (), "p", "t", console).identity("wandb") for _ in range(2))
+    assert first == again != MetricLog(tmp_path / "other", (), "p", "t", console).identity("wandb")
+
+
+def killed_and_resumed(folder: Path, name: str) -> None:
+    """Two trainings of one process with a logger; the second is killed and goes on. No warning is given."""
+    said = StringIO()
+    console, hardware = Console(file=said, width=500), {"loggers": (name, "csv")}
+    train(folder / "first", hardware=hardware, console=console, **STEPS)
+    with pytest.raises(ConnectionResetError):
+        train(folder / "second", hardware=hardware, console=console, dies_at=23, **STEPS)
+    train(folder / "second", hardware=hardware, console=console, **STEPS)
+    assert "logger" not in said.getvalue()
+    assert {path.name for path in folder.iterdir()} == {"first", "second"}
+
+
+def test_mlflow_has_every_row_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mlflow = pytest.importorskip("mlflow", reason="the extra mlflow is not installed")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(metric_log, "_MLFLOW_SERVER", None)
+    killed_and_resumed(tmp_path, "mlflow")
+    for folder in (tmp_path / "first", tmp_path / "second"):
+        client = mlflow.MlflowClient(f"sqlite:///{folder}/logs/mlflow.db")
+        experiment = client.get_experiment_by_name("test").experiment_id
+        (run,) = client.search_runs([experiment])
+        assert run.info.run_name == "test/duel" and run.info.status == "FINISHED"
+        for name in ("train/loss", "val/loss"):
+            logged = [(m.step, m.value) for m in client.get_metric_history(run.info.run_id, name)]
+            rows = [(row["step"], row[name]) for row in read_training_log(folder) if name in row]
+            assert logged == rows
+
+
+def wandb_steps(path: Path) -> list[int]:
+    """The steps of the rows in wandb's file of a run that was offline: a log in LevelDB's format."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    data, place, steps = path.read_bytes(), 7, []
+    while place < len(data):
+        length = int.from_bytes(data[place + 4 : place + 6], "little")
+        record = Record.FromString(data[place + 7 : place + 7 + length])
+        values = {item.key or item.nested_key[0]: item.value_json for item in record.history.item}
+        steps += [int(values["trainer/global_step"])] if values else []
+        place += 7 + length
+    return steps
+
+
+def test_wandb_has_every_row_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("wandb", reason="the extra wandb is not installed")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    killed_and_resumed(tmp_path, "wandb")
+    ids = set()
+    for folder, runs in ((tmp_path / "first", 1), (tmp_path / "second", 2)):
+        paths = sorted(folder.glob("logs/wandb/offline-run-*/*.wandb"))
+        steps = [step for path in paths for step in wandb_steps(path)]
+        assert len(paths) == runs and steps == [row["step"] for row in read_training_log(folder)]
+        ids |= {path.stem for path in paths}
+    assert len(ids) == 2
 
 
 @pytest.mark.parametrize("name", ["wandb", "mlflow"])
