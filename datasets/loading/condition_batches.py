@@ -10,6 +10,7 @@ everywhere.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Literal, NotRequired, cast
 
 import numpy as np
@@ -35,6 +36,9 @@ _CAPTION, _CROP, _DROP = 2, 3, 4
 
 Captioned = Literal["body", "face"]
 """Subject of the captions that every clip must have."""
+
+KEPT = 2**16
+"""Clips whose captions are kept as read: some 50 MB a process."""
 
 
 class ConditionBatch(MotionBatch):
@@ -102,6 +106,14 @@ class ConditionedClips:
         """Which of the modalities that are read every clip of the dataset has, [n, M]."""
         for column, member in enumerate(self.members.values()):
             self.present[:, column] = dataset.has(member)
+        self._captions = lru_cache(KEPT)(self._read_captions)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in vars(self).items() if name != "_captions"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
+        self._captions = lru_cache(KEPT)(self._read_captions)
 
     @property
     def names(self) -> list[str]:
@@ -117,13 +129,17 @@ class ConditionedClips:
         out = []
         read = present[:, self.names.index("text")] if "text" in self.readers else np.zeros(len(clips), bool)
         for clip, text, draw in zip(clips.tolist(), read.tolist(), draws.tolist(), strict=True):
-            frames = int(self.dataset.frames[clip])
-            choices = [CaptionSpan("", 0, frames)]
-            if text:
-                captions = self.dataset.face_texts(clip) if self.face else self.dataset.texts(clip)
-                choices = caption_spans(captions, self.dataset.layout.fps, frames, self.min_frames)
+            if not text:
+                out.append(CaptionSpan("", 0, int(self.dataset.frames[clip])))
+                continue
+            choices = self._captions(clip)
             out.append(choices[int(draw * len(choices))])
         return out
+
+    def _read_captions(self, clip: int) -> list[CaptionSpan]:
+        captions = self.dataset.face_texts(clip) if self.face else self.dataset.texts(clip)
+        frames = int(self.dataset.frames[clip])
+        return caption_spans(captions, self.dataset.layout.fps, frames, self.min_frames)
 
     def make(
         self,

@@ -104,16 +104,16 @@ class Crops:
 
         `present` are the bits of what the clip holds.
         """
-        target = out[:length]
+        target, frames = out[:length], clip[start : start + length]
+        row = target.reshape(-1)  # a view: it is contiguous
+        mean, scale = self._repeated(length)
         if self.width == clip.shape[1]:
-            row = target.reshape(-1)  # a view: both are contiguous
-            mean, scale = self._repeated(length)
-            np.subtract(clip[start : start + length].reshape(-1), mean, out=row)
-            np.multiply(row, scale, out=row)
+            np.subtract(frames.reshape(-1), mean, out=row)
         else:
             for source, place in self._runs:
-                np.subtract(clip[start : start + length, source], self._mean[place], out=target[:, place])
-            np.multiply(target, self._scale, out=target)
+                target[:, place] = frames[:, source]
+            np.subtract(row, mean, out=row)
+        np.multiply(row, scale, out=row)
         # Whatever the file stores for parts that the clip does not hold, the batch has the mean.
         for place in self._missing[present]:
             target[:, place] = 0.0

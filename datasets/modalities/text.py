@@ -43,6 +43,8 @@ class TextModality(Modality):
         with_text = np.flatnonzero(rows.present)
         chosen = [rows.captions[row] for row in with_text.tolist()]
         tokens, known = cache.tokens(chosen)
+        if len(chosen) == count:
+            return condition_of(tokens, known, cache.sentence(chosen))
         # A batch without any text keeps one position, so that attention has something to mask.
         places = max(1, tokens.shape[1])
         features = np.zeros((count, places, cache.dim), dtype=np.float32)

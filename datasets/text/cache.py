@@ -91,10 +91,12 @@ class TextCache:
         """Token embeddings [n, S, E], zero padded to the longest, and the mask [n, S] of real tokens."""
         rows = self._rows(captions)
         begin, length = self._offsets[rows], self._offsets[rows + 1] - self._offsets[rows]
-        out = np.zeros((len(rows), int(length.max(initial=0)), self.dim), dtype=np.float32)
-        for i in range(len(rows)):
-            out[i, : length[i]] = self._tokens[begin[i] : begin[i] + length[i]]
-        return out, np.arange(out.shape[1])[None] < length[:, None]
+        mask = np.arange(length.max(initial=0))[None] < length[:, None]
+        out = np.zeros((*mask.shape, self.dim), dtype=np.float32)
+        # Tokens of all captions one after the other, which is the order of the mask's true places too.
+        before = np.cumsum(length) - length
+        out[mask] = self._tokens[np.repeat(begin - before, length) + np.arange(length.sum())]
+        return out, mask
 
     def keys(self) -> set[bytes]:
         """sha256 of every caption here."""
@@ -121,12 +123,16 @@ class TextCache:
         return self._sentence[row], self._tokens[self._offsets[row] : self._offsets[row + 1]]
 
     def _rows(self, captions: Sequence[str]) -> NDArray[np.int64]:
-        rows = np.empty(len(captions), dtype=np.int64)
-        for i, text in enumerate(captions):
-            row = self.row(key_of(text))
+        keys = np.frombuffer(b"".join(map(key_of, captions)), dtype=np.uint8).reshape(-1, 32)
+        heads = np.ascontiguousarray(keys[:, :8]).view(">u8").reshape(-1).astype(np.uint64)
+        rows = np.searchsorted(self._heads, heads).clip(max=len(self._keys) - 1)
+        # Where the whole key is another, two keys begin alike or the caption is not here.
+        for i in np.flatnonzero((self._keys[rows] != keys).any(axis=1)).tolist():
+            row = self.row(keys[i].tobytes())
             if row is None:
                 raise UserError(
-                    f"caption '{text[:80]}' is not in the text cache {self.folder}; run the text stage again"
+                    f"caption '{captions[i][:80]}' is not in the text cache {self.folder}; run the text "
+                    "stage again"
                 )
             rows[i] = row
         return rows

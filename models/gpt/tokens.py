@@ -143,20 +143,6 @@ def as_codes(tokens: Tensor, pattern: Sequence[str], groups: Tensor) -> Codes:
     return Codes({name: rows[:, :, here].flatten(1) for name, here in slots.items()}, groups)
 
 
-def pad_sequences(rows: Sequence[TokenSequence]) -> TokenSequence:
-    """Batches of different L (or single clips, B = 1) -> one padded batch."""
-    size = max(row.tokens.shape[1] for row in rows)
-
-    def padded(x: Tensor, value: int) -> Tensor:
-        return functional.pad(x, (0, size - x.shape[1]), value=value)
-
-    return TokenSequence(
-        torch.cat([padded(row.tokens, PAD) for row in rows]),
-        torch.cat([padded(row.kinds, 0) for row in rows]),
-        torch.cat([row.length for row in rows]),
-    )
-
-
 class TokenNetwork(nn.Module):
     """Base of autoregressive networks whose slots belong to several codebooks.
 

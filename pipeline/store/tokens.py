@@ -11,11 +11,11 @@ part with a stream of its own (hands, in H2VQ) stays; that stream's tokens are n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.order import Source
-from motionloom.models.gpt.tokens import TokenSequence, interleave, pad_sequences, stream_names
+from motionloom.models.gpt.tokens import TokenSequence, interleave, stream_names
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.store.data import captions_of
 
@@ -58,6 +58,14 @@ class TokenStore:
         begin = int(self.starts[index]) + first
         end = int(self.starts[index + 1]) if count is None else begin + count
         return {name: flat[begin * n : end * n] for (name, flat), n in self._streams()}
+
+    def stretches(self, begin: NDArray[np.int64], count: NDArray[np.int64]) -> Codes:
+        """Codes of `count` [B] groups from group `begin` [B] of the split on: per stream int64
+        [B, most * per_group]; after a shorter row's own come others, of no meaning.
+        """
+        places = begin[:, None] + np.arange(count.max())
+        groups = torch.from_numpy(np.minimum(places, self.starts[-1] - 1))
+        return {name: flat.reshape(-1, n)[groups].flatten(1) for (name, flat), n in self._streams()}
 
     def whole_clips(self) -> TokenStore:
         return self.of(self.whole)
@@ -97,14 +105,27 @@ class TokenStore:
         return TokenStore(codes, tensors["starts"].numpy(), per_group, tensors["whole"].numpy())
 
 
-class TokenCaption(NamedTuple):
-    """A caption and the groups of its clip that it is about."""
+@dataclass(frozen=True)
+class TokenCaptions:
+    """The captions of n clips, m in all, clip by clip, and the groups of their clips that they are about."""
 
-    row: int
-    """Its row in the list of all captions."""
-    first: int
-    end: int
-    """The group behind the last."""
+    starts: NDArray[np.int64]
+    """Number of each clip's first caption, and m, [n + 1]; every clip has one."""
+    rows: NDArray[np.int64]
+    """Rows in the list of all different captions, [m]."""
+    first: NDArray[np.int64]
+    count: NDArray[np.int64]
+    """Groups, [m]."""
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    @staticmethod
+    def of(clips: Sequence[Sequence[tuple[int, int, int]]]) -> TokenCaptions:
+        """The (row, first, count) of each caption of each clip."""
+        starts = np.cumsum([0, *map(len, clips)])
+        table = np.array([caption for own in clips for caption in own], dtype=np.int64)
+        return TokenCaptions(starts, *table.reshape(-1, 3).T.copy())
 
 
 @dataclass(frozen=True)
@@ -118,7 +139,7 @@ class PresentTokens:
     columns: Tensor
     """bool [4, C]: the same for the tokenizer's columns."""
 
-    def known(self, items: list[int], batch: TokenSequence, ends: Tensor) -> Tensor:
+    def known(self, items: Sequence[int] | NDArray[np.int64], batch: TokenSequence, ends: Tensor) -> Tensor:
         """Bool [B, L]: false at codes of streams that the clips `items` [B] lack; `ends` int64 [K]."""
         recorded = self.streams[self.bits[items]].gather(1, batch.kinds)
         return recorded | (batch.tokens == ends[batch.kinds])
@@ -134,8 +155,8 @@ class TokenBatches(Dataset[dict[str, Any]]):
     """
 
     store: TokenStore
-    captions: list[list[TokenCaption]]
-    """The captions of each clip; their rows are rows of `prior`."""
+    captions: TokenCaptions
+    """The clips' captions; their rows are rows of `prior`."""
     prior: Tensor
     """Text embeddings [n, E]."""
     similarity: Tensor
@@ -166,8 +187,9 @@ class TokenBatches(Dataset[dict[str, Any]]):
 
     @cached_property
     def _plan(self) -> BatchPlan:
-        spans = [sum(caption.end - caption.first for caption in own) // len(own) for own in self.captions]
-        lengths = np.minimum(np.array(spans), self.max_groups)
+        starts = self.captions.starts
+        spans = np.add.reduceat(self.captions.count, starts[:-1]) // np.diff(starts)
+        lengths = np.minimum(spans, self.max_groups)
         return BatchPlan(len(self.captions), self.batch_size, self.seed, lengths, self.sources)
 
     def __len__(self) -> int:
@@ -179,17 +201,15 @@ class TokenBatches(Dataset[dict[str, Any]]):
         else:
             items = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
             turns = np.zeros(len(items), dtype=np.int64)
-        rows, sequences = [], []
-        for item, turn in zip(items.tolist(), turns.tolist(), strict=True):
-            caption, first, groups = self._drawn(item, turn)
-            rows.append(caption.row)
-            closed = groups == caption.end - caption.first
-            sequences.append(self._row(self.store.clip(item, first, groups), closed=closed))
-        batch = pad_sequences(sequences)
+        captions, first, groups = self._drawn(items, turns)
+        rows = self.captions.rows[captions]
+        batch = self._sequences(
+            self.store.starts[items] + first, groups, groups == self.captions.count[captions]
+        )
         more = {} if self.latents is None else {"tma_text": self.latents[rows]}
         if self.present is not None:
             ends = torch.tensor([self.ends[name] for name in stream_names(self.pattern)])
-            more["known"] = self.present.known(items.tolist(), batch, ends)
+            more["known"] = self.present.known(items, batch, ends)
             more["present"] = self.present.columns[self.present.bits[items]]
         return {
             "tokens": batch.tokens,
@@ -200,24 +220,31 @@ class TokenBatches(Dataset[dict[str, Any]]):
             **more,
         }
 
-    def _drawn(self, item: int, turn: int) -> tuple[TokenCaption, int, int]:
-        """A caption of a clip, and first group and length of the stretch it is about, or of a random part of
-        one that is longer than the block.
+    def _drawn(
+        self, items: NDArray[np.int64], turns: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """A caption of each clip, and first group and length of the stretch it is about, or of a random part
+        of one that is longer than the block; each [B].
         """
-        # Seeded by clip and turn, so that no order of batches and no number of ranks changes a draw.
-        rng = np.random.default_rng([self.seed, turn, item])
-        choice = int(rng.integers(len(self.captions[item]))) if self.training else 0
-        caption = self.captions[item][choice]
-        first, groups = caption.first, caption.end - caption.first
-        if groups > self.max_groups:
-            if self.training:
-                first += int(rng.integers(groups - self.max_groups + 1))
-            groups = self.max_groups
-        return caption, first, groups
+        own, chosen, skipped = self.captions, self.captions.starts[items], np.zeros_like(items)
+        choices = own.starts[items + 1] - chosen
+        if self.training:
+            # Seeded by clip and turn, so that no order of batches and no number of ranks changes a draw.
+            for row, (item, turn) in enumerate(zip(items.tolist(), turns.tolist(), strict=True)):
+                rng = np.random.Generator(np.random.PCG64([self.seed, turn, item]))
+                chosen[row] += rng.integers(choices[row])
+                more = own.count[chosen[row]] - self.max_groups
+                skipped[row] = rng.integers(more + 1) if more > 0 else 0
+        return chosen, own.first[chosen] + skipped, np.minimum(own.count[chosen], self.max_groups)
 
-    def _row(self, codes: Codes, *, closed: bool) -> TokenSequence:
-        batched = {name: row[None] for name, row in codes.items()}
-        return interleave(batched, self.pattern, ends=self.ends if closed else None)
+    def _sequences(
+        self, begin: NDArray[np.int64], groups: NDArray[np.int64], closed: NDArray[np.bool_]
+    ) -> TokenSequence:
+        """The sequences of `groups` [B] groups from group `begin` [B] of the split on."""
+        codes, count = self.store.stretches(begin, groups), torch.from_numpy(groups)
+        batch = interleave(codes, self.pattern, ends=self.ends, groups=count, closed=torch.from_numpy(closed))
+        longest = int(batch.length.max())  # the longest row may have no End
+        return TokenSequence(batch.tokens[:, :longest], batch.kinds[:, :longest], batch.length)
 
 
 @dataclass(frozen=True)
@@ -226,8 +253,7 @@ class GptClips:
 
     store: TokenStore
     """Tokens of these clips alone."""
-    captions: list[list[TokenCaption]]
-    """Captions of each clip, n lists."""
+    captions: TokenCaptions
     texts: list[str]
     """Texts of all different captions, [m]."""
     present: PresentTokens | None
@@ -276,7 +302,7 @@ def gpt_clips(
     bits = torch.from_numpy(dataset.present[clips].astype(np.int64))
     return GptClips(
         own,
-        captions,
+        TokenCaptions.of(captions),
         list(rows),
         None if table.streams[bits].all() else PresentTokens(bits, table.streams, table.columns),
         # Weights count; the order of shards does not, as the tokens are all in memory.
@@ -286,11 +312,11 @@ def gpt_clips(
     )
 
 
-def _caption(span: CaptionSpan, groups: int, unit: int, rows: dict[str, int]) -> TokenCaption:
-    """The groups whose borders are nearest to the caption's, at least one."""
+def _caption(span: CaptionSpan, groups: int, unit: int, rows: dict[str, int]) -> tuple[int, int, int]:
+    """Row, first group and number of the groups whose borders are nearest to the caption's, at least one."""
     first = min((span.first + unit // 2) // unit, groups - 1)
     end = min(max((span.end + unit // 2) // unit, first + 1), groups)
-    return TokenCaption(rows.setdefault(span.text, len(rows)), first, end)
+    return rows.setdefault(span.text, len(rows)), first, end - first
 
 
 @dataclass(frozen=True)

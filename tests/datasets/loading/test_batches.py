@@ -70,6 +70,21 @@ def test_windows_are_pieces_of_clips(train: ShardDataset, stats: FeatureStats) -
     assert len(starts) > 50
 
 
+@pytest.mark.parametrize("columns", [range(133), range(4, 90), [0, 3, 4, 5, 60, 132]])
+def test_windows_are_normalised_to_the_byte(
+    train: ShardDataset, stats: FeatureStats, columns: Sequence[int]
+) -> None:
+    chosen = np.array(columns)
+    batches = WindowBatches(train, stats, window=32, batch_size=8, seed=3, columns=chosen)
+    for k in range(4):
+        clips, starts, lengths = batches._windows(k)
+        wanted = np.zeros((8, 32, len(chosen)), dtype=np.float32)
+        for row, (clip, start, length) in enumerate(zip(clips, starts[:, 0], lengths, strict=True)):
+            part = train.motion(int(clip))[start : start + length, chosen]
+            wanted[row, :length] = (part - stats.mean[chosen]) * (1.0 / stats.std[chosen])
+        np.testing.assert_array_equal(batches[k]["motion"].numpy(), wanted)
+
+
 @pytest.mark.parametrize("world", [2, 3, 6])
 def test_any_number_of_ranks_sees_the_same_global_batch(
     train: ShardDataset, stats: FeatureStats, text: TextCache, world: int

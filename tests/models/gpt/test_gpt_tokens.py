@@ -7,14 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from motionloom.models.gpt.tokens import (
-    PAD,
-    as_codes,
-    closing_length,
-    interleave,
-    pad_sequences,
-    stream_names,
-)
+from motionloom.models.gpt.tokens import PAD, as_codes, closing_length, interleave, stream_names
 
 PATTERNS = st.lists(st.sampled_from(["a", "b", "c"]), min_size=1, max_size=5).map(tuple)
 
@@ -86,10 +79,3 @@ def test_mistakes_are_named() -> None:
     codes = {"a": torch.tensor([[0, 1, 2, 3]]), "b": torch.tensor([[0]])}
     with pytest.raises(ValueError, match="'b' holds 1 codes"):
         interleave(codes, ("a", "a", "b"))
-
-
-def test_pad_sequences() -> None:
-    rows = [interleave({"a": torch.arange(n)[None]}, ("a",), ends={"a": 9}) for n in (1, 4, 2)]
-    out = pad_sequences(rows)
-    assert out.tokens.tolist() == [[0, 9, -1, -1, -1], [0, 1, 2, 3, 9], [0, 1, 9, -1, -1]]
-    assert out.length.tolist() == [2, 5, 3]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.models.gpt.losses import group_counts
-from motionloom.models.gpt.tokens import as_codes
+from motionloom.models.gpt.tokens import as_codes, stream_names
 from motionloom.models.tokenizer.base import Tokenizer, TokenizerConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.single import VqConfig
@@ -202,3 +202,48 @@ def test_tokens_of_another_tokenizer_are_refused(tmp_path: Path) -> None:
     store.codes["hand"][3] = 8
     with pytest.raises(UserError, match=r"'hand'.*8 codes.*tokens stage"):
         batches_of(clips, net)
+
+
+def sequence_by_sequence(batches: TokenBatches, k: int) -> dict[str, torch.Tensor]:
+    """The slow obvious way: one row after the other, token by token, padded to the longest."""
+    captions, pattern, names = batches.captions, batches.pattern, stream_names(batches.pattern)
+    turns, items = batches._plan.local(k, batches.rank, batches.world)
+    rows, texts = [], []
+    for turn, item in zip(turns.tolist(), items.tolist(), strict=True):
+        rng = np.random.default_rng([batches.seed, turn, item])
+        own = range(captions.starts[item], captions.starts[item + 1])
+        chosen = own[int(rng.integers(len(own)))]
+        first, count = int(captions.first[chosen]), int(captions.count[chosen])
+        most = min(count, batches.max_groups)
+        first += int(rng.integers(count - most + 1)) if count > most else 0
+        codes, tokens = {n: c.tolist() for n, c in batches.store.clip(item, first, most).items()}, []
+        for _ in range(most):
+            tokens += [(codes[name].pop(0), names.index(name)) for name in pattern]
+        tokens += [(batches.ends[name], names.index(name)) for name in names] if most == count else []
+        rows.append(tokens)
+        texts.append(int(captions.rows[chosen]))
+    size = max(map(len, rows))
+    padded = torch.tensor([row + [(-1, 0)] * (size - len(row)) for row in rows])
+    return {
+        "tokens": padded[..., 0],
+        "kinds": padded[..., 1],
+        "length": torch.tensor([len(row) for row in rows]),
+        "text": batches.prior[texts],
+        "similarity": batches.similarity[texts],
+    }
+
+
+@pytest.mark.parametrize("most", [5, 40])
+@pytest.mark.parametrize("config", [None, VqConfig(width=8, depth=1, code_dim=8, num_codes=8)])
+def test_batches_hold_what_one_sequence_after_the_other_gives(
+    tmp_path: Path, most: int, config: TokenizerConfig | None
+) -> None:
+    texts = [[WALKS, SITS, ALL], [SITS], [WALKS, BLINK], [ALL, WALKS], [WALKS]]
+    clips, _, net = clips_of(dataset_of(tmp_path, Convert(texts)), config=config)
+    for rank in range(2):
+        batches = replace(batches_of(clips, net, most=most), rank=rank, world=2)
+        for k in range(6):
+            wanted, batch = sequence_by_sequence(batches, k), batches[k]
+            assert batch.keys() == wanted.keys()
+            for name, values in wanted.items():
+                assert batch[name].dtype == values.dtype and torch.equal(batch[name], values), (k, name)

@@ -76,7 +76,7 @@ def test_gpt_batches_say_which_tokens_were_recorded(data: Data) -> None:
     net, (dataset, stats) = tokenizer(data), data[0]
     clips = gpt_clips(dataset, encode_split(net, dataset, stats, 256), net, face=False, min_frames=16)
     assert clips.present is not None and len(clips.captions) == len(dataset)
-    own = [clips.texts[captions[0].row] for captions in clips.captions]
+    own = [clips.texts[row] for row in clips.captions.rows[clips.captions.starts[:-1]]]
     number = len(clips.texts)
     batches = TokenBatches(
         clips.store, clips.captions, torch.eye(number), torch.eye(number), net.pattern,
