@@ -217,6 +217,8 @@ class StageKind(ABC, Generic[C]):
     otherwise than what fills it tells that behind a colon: "face_tokenizer?: tokenizer"."""
     offers: frozenset[str] = frozenset()
     """Names of what other stages may ask of it, such as "tokenizer" or `GENERATOR`."""
+    exports: tuple[str, ...] = ()
+    """Roles whose stages an export must take along for this stage to load."""
     version: int = 1
     """Raised when the same config makes something else than before."""
     trains: bool = False
@@ -282,8 +284,8 @@ class StageKind(ABC, Generic[C]):
         raise NotImplementedError(f"stages of kind {self.name} say nothing")
 
     def exported(self, config: C) -> tuple[str, ...]:
-        """Roles whose stages an export must take along for this stage to load."""
-        return ()
+        """`exports`, where the config does not say otherwise."""
+        return self.exports
 
     def exported_config(self, config: C) -> C:
         """The config as an export shows it to everybody."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from os.path import relpath
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
 
 import torch
@@ -76,6 +77,9 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     config: type[C]
     inputs: type[I] = cast(type[I], Inputs)
     """Declares what the stage takes."""
+    trainer: str
+    """The `StageModule` that trains the network, as "package.module:Class"; it is imported where a training
+    begins, since Lightning takes seconds."""
     trains = True
 
     def roles(self) -> tuple[Role | Every, ...]:
@@ -89,9 +93,15 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     def network(self, facts: ModelFacts, inputs: I) -> N:
         """The untrained network; `UserError` where it does not fit the inputs."""
 
-    @abstractmethod
     def module(self, config: C, net: N, inputs: I, seed: int) -> StageModule:
         """The network with its losses and optimizers."""
+        trainer: Callable[..., StageModule] = resolve_name(self.trainer)
+        settings = self.module_settings(config, net, inputs)
+        return trainer(net, config.optim, seed=seed, max_steps=config.train.steps, **settings)
+
+    def module_settings(self, config: C, net: N, inputs: I) -> dict[str, object]:
+        """Return what the trainer takes besides the network, its optimizer, a seed and the steps."""
+        return {}
 
     @abstractmethod
     def batches(self, config: C, net: N, inputs: I, seed: int, log: Log) -> Batches:

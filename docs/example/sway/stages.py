@@ -4,25 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from motionloom import register
-from motionloom.models.tma.network import Tma
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs
-from motionloom.pipeline.inference.generators.whole import WholeMotion
+from motionloom.pipeline.inference.generators.base import WholeMotion
 from motionloom.pipeline.stages.networks.captions import CaptionInputs, CaptionStage, CaptionStageConfig
-from motionloom.pipeline.stages.networks.tma import TmaInputs, TmaStage, TmaStageConfig
+from motionloom.pipeline.stages.networks.tma import TmaStage
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig
 from sway.network import Sway, SwayNetConfig
-
-if TYPE_CHECKING:
-    from sway.losses import SwayModule, TightTmaModule
 
 
 class SwayConfig(CaptionStageConfig):
@@ -55,6 +50,7 @@ class SwayStage(CaptionStage[SwayConfig, CaptionInputs, Sway]):
 
     name = "sway"
     summary = "text to swaying motion"
+    trainer = "sway.losses:SwayModule"
     config = SwayConfig
     inputs = CaptionInputs
     offers = frozenset({GENERATOR})
@@ -72,12 +68,6 @@ class SwayStage(CaptionStage[SwayConfig, CaptionInputs, Sway]):
         config = SwayNetConfig.parse(facts.config, facts.where)
         return Sway(config, facts.fact("text", int), facts.fact("motion", int))
 
-    def module(self, config: SwayConfig, net: Sway, inputs: CaptionInputs, seed: int) -> SwayModule:
-        """The network with its losses; only training pays for importing Lightning."""
-        from sway.losses import SwayModule
-
-        return SwayModule(net, config.optim, seed=seed, max_steps=config.train.steps)
-
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         """From a run and from an export alike."""
         return SwayMotion(given["stats"].layout, stage.config.part, given, self.load(stage, given, device))
@@ -88,12 +78,7 @@ class TightTmaStage(TmaStage):
 
     name = "tight_tma"
     summary = "text-motion alignment of short texts"
-
-    def module(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs, seed: int) -> TightTmaModule:
-        """TMA's network and settings with our losses."""
-        from sway.losses import TightTmaModule
-
-        return TightTmaModule(net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss)
+    trainer = "sway.losses:TightTmaModule"
 
 
 register(SwayStage())

@@ -16,7 +16,7 @@ from motionloom.datasets.motion.layout import Part
 from motionloom.pipeline.baselines.bailando.codes import DanceVq
 from motionloom.pipeline.baselines.bailando.network import CrossGpt
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
-from motionloom.pipeline.stages.networks.clips import DanceGenerator, music_of
+from motionloom.pipeline.inference.generators.base import DanceGenerator
 from motionloom.pipeline.store.networks import device_of
 
 
@@ -52,7 +52,7 @@ class BailandoGenerator(DanceGenerator):
         else:
             seeds = np.stack([joints_of_dance(motion, self.layout) for motion in request.seed_motions])
             first = self.vq.encode(torch.from_numpy(seeds).to(device, torch.float32))
-        music = gpt.heard(music_of(request, self.given), self.unit_frames, count)
+        music = gpt.heard(self.music(request), self.unit_frames, count)
         codes = gpt.dance(first, music.to(device))
         out = []
         for row, frames in zip(codes, lengths, strict=True):

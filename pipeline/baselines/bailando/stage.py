@@ -5,7 +5,7 @@ dance_vq -> cross_gpt -> actor_critic
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import torch
 from pydantic import Field
@@ -32,7 +32,7 @@ from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
-    from motionloom.pipeline.baselines.bailando.module import ActorCriticModule, CrossGptModule, DanceVqModule
+    from motionloom.models.training.stage_module import StageModule
 
 _ADAM = OptimConfig(optimizer="adam", lr=3e-5, betas=(0.5, 0.999), grad_clip=0.0)
 
@@ -67,6 +67,7 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
 
     name = "dance_vq"
     summary = "Bailando: codes of upper and lower body"
+    trainer = "motionloom.pipeline.baselines.bailando.module:DanceVqModule"
     config = DanceVqStageConfig
     inputs = DanceVqInputs
     curves = tuple(Curve(name) for name in ("codes_recon_up", "codes_recon_down", "root_loss"))
@@ -93,15 +94,10 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
         """Bailando's, with the decoder of the root."""
         return release_of_codes(net)
 
-    def module(
-        self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, seed: int
-    ) -> DanceVqModule:
-        from motionloom.pipeline.baselines.bailando.module import DanceVqModule
-
-        return DanceVqModule(
-            net, config.optim, seed=seed, max_steps=config.train.steps,
-            root_optim=config.root_optim, root_start=config.root_start,
-        )  # fmt: skip
+    def module_settings(
+        self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs
+    ) -> dict[str, object]:
+        return {"root_optim": config.root_optim, "root_start": config.root_start}
 
     def batches(
         self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, seed: int, log: Log
@@ -142,6 +138,10 @@ class DanceGptStage(TrainedStage[C, I, G]):
     """A stage of a network that has the GPT; subclasses build it and its module."""
 
     offers = frozenset({GENERATOR})
+    exports = ("dance_vq", "audio")
+
+    def module_settings(self, config: C, net: G, inputs: I) -> dict[str, object]:
+        return {"vq": inputs.dance_vq}
 
     def release(self, net: G) -> Release:
         """Bailando's; the critic is read where there is one."""
@@ -160,15 +160,13 @@ class DanceGptStage(TrainedStage[C, I, G]):
         layout, gpt = load_facts(stage.folder).layout.layout(), gpt_in(self.load(stage, given, device))
         return BailandoGenerator(layout, given, gpt, given["dance_vq"], note)
 
-    def exported(self, config: C) -> tuple[str, ...]:
-        return ("dance_vq", "audio")
-
 
 class CrossGptStage(DanceGptStage[CrossGptStageConfig, CrossGptInputs, CrossGpt]):
     """Music to codes of both halves of the body."""
 
     name = "cross_gpt"
     summary = "Bailando: music to codes"
+    trainer = "motionloom.pipeline.baselines.bailando.module:CrossGptModule"
     config = CrossGptStageConfig
     inputs = CrossGptInputs
     curves = tuple(Curve(name) for name in ("loss", "accuracy_up", "accuracy_down"))
@@ -189,14 +187,6 @@ class CrossGptStage(DanceGptStage[CrossGptStageConfig, CrossGptInputs, CrossGpt]
         for row, clip in enumerate(clips):
             crops.fill(starts[row].numpy(), dataset.motion(clip), 0, frames, 0)
         net.kept.copy_(inputs.dance_vq.encode(places(starts))[:, 0])
-
-    def module(
-        self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, seed: int
-    ) -> CrossGptModule:
-        from motionloom.pipeline.baselines.bailando.module import CrossGptModule
-
-        steps = config.train.steps
-        return CrossGptModule(net, config.optim, seed=seed, max_steps=steps, vq=inputs.dance_vq)
 
     def batches(
         self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, seed: int, log: Log
@@ -229,6 +219,7 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
 
     name = "actor_critic"
     summary = "Bailando: rewards for the beat"
+    trainer = "motionloom.pipeline.baselines.bailando.module:ActorCriticModule"
     config = ActorCriticStageConfig
     inputs = ActorCriticInputs
     curves = (Curve("actor_reward"), Curve("critic_loss"))
@@ -250,24 +241,18 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
         """The actor starts as the trained GPT."""
         net.gpt.load_state_dict(inputs.cross_gpt.state_dict())
 
-    def module(
-        self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, seed: int
-    ) -> ActorCriticModule:
-        from motionloom.pipeline.baselines.bailando.module import ActorCriticModule
-
-        return ActorCriticModule(net, config.optim, seed=seed, **self._how(config, inputs))
+    def module_settings(
+        self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs
+    ) -> dict[str, object]:
+        return {"vq": inputs.dance_vq, "fps": inputs.data.layout.fps, "reward": config.reward}
 
     def dry_module(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs
-    ) -> ActorCriticModule:
+    ) -> StageModule:
         from motionloom.pipeline.baselines.bailando.module import Unrewarded
 
-        return Unrewarded(net, config.optim, seed=0, **self._how(config, inputs))
-
-    @staticmethod
-    def _how(config: ActorCriticStageConfig, inputs: ActorCriticInputs) -> dict[str, Any]:
-        known = {"vq": inputs.dance_vq, "fps": inputs.data.layout.fps}
-        return {**known, "max_steps": config.train.steps, "reward": config.reward}
+        settings = self.module_settings(config, net, inputs)
+        return Unrewarded(net, config.optim, seed=0, max_steps=config.train.steps, **settings)
 
     def batches(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, seed: int, log: Log

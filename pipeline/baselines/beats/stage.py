@@ -10,7 +10,6 @@ The weights in the package are those of the recipe `beats`:
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from pydantic import Field
@@ -23,9 +22,6 @@ from motionloom.pipeline.contract.stage import Inputs, register
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts, load_facts, load_weights
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
-
-if TYPE_CHECKING:
-    from motionloom.pipeline.baselines.beats.training import BeatsModule
 
 _NO_MOTION = LayoutFacts(name="none", fps=ROWS, family="none")
 
@@ -56,6 +52,7 @@ class BeatsStage(TrainedStage[BeatsConfig, BeatsInputs, BeatNet]):
 
     name = "beats"
     summary = "beats and downbeats of music"
+    trainer = "motionloom.pipeline.baselines.beats.training:BeatsModule"
     config = BeatsConfig
     inputs = BeatsInputs
     curves = (Curve("beat", "cross-entropy of beats"), Curve("downbeat", "cross-entropy of downbeats"))
@@ -65,11 +62,6 @@ class BeatsStage(TrainedStage[BeatsConfig, BeatsInputs, BeatNet]):
 
     def network(self, facts: ModelFacts, inputs: BeatsInputs) -> BeatNet:
         return BeatNet(BeatNetConfig.parse(facts.config, facts.where))
-
-    def module(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int) -> BeatsModule:
-        from motionloom.pipeline.baselines.beats.training import BeatsModule
-
-        return BeatsModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
     def batches(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, seed: int, log: Log) -> Batches:
         from motionloom.pipeline.baselines.beats.training import SongBatches

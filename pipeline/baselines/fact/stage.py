@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,23 +18,14 @@ from motionloom.pipeline.baselines.fact.network import Fact, FactConfig
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
+from motionloom.pipeline.inference.generators.base import DanceGenerator
 from motionloom.pipeline.stages.networks.captions import part_columns, part_of
-from motionloom.pipeline.stages.networks.clips import (
-    MUSIC,
-    DanceGenerator,
-    clip_batches,
-    motion_example,
-    music_of,
-    spread_dances,
-)
+from motionloom.pipeline.stages.networks.clips import MUSIC, clip_batches, motion_example, spread_dances
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
-
-if TYPE_CHECKING:
-    from motionloom.pipeline.baselines.fact.module import FactModule
 
 
 @dataclass(frozen=True)
@@ -60,9 +50,7 @@ class FactGenerator(DanceGenerator):
             begun = self.net.kept[[seed % len(self.net.kept) for seed in request.seeds]]
         else:
             begun = torch.from_numpy((np.stack(list(request.seed_motions)) - mean) / std)
-        made = self.net.go_on(
-            begun.to(device_of(self.net), torch.float32), music_of(request, self.given), max(lengths)
-        )
+        made = self.net.go_on(begun.to(device_of(self.net), torch.float32), self.music(request), max(lengths))
         own = np.asarray(made.cpu().numpy() * std + mean, np.float32)
         return [motion[:count] for motion, count in zip(own, lengths, strict=True)]
 
@@ -94,10 +82,12 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
 
     name = "fact"
     summary = "FACT: music and a start to a dance"
+    trainer = "motionloom.pipeline.baselines.fact.module:FactModule"
     config = FactStageConfig
     offers = frozenset({GENERATOR})
     inputs = FactInputs
     curves = (Curve("loss"),)
+    exports = ("stats", "audio")
 
     def facts(self, config: FactStageConfig, inputs: FactInputs) -> ModelFacts:
         layout = inputs.data.layout
@@ -119,11 +109,6 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
             start = stats.normalize(dataset.motion(clip)[:frames])[:, columns]
             net.kept[row] = torch.from_numpy(start)
 
-    def module(self, config: FactStageConfig, net: Fact, inputs: FactInputs, seed: int) -> FactModule:
-        from motionloom.pipeline.baselines.fact.module import FactModule
-
-        return FactModule(net, config.optim, seed=seed, max_steps=config.train.steps)
-
     def batches(self, config: FactStageConfig, net: Fact, inputs: FactInputs, seed: int, log: Log) -> Batches:
         columns = inputs.data.layout.part(config.part)
         frames = {"max_frames": config.net.window_frames, "min_frames": config.net.clip_frames}
@@ -140,9 +125,6 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return FactGenerator(given["stats"].layout, given, self.load(stage, given, device), stage.config.part)
-
-    def exported(self, config: FactStageConfig) -> tuple[str, ...]:
-        return ("stats", "audio")
 
 
 register(FactStage())

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from motionloom.models.layers.transformer import name_in_torch
 from motionloom.pipeline.baselines.mdm.network import Mdm
 from motionloom.pipeline.contract.stage import register
-from motionloom.pipeline.stages.networks.captions import CaptionInputs, DenoiserStage, DenoiserStageConfig
+from motionloom.pipeline.stages.networks.captions import DenoiserStage, DenoiserStageConfig
 from motionloom.pipeline.store.weights import Release
-
-if TYPE_CHECKING:
-    from motionloom.models.diffusion.module import TextDenoiserModule
 
 
 class MdmStage(DenoiserStage[DenoiserStageConfig, Mdm]):
@@ -19,19 +14,13 @@ class MdmStage(DenoiserStage[DenoiserStageConfig, Mdm]):
 
     name = "mdm"
     summary = "MDM: motion diffusion"
+    trainer = "motionloom.models.diffusion.module:TextDenoiserModule"
     config = DenoiserStageConfig
     denoiser = Mdm
 
     def release(self, net: Mdm) -> Release:
         """Return MDM's published names; text encoder and positions are not read."""
         return Release(published_names(net), unread=("*.pe", "clip_model.*"))
-
-    def module(
-        self, config: DenoiserStageConfig, net: Mdm, inputs: CaptionInputs, seed: int
-    ) -> TextDenoiserModule:
-        from motionloom.models.diffusion.module import TextDenoiserModule
-
-        return TextDenoiserModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
 
 _AROUND = {

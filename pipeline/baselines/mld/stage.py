@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from pydantic import model_validator
@@ -24,18 +24,17 @@ from motionloom.pipeline.baselines.mld.network import (
     MotionVaeConfig,
     MotionVaeLossConfig,
 )
-from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest, MotionGenerator
-from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, Stage, register
-from motionloom.pipeline.inference.generators.whole import WholeMotion
+from motionloom.pipeline.inference.generators.diffusion import DenoisedMotion
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     CaptionStage,
     CaptionStageConfig,
     clips_of,
+    joint_loss_settings,
     part_columns,
-    part_statistics,
 )
 from motionloom.pipeline.stages.networks.clips import clip_batches, motion_example
 from motionloom.pipeline.store.data import Data
@@ -43,10 +42,6 @@ from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.weights import ModelFacts, Release
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
-
-if TYPE_CHECKING:
-    from motionloom.pipeline.baselines.mld.module import LatentDiffusionModule, MotionVaeModule
-
 
 _OPTIM = OptimConfig(weight_decay=0.01, betas=(0.9, 0.999))
 """AdamW as published, at 1e-4."""
@@ -67,7 +62,7 @@ def sample_latents(
 
 
 @dataclass(frozen=True)
-class LatentMotion(WholeMotion):
+class LatentMotion(DenoisedMotion):
     """A latent is denoised under a sentence embedding and decoded to all frames at once."""
 
     net: LatentDenoiser
@@ -75,20 +70,12 @@ class LatentMotion(WholeMotion):
     who = "this latent diffusion model"
     method = "mld"
     settings = frozenset({"cfg_scale", "sampler", "denoising_steps"})
+    usual = "ddim"
 
     @property
     def max_frames(self) -> int | None:
         """Return the longest motion of the decoder's training."""
         return self.vae.max_frames
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return Capabilities(denoising=self.denoising)
-
-    def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
-        """As asked for, or else DDIM in 50 steps, as published, or the training's where those are fewer."""
-        steps = sampling.denoising_steps or min(50, self.net.config.schedule.steps)
-        return sampling.sampler or "ddim", steps
 
     def normalised(self, request: GenerationRequest, frames: Sequence[int]) -> list[Tensor]:
         sampler, steps = self.denoising(request.sampling)
@@ -134,9 +121,11 @@ class MotionVaeStage(TrainedStage[MotionVaeStageConfig, MotionVaeInputs, MotionV
 
     name = "motion_vae"
     summary = "auto-encoder of motion (MLD)"
+    trainer = "motionloom.pipeline.baselines.mld.module:MotionVaeModule"
     config = MotionVaeStageConfig
     inputs = MotionVaeInputs
     curves = tuple(Curve(name) for name in ("features", "joints", "kl"))
+    exports = ("stats",)
 
     def facts(self, config: MotionVaeStageConfig, inputs: MotionVaeInputs) -> ModelFacts:
         layout = inputs.data.layout
@@ -150,17 +139,10 @@ class MotionVaeStage(TrainedStage[MotionVaeStageConfig, MotionVaeInputs, MotionV
         """`vae.safetensors` of MLD's release."""
         return Release(mld_names(net))
 
-    def module(
-        self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs, seed: int
-    ) -> MotionVaeModule:
-        from motionloom.pipeline.baselines.mld.module import MotionVaeModule
-
-        layout = inputs.data.layout
-        mean, std = part_statistics(layout, config.part, inputs.stats)
-        return MotionVaeModule(
-            net, config.optim, seed=seed, max_steps=config.train.steps, layout=layout,
-            mean=mean, std=std, loss=config.loss,
-        )  # fmt: skip
+    def module_settings(
+        self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs
+    ) -> dict[str, object]:
+        return joint_loss_settings(inputs.data.layout, config.part, inputs.stats, config.loss)
 
     def batches(
         self, config: MotionVaeStageConfig, net: MotionVae, inputs: MotionVaeInputs, seed: int, log: Log
@@ -176,9 +158,6 @@ class MotionVaeStage(TrainedStage[MotionVaeStageConfig, MotionVaeInputs, MotionV
 
     def loaded(self, net: MotionVae, facts: ModelFacts, inputs: MotionVaeInputs) -> LoadedMotionVae:
         return LoadedMotionVae(net, facts.layout.layout(), facts.fact("max_frames", int))
-
-    def exported(self, config: MotionVaeStageConfig) -> tuple[str, ...]:
-        return ("stats",)
 
 
 class LatentDiffusionStageConfig(CaptionStageConfig):
@@ -201,10 +180,12 @@ class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffus
 
     name = "latent_diffusion"
     summary = "diffusion of a motion's latents (MLD)"
+    trainer = "motionloom.pipeline.baselines.mld.module:LatentDiffusionModule"
     config = LatentDiffusionStageConfig
     offers = frozenset({GENERATOR})
     inputs = LatentDiffusionInputs
     curves = (Curve("loss"),)
+    exports = ("stats", "text", "motion_vae")
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """It is as wide as the latents, and reads no longer motion than the auto-encoder was trained on."""
@@ -249,20 +230,10 @@ class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffus
         """
         return Release(mld_names(net), unread=("mem_pos.pe",))
 
-    def module(
-        self,
-        config: LatentDiffusionStageConfig,
-        net: LatentDenoiser,
-        inputs: LatentDiffusionInputs,
-        seed: int,
-    ) -> LatentDiffusionModule:
-        from motionloom.pipeline.baselines.mld.module import LatentDiffusionModule
-
-        steps, vae = config.train.steps, inputs.motion_vae.net
-        return LatentDiffusionModule(net, config.optim, seed=seed, max_steps=steps, vae=vae)
-
-    def exported(self, config: LatentDiffusionStageConfig) -> tuple[str, ...]:
-        return ("stats", "text", "motion_vae")
+    def module_settings(
+        self, config: LatentDiffusionStageConfig, net: LatentDenoiser, inputs: LatentDiffusionInputs
+    ) -> dict[str, object]:
+        return {"vae": inputs.motion_vae.net}
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         vae: LoadedMotionVae = given["motion_vae"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -21,20 +21,17 @@ from motionloom.pipeline.baselines.motionclip.network import (
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, register
-from motionloom.pipeline.inference.generators.whole import WholeMotion
+from motionloom.pipeline.inference.generators.base import WholeMotion
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     CaptionStage,
     CaptionStageConfig,
+    joint_loss_settings,
     part_columns,
-    part_statistics,
 )
 from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.weights import ModelFacts, load_facts
 from motionloom.pipeline.training.config import TrainConfig
-
-if TYPE_CHECKING:
-    from motionloom.pipeline.baselines.motionclip.module import MotionClipModule
 
 
 @dataclass(frozen=True)
@@ -75,6 +72,7 @@ class MotionClipStage(CaptionStage[MotionClipStageConfig, CaptionInputs, MotionC
 
     name = "motionclip"
     summary = "auto-encoder in the space of texts (MotionCLIP)"
+    trainer = "motionloom.pipeline.baselines.motionclip.module:MotionClipModule"
     config = MotionClipStageConfig
     offers = frozenset({GENERATOR})
     inputs = CaptionInputs
@@ -101,17 +99,10 @@ class MotionClipStage(CaptionStage[MotionClipStageConfig, CaptionInputs, MotionC
         if net.sixd is not None:
             net.sixd.learn(inputs.stats.mean, inputs.stats.std)
 
-    def module(
-        self, config: MotionClipStageConfig, net: MotionClip, inputs: CaptionInputs, seed: int
-    ) -> MotionClipModule:
-        from motionloom.pipeline.baselines.motionclip.module import MotionClipModule
-
-        layout = inputs.data.layout
-        mean, std = part_statistics(layout, config.part, inputs.stats)
-        return MotionClipModule(
-            net, config.optim, seed=seed, max_steps=config.train.steps, layout=layout,
-            mean=mean, std=std, loss=config.loss,
-        )  # fmt: skip
+    def module_settings(
+        self, config: MotionClipStageConfig, net: MotionClip, inputs: CaptionInputs
+    ) -> dict[str, object]:
+        return joint_loss_settings(inputs.data.layout, config.part, inputs.stats, config.loss)
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         facts, layout = load_facts(stage.folder), given["stats"].layout

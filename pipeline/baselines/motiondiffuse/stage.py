@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from motionloom.datasets.conditions import Condition
-from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig, by_length
+from motionloom.models.diffusion.schedule import Sampler, by_length
 from motionloom.models.layers.frozen import evaluating
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.motiondiffuse.network import MotionDiffuse, MotionDiffuseConfig
@@ -27,9 +26,6 @@ from motionloom.pipeline.stages.networks.captions import (
 )
 from motionloom.pipeline.store.weights import ModelFacts, load_facts
 from motionloom.pipeline.training.config import TrainConfig
-
-if TYPE_CHECKING:
-    from motionloom.models.diffusion.module import DenoiserModule
 
 
 @torch.no_grad()
@@ -65,10 +61,6 @@ class MotionDiffuseMotion(DenoisedMotion):
     net: MotionDiffuse
 
     @property
-    def schedule(self) -> ScheduleConfig:
-        return self.net.config.schedule
-
-    @property
     def max_frames(self) -> int:
         return self.net.max_frames
 
@@ -92,6 +84,7 @@ class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, M
 
     name = "motiondiffuse"
     summary = "MotionDiffuse"
+    trainer = "motionloom.models.diffusion.module:DenoiserModule"
     config = MotionDiffuseStageConfig
     offers = frozenset({GENERATOR})
     inputs = CaptionInputs
@@ -108,13 +101,6 @@ class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, M
         return MotionDiffuse(
             config, *(facts.fact(key, int) for key in ("motion_dim", "text_dim", "max_frames"))
         )
-
-    def module(
-        self, config: MotionDiffuseStageConfig, net: MotionDiffuse, inputs: CaptionInputs, seed: int
-    ) -> DenoiserModule:
-        from motionloom.models.diffusion.module import DenoiserModule
-
-        return DenoiserModule(net, config.optim, seed=seed, max_steps=config.train.steps)
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))

@@ -19,8 +19,8 @@ from motionloom.models.gpt.tokens import interleave
 from motionloom.pipeline.baselines.tm2t.network import END, START, Captioner, Reading, Vocabulary
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, draw_tokens
 from motionloom.pipeline.contract.captioning import Sentence
-from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
-from motionloom.pipeline.inference.generators.of_tokens import OfTokens
+from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.inference.generators.base import OfTokens
 from motionloom.pipeline.store.networks import TrainedTokenizer, device_of
 from motionloom.pipeline.store.tokens import PresentTokens, present_table
 from motionloom.pipeline.store.weights import Rows, Source
@@ -166,18 +166,7 @@ class Seq2SeqGenerator(OfTokens):
     net: Seq2Seq
     given: Mapping[str, Any]
     method = "seq2seq"
-    modalities = frozenset({"text"})
     settings = frozenset({"temperature", "top_k", "top_p"})
-    capabilities = Capabilities()
-
-    @property
-    def tokenizer(self) -> TrainedTokenizer:
-        tokenizer: TrainedTokenizer = self.given["tokenizer"]
-        return tokenizer
-
-    @property
-    def prepared(self) -> Mapping[str, object]:
-        return {"text": self.given.get("text")}
 
     @property
     def max_frames(self) -> int:
@@ -186,19 +175,15 @@ class Seq2SeqGenerator(OfTokens):
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """Lengths that are no whole groups are made of one group more, and cut."""
         text, device, sampling = request.text("this model"), device_of(self.net), request.sampling
-        frames, unit = request.frames, self.unit_frames
         codes = draw_tokens(
             self.net,
             text.features.to(device),
             text.mask.to(device),
-            None if frames is None else torch.tensor([-(-count // unit) for count in frames]),
+            self.whole_groups(request.frames),
             request.seeds,
             Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
         )
-        motions = self.tokenizer.decode(codes.codes, codes.groups.tolist())
-        if frames is None:
-            return motions
-        return [motion[:count] for motion, count in zip(motions, frames, strict=True)]
+        return self.decoded(codes, request.frames)
 
 
 _LAYER = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from pydantic import Field
@@ -44,9 +43,6 @@ from motionloom.pipeline.store.weights import ModelFacts, Release
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
-if TYPE_CHECKING:
-    from motionloom.pipeline.baselines.tm2t.module import CaptionerModule, Seq2SeqModule
-
 
 class CaptionerStageConfig(TrainedStageConfig):
     """Motion tokens to words."""
@@ -78,10 +74,12 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
 
     name = "captioner"
     summary = "motion tokens to words"
+    trainer = "motionloom.pipeline.baselines.tm2t.module:CaptionerModule"
     config = CaptionerStageConfig
     offers = frozenset({CAPTIONER})
     inputs = CaptionerInputs
     curves = (Curve("ce"), Curve("accuracy"))
+    exports = ("tokenizer",)
 
     def facts(self, config: CaptionerStageConfig, inputs: CaptionerInputs) -> ModelFacts:
         published = config.published
@@ -101,12 +99,10 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
             return None
         return Release(captioner_names(net), unread=("trg_word_prj.weight", "*.positional_encoding"))
 
-    def module(
-        self, config: CaptionerStageConfig, net: Captioner, inputs: CaptionerInputs, seed: int
-    ) -> CaptionerModule:
-        from motionloom.pipeline.baselines.tm2t.module import CaptionerModule
-
-        return CaptionerModule(net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss)
+    def module_settings(
+        self, config: CaptionerStageConfig, net: Captioner, inputs: CaptionerInputs
+    ) -> dict[str, object]:
+        return {"loss": config.loss}
 
     def batches(
         self, config: CaptionerStageConfig, net: Captioner, inputs: CaptionerInputs, seed: int, log: Log
@@ -135,9 +131,6 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
 
     def loaded(self, net: Captioner, facts: ModelFacts, inputs: CaptionerInputs) -> TokenCaptioner:
         return TokenCaptioner(net, inputs.tokenizer, _words(facts))
-
-    def exported(self, config: CaptionerStageConfig) -> tuple[str, ...]:
-        return ("tokenizer",)
 
 
 class Seq2SeqStageConfig(TrainedStageConfig):
@@ -195,10 +188,12 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
 
     name = "seq2seq"
     summary = "words to motion tokens by a GRU"
+    trainer = "motionloom.pipeline.baselines.tm2t.module:Seq2SeqModule"
     config = Seq2SeqStageConfig
     offers = frozenset({GENERATOR})
     inputs = Seq2SeqInputs
     curves = (Curve("ce"), Curve("accuracy"), Curve("inverse"))
+    exports = ("tokenizer", "text")
 
     def facts(self, config: Seq2SeqStageConfig, inputs: Seq2SeqInputs) -> ModelFacts:
         extra = {"text_dim": inputs.text.dim, **stream_facts(inputs.tokenizer.net)}
@@ -210,17 +205,11 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
         config = Seq2SeqConfig.parse(facts.config, facts.where)
         return Seq2Seq(config, tokenizer.streams, tokenizer.pattern, facts.fact("text_dim", int))
 
-    def module(
-        self, config: Seq2SeqStageConfig, net: Seq2Seq, inputs: Seq2SeqInputs, seed: int
-    ) -> Seq2SeqModule:
-        """Cross-entropy, and what the frozen captioner makes of the tokens that it draws."""
-        from motionloom.pipeline.baselines.tm2t.module import Seq2SeqModule
-
+    def module_settings(
+        self, config: Seq2SeqStageConfig, net: Seq2Seq, inputs: Seq2SeqInputs
+    ) -> dict[str, object]:
         judge = _captioner(config, net, inputs)
-        return Seq2SeqModule(
-            net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss,
-            captioner=None if judge is None else judge.net,
-        )  # fmt: skip
+        return {"loss": config.loss, "captioner": None if judge is None else judge.net}
 
     def batches(
         self, config: Seq2SeqStageConfig, net: Seq2Seq, inputs: Seq2SeqInputs, seed: int, log: Log
@@ -250,9 +239,6 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return Seq2SeqGenerator(self.load(stage, given, device), given)
-
-    def exported(self, config: Seq2SeqStageConfig) -> tuple[str, ...]:
-        return ("tokenizer", "text")
 
 
 def _clips(

@@ -8,7 +8,7 @@ follows it. The discriminator that it is trained against is in `module.py`. Padd
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -32,9 +32,6 @@ from motionloom.pipeline.stages.networks.tokenizer import (
 )
 from motionloom.pipeline.store.weights import Release
 from motionloom.pipeline.training.config import TrainConfig
-
-if TYPE_CHECKING:
-    from motionloom.models.training.stage_module import StageModule
 
 
 class Tm2tConfig(MqConfig):
@@ -169,6 +166,7 @@ class Tm2tStageConfig(TokenizerStageConfig):
 class Tm2tStage(TokenizerStage):
     """A tokenizer and its critic, which take turns."""
 
+    trainer = "motionloom.pipeline.baselines.tm2t.module:AdversarialTokenizerModule"
     curves = tuple(
         Curve(name)
         for name in ("tokenizer_recon", "tokenizer_adversarial", "tokenizer_perplexity", "critic_accuracy")
@@ -179,11 +177,8 @@ class Tm2tStage(TokenizerStage):
         assert isinstance(net, Tm2tQuantizer)
         return Release(tm2t_names(net))
 
-    def module(
-        self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, seed: int
-    ) -> StageModule:
-        from motionloom.pipeline.baselines.tm2t.module import AdversarialTokenizerModule
-
-        assert isinstance(config, Tm2tStageConfig) and isinstance(net, Tm2tQuantizer)
-        steps = config.train.steps
-        return AdversarialTokenizerModule(net, config.optim, seed=seed, max_steps=steps, critic=config.critic)
+    def module_settings(
+        self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs
+    ) -> dict[str, object]:
+        assert isinstance(config, Tm2tStageConfig)
+        return {"critic": config.critic}

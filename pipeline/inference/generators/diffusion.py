@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -18,33 +18,33 @@ from motionloom.models.diffusion.editing import CaptionSpan, Filling, KnownMotio
 from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.observed import Places, Recovery, known_columns
 from motionloom.models.diffusion.sampling import sample_motions
-from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
+from motionloom.models.diffusion.schedule import Sampler
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.edits.frames import EditFrames
-from motionloom.pipeline.inference.generators.whole import WholeMotion
+from motionloom.pipeline.inference.generators.base import WholeMotion
 from motionloom.pipeline.store.networks import device_of
 
 
 class DenoisedMotion(WholeMotion):
     """Any model that denoises a whole motion."""
 
+    net: Any
+    """Its `config` has the noise `schedule` of the training."""
+    usual: ClassVar[Sampler] = "ddpm"
+    """Sampler where nobody asks for one, in 50 steps or the training's where those are fewer."""
     who = "this diffusion model"
     method = "diffusion"
     settings = frozenset({"sampler", "denoising_steps"})
-
-    @property
-    @abstractmethod
-    def schedule(self) -> ScheduleConfig:
-        """The noise schedule of the training."""
 
     @property
     def capabilities(self) -> Capabilities:
         return Capabilities(denoising=self.denoising)
 
     def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
-        """As asked for, or else DDPM in 50 steps, or the training's where those are fewer."""
-        return sampling.sampler or "ddpm", sampling.denoising_steps or min(50, self.schedule.steps)
+        """As asked for, or else as `usual`."""
+        steps = sampling.denoising_steps or min(50, self.net.config.schedule.steps)
+        return sampling.sampler or self.usual, steps
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,6 @@ class DiffusionMotion(DenoisedMotion):
     net: TextDenoiser
     window: int = 196
     """Frames that are edited at once: the longest motion of its training."""
-
-    @property
-    def schedule(self) -> ScheduleConfig:
-        return self.net.config.schedule
 
     @property
     def settings(self) -> frozenset[str]:  # type: ignore[override]

@@ -25,15 +25,8 @@ from motionloom.pipeline.contract.generation import (
     TokenFlow,
 )
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
-from motionloom.pipeline.inference.generators.of_tokens import OfTokens
-from motionloom.pipeline.store.networks import (
-    LoadedGpt,
-    LoadedTma,
-    MotionJudge,
-    TrainedTokenizer,
-    device_of,
-    embed_motions,
-)
+from motionloom.pipeline.inference.generators.base import OfTokens
+from motionloom.pipeline.store.networks import LoadedGpt, LoadedTma, MotionJudge, device_of, embed_motions
 
 T = TypeVar("T")
 
@@ -49,16 +42,6 @@ class GptGenerator(OfTokens):
     given: Mapping[str, Any]
     face: bool
     method = "gpt"
-    modalities = frozenset({"text"})
-
-    @property
-    def tokenizer(self) -> TrainedTokenizer:
-        tokenizer: TrainedTokenizer = self.given["tokenizer"]
-        return tokenizer
-
-    @property
-    def prepared(self) -> Mapping[str, object]:
-        return {"text": self.given.get("text")}
 
     @property
     def settings(self) -> frozenset[str]:
@@ -112,20 +95,15 @@ class GptGenerator(OfTokens):
         self, prior: Tensor, frames: Sequence[int] | None, seeds: Sequence[int], sampling: SamplingConfig
     ) -> list[NDArray[np.float32]]:
         """One motion for each row of the prior [B, E]."""
-        unit = self.unit_frames
-        groups = None if frames is None else torch.tensor([-(-n // unit) for n in frames])
         codes = generate(
             self.gpt.net,
             prior,
-            groups=groups,
+            groups=self.whole_groups(frames),
             how=Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
             cfg_scale=sampling.guidance_of(self.part),
             seed=list(seeds),
         )
-        motions = self.tokenizer.decode(codes.codes, codes.groups.tolist())
-        if frames is None:
-            return motions
-        return [motion[:count] for motion, count in zip(motions, frames, strict=True)]
+        return self.decoded(codes, frames)
 
     def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
         """Tokens as they come; a full block, or another text, goes on from the last frames."""

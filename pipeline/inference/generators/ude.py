@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,9 +30,9 @@ from motionloom.pipeline.contract.generation import (
 )
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import StageConfig
-from motionloom.pipeline.inference.generators.of_tokens import OfTokens
+from motionloom.pipeline.inference.generators.base import OfTokens
 from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
-from motionloom.pipeline.store.networks import LoadedDmd, LoadedUtt, TrainedTokenizer
+from motionloom.pipeline.store.networks import LoadedDmd, LoadedUtt
 
 
 class UdeConfig(StageConfig):
@@ -59,16 +60,10 @@ class UdeGenerator(OfTokens):
     dmd: LoadedDmd | None
     config: UdeConfig
     method = "ude"
-    max_frames = None
 
     @property
-    def tokenizer(self) -> TrainedTokenizer:
-        tokenizer: TrainedTokenizer = self.utt.given["tokenizer"]
-        return tokenizer
-
-    @property
-    def prepared(self) -> Mapping[str, object]:
-        return {name: self.utt.given.get(name) for name in self.modalities}
+    def given(self) -> Mapping[str, Any]:  # type: ignore[override]
+        return self.utt.given
 
     @property
     def modalities(self) -> frozenset[str]:
@@ -168,7 +163,7 @@ class UdeGenerator(OfTokens):
     ) -> list[NDArray[np.float32]]:
         """Features in their own units, [T, C] a row; `hidden` as `decode_motions` takes it."""
         if self.dmd is None:
-            return self.tokenizer.decode(codes.codes, codes.groups.tolist())
+            return self.decoded(codes, None)
         sampler, steps = self.denoising(sampling)
         made = decode_motions(
             self.dmd.net,

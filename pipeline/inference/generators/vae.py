@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.pipeline.contract.generation import GenerationRequest
-from motionloom.pipeline.inference.generators.whole import WholeMotion
+from motionloom.pipeline.inference.generators.base import WholeMotion
 from motionloom.pipeline.store.networks import LoadedTma
 
 

@@ -14,7 +14,7 @@ from motionloom.datasets.loading.condition_batches import Captioned
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import Config, UserError
 from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
@@ -55,6 +55,8 @@ N = TypeVar("N", bound=nn.Module)
 class CaptionStage(TrainedStage[C, I, N]):
     """A stage that trains on one part of whole clips and what is said of it."""
 
+    exports: tuple[str, ...] = ("stats", "text")
+
     def batches(self, config: C, net: N, inputs: I, seed: int, log: Log) -> Batches:
         captioned: Captioned = "face" if config.part == "face" else "body"
         clips = clips_of(config, inputs.data.layout, captioned)
@@ -66,9 +68,6 @@ class CaptionStage(TrainedStage[C, I, N]):
         conditions = {"text": MODALITIES["text"].example(batch, frames, width)}
         similarity = torch.empty(batch, width)
         return Example(motion_example(batch, frames, dim, conditions=conditions, similarity=similarity))
-
-    def exported(self, config: C) -> tuple[str, ...]:
-        return ("stats", "text")
 
 
 class DenoiserStageConfig(CaptionStageConfig):
@@ -123,14 +122,12 @@ def part_columns(layout: MotionLayout, part: Part) -> NDArray[np.int64]:
     return layout.part(part)
 
 
-def part_statistics(
-    layout: MotionLayout, part: Part, stats: FeatureStats | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Mean and deviation of one part's columns; 0 and 1 in a dry run, which has no statistics."""
-    columns = part_columns(layout, part)
-    if stats is None:
-        return np.zeros(len(columns), np.float32), np.ones(len(columns), np.float32)
-    return stats.mean[columns], stats.std[columns]
+def joint_loss_settings(
+    layout: MotionLayout, part: Part, stats: FeatureStats | None, loss: Config
+) -> dict[str, object]:
+    """Return what a `JointsModule` takes of one part's columns; a dry run has no statistics."""
+    columns, known = part_columns(layout, part), stats or FeatureStats.unit(layout)
+    return {"layout": layout, "mean": known.mean[columns], "std": known.std[columns], "loss": loss}
 
 
 def part_of(facts: ModelFacts) -> Part:

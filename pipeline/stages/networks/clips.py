@@ -1,24 +1,20 @@
-"""Batches of clips with their conditions, dances to begin with, and the music of a request."""
+"""Batches of clips with their conditions, and dances to begin with."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import Crops
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.training.config import SizedBatches
 from motionloom.pipeline.training.trained_stage import Batches
@@ -82,28 +78,3 @@ def spread_dances(dataset: ClipDataset, count: int, least: int) -> list[int]:
         )
     rows: list[int] = found[np.linspace(0, len(found) - 1, count).round().astype(int)].tolist()
     return rows
-
-
-@dataclass(frozen=True)
-class DanceGenerator:
-    """Makes one dance for each music and draws nothing: what it begins with makes the difference."""
-
-    layout: MotionLayout
-    given: Mapping[str, Any]
-    """The stage's loaded inputs; "audio" is read."""
-    modalities = frozenset({"audio"})
-    settings = frozenset[str]()
-    max_frames = None
-    decides_length = False
-
-    @property
-    def prepared(self) -> Mapping[str, object]:
-        return {"audio": self.given.get("audio")}
-
-
-def music_of(request: GenerationRequest, given: Mapping[str, Any]) -> Tensor:
-    """The normalised music [B, L, E] of a request; 0 after each row's end."""
-    found = request.conditions.get("audio")
-    if found is None:
-        raise UserError("this model dances to music, and none was given")
-    return MODALITIES["audio"].normalise(given["audio"], found).features

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from pydantic import Field
 
 from motionloom.datasets.schema import UserError
@@ -18,9 +16,6 @@ from motionloom.pipeline.store.networks import LoadedDmd, TrainedTokenizer, requ
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
-
-if TYPE_CHECKING:
-    from motionloom.models.diffusion.module import DmdModule
 
 
 class DmdStageConfig(WindowStageConfig):
@@ -44,10 +39,12 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
 
     name = "dmd"
     summary = "diffusion decoder of motion tokens"
+    trainer = "motionloom.models.diffusion.module:DmdModule"
     config = DmdStageConfig
     offers = frozenset({"decoder"})
     inputs = DmdInputs
     curves = (Curve("loss"),)
+    exports = ("tokenizer",)
 
     def facts(self, config: DmdStageConfig, inputs: DmdInputs) -> ModelFacts:
         tokenizer = inputs.tokenizer.net
@@ -66,12 +63,8 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
         config = DmdConfig.parse(facts.config, facts.where)
         return Dmd(config, tokenizer.streams, tokenizer.pattern, tokenizer.dim)
 
-    def module(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, seed: int) -> DmdModule:
-        from motionloom.models.diffusion.module import DmdModule
-
-        return DmdModule(
-            net, config.optim, seed=seed, max_steps=config.train.steps, tokenizer=inputs.tokenizer.net
-        )
+    def module_settings(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs) -> dict[str, object]:
+        return {"tokenizer": inputs.tokenizer.net}
 
     def batches(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, seed: int, log: Log) -> Batches:
         columns, window = inputs.tokenizer.columns, config.window
@@ -84,9 +77,6 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
 
     def loaded(self, net: Dmd, facts: ModelFacts, inputs: DmdInputs) -> LoadedDmd:
         return LoadedDmd(net, facts.fact("window", int), inputs)
-
-    def exported(self, config: DmdStageConfig) -> tuple[str, ...]:
-        return ("tokenizer",)
 
 
 register(DmdStage())

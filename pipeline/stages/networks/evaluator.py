@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -18,9 +18,6 @@ from motionloom.pipeline.store.evaluator import LoadedEvaluator, StageWords
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig
-
-if TYPE_CHECKING:
-    from motionloom.models.evaluator.module import EvaluatorModule
 
 
 class EvaluatorStageConfig(CaptionStageConfig):
@@ -66,6 +63,7 @@ class EvaluatorStage(CaptionStage[EvaluatorStageConfig, CaptionInputs, Evaluator
 
     name = "evaluator"
     summary = "text-motion evaluator"
+    trainer = "motionloom.models.evaluator.module:EvaluatorModule"
     config = EvaluatorStageConfig
     inputs = CaptionInputs
     curves = (
@@ -89,20 +87,11 @@ class EvaluatorStage(CaptionStage[EvaluatorStageConfig, CaptionInputs, Evaluator
         frames = facts.fact("max_frames", int)
         return Evaluator(config, facts.layout.layout(), facts.fact("text_dim", int), frames)
 
-    def module(
-        self, config: EvaluatorStageConfig, net: Evaluator, inputs: CaptionInputs, seed: int
-    ) -> EvaluatorModule:
-        from motionloom.models.evaluator.module import EvaluatorModule
-
-        return EvaluatorModule(
-            net,
-            config.optim,
-            seed=seed,
-            max_steps=config.train.steps,
-            movement_optim=config.movement_optim,
-            movement_steps=config.movement_steps,
-            loss=config.loss,
-        )
+    def module_settings(
+        self, config: EvaluatorStageConfig, net: Evaluator, inputs: CaptionInputs
+    ) -> dict[str, object]:
+        movement = {"movement_optim": config.movement_optim, "movement_steps": config.movement_steps}
+        return {"loss": config.loss, **movement}
 
     def loaded(self, net: Evaluator, facts: ModelFacts, inputs: CaptionInputs) -> LoadedEvaluator:
         layout: MotionLayout = facts.layout.layout()

@@ -37,7 +37,7 @@ from motionloom.pipeline.training.trained_stage import Batches, Example, Log, Tr
 from motionloom.pipeline.training.warm_start import START, require_start_layout, same_encoder, starts_from
 
 if TYPE_CHECKING:
-    from motionloom.models.gpt.module import GptModule
+    from motionloom.models.training.stage_module import StageModule
 
 Prior = Literal["tma", "sentence"]
 
@@ -101,6 +101,7 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
 
     name = "gpt"
     summary = "GPT over motion tokens"
+    trainer = "motionloom.models.gpt.module:GptModule"
     config = GptStageConfig
     offers = frozenset({GENERATOR})
     inputs = GptInputs
@@ -133,21 +134,20 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         if inputs.start is not None:
             net.load_state_dict(inputs.start.net.state_dict())
 
-    def module(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int) -> GptModule:
-        """Cross-entropy, and L_align on what the frozen tokenizer and TMA make of its tokens."""
-        from motionloom.models.gpt.module import GptModule
-
+    def module(
+        self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int
+    ) -> StageModule:
         if config.lora is not None:
             add_lora(net, config.lora)
-        return GptModule(
-            net,
-            config.optim,
-            seed=seed,
-            max_steps=config.train.steps,
-            loss=config.loss,
-            tokenizer=inputs.tokenizer.net if config.aligned else None,
-            tma=inputs.tma.net if config.aligned and inputs.tma is not None else None,
-        )
+        return super().module(config, net, inputs, seed)
+
+    def module_settings(
+        self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs
+    ) -> dict[str, object]:
+        """L_align is taken on what the frozen tokenizer and TMA make of its tokens."""
+        if not config.aligned or inputs.tma is None:
+            return {"loss": config.loss}
+        return {"loss": config.loss, "tokenizer": inputs.tokenizer.net, "tma": inputs.tma.net}
 
     def trained(self, config: GptStageConfig, net: InterleavedGPT) -> None:
         if config.lora is not None:
@@ -182,13 +182,13 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
 
         return token_batches(net, clips_of, data.held_out().split, seed, tables)
 
-    def dry_module(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs) -> GptModule:
+    def dry_module(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs) -> StageModule:
         """Without the judge of sampled motions, which keeps nothing for the backward pass, and without
         adapters, which peft cannot make of tensors without values: a bound from above.
         """
         module = self.module(config.model_copy(update={"lora": None}), net, inputs, seed=0)
         if config.aligned_on_samples:
-            module.tokenizer = None
+            module.tokenizer = None  # type: ignore[assignment]
         return module
 
     def example(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, batch: int) -> Example:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import Part
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
@@ -15,9 +13,6 @@ from motionloom.pipeline.stages.networks.captions import (
     DenoiserStageConfig,
     part_columns,
 )
-
-if TYPE_CHECKING:
-    from motionloom.models.diffusion.module import InBetweenModule
 
 
 class InBetweenStageConfig(DenoiserStageConfig):
@@ -32,22 +27,18 @@ class InBetweenStage(DenoiserStage[InBetweenStageConfig, InBetweener]):
 
     name = "inbetween"
     summary = "motion in-betweening"
+    trainer = "motionloom.models.diffusion.module:InBetweenModule"
     config = InBetweenStageConfig
     denoiser = InBetweener
 
-    def module(
-        self, config: InBetweenStageConfig, net: InBetweener, inputs: CaptionInputs, seed: int
-    ) -> InBetweenModule:
-        from motionloom.models.diffusion.module import InBetweenModule
-
+    def module_settings(
+        self, config: InBetweenStageConfig, net: InBetweener, inputs: CaptionInputs
+    ) -> dict[str, object]:
         columns = part_columns(inputs.data.layout, config.part)
         # A dry run has no statistics.
         stats = inputs.stats or FeatureStats.unit(inputs.data.layout)
         share = config.net.observed_share
-        observations = Observations.of(stats.layout, columns, stats.mean, stats.std, share)
-        return InBetweenModule(
-            net, config.optim, seed=seed, max_steps=config.train.steps, observations=observations
-        )
+        return {"observations": Observations.of(stats.layout, columns, stats.mean, stats.std, share)}
 
 
 register(InBetweenStage())

@@ -5,7 +5,7 @@ B.5.1, D).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from pydantic import model_validator
@@ -43,9 +43,6 @@ from motionloom.pipeline.training.warm_start import (
     same_encoder,
 )
 
-if TYPE_CHECKING:
-    from motionloom.models.tma.module import TmaModule
-
 _FREE = frozenset({"dropout", "attention_dropout", "text_dropout", "text_noise"})
 """Settings that are of the training and not of the network: another one may go on with others."""
 
@@ -78,6 +75,7 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
 
     name = "tma"
     summary = "text-motion alignment"
+    trainer = "motionloom.models.tma.module:TmaModule"
     config = TmaStageConfig
     inputs = TmaInputs
     curves = (Curve("contrastive"), Curve("loss"))
@@ -126,10 +124,8 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
             columns, stats = part_columns(inputs.data.layout, config.part), inputs.stats
             net.basis.learn(stats.mean[columns], stats.std[columns])
 
-    def module(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs, seed: int) -> TmaModule:
-        from motionloom.models.tma.module import TmaModule
-
-        return TmaModule(net, config.optim, seed=seed, max_steps=config.train.steps, loss=config.loss)
+    def module_settings(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs) -> dict[str, object]:
+        return {"loss": config.loss}
 
     def loaded(self, net: Tma, facts: ModelFacts, inputs: TmaInputs) -> LoadedTma:
         frames, part = facts.fact("max_frames", int), part_of(facts)

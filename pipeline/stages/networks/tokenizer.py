@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,6 @@ from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 from motionloom.pipeline.training.warm_start import require_same_start, require_start_layout
-
-if TYPE_CHECKING:
-    from motionloom.models.training.stage_module import StageModule
 
 _FREE = frozenset(
     {
@@ -98,6 +95,8 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
     inputs = TokenizerInputs
     curves = tuple(Curve(name) for name in ("recon", "perplexity", "usage", "dead", "resets"))
     offers = frozenset({"tokenizer"})
+    trainer = "motionloom.models.tokenizer.module:TokenizerModule"
+    exports = ("stats",)
 
     def __init__(self, name: str, summary: str, config: type[TokenizerStageConfig]) -> None:
         self.name, self.summary, self.config = name, summary, config
@@ -124,14 +123,6 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
         columns, stats = net.columns.numpy(), inputs.stats
         net.basis.learn(stats.mean[columns], stats.std[columns])
 
-    def module(
-        self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, seed: int
-    ) -> StageModule:
-        from motionloom.models.tokenizer.module import TokenizerModule
-
-        steps = config.train.steps
-        return TokenizerModule(net, config.optim, seed=seed, max_steps=steps)
-
     def batches(
         self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs, seed: int, log: Log
     ) -> Batches:
@@ -148,9 +139,6 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
 
     def loaded(self, net: Tokenizer, facts: ModelFacts, inputs: TokenizerInputs) -> TrainedTokenizer:
         return TrainedTokenizer(net.freeze(), inputs)
-
-    def exported(self, config: TokenizerStageConfig) -> tuple[str, ...]:
-        return ("stats",)
 
 
 def window_batches(

@@ -34,6 +34,7 @@ class UdeStage(StageKind[UdeConfig]):
     config = UdeConfig
     offers = frozenset({GENERATOR})
     takes = ("utt", "dmd?")
+    exports = ("utt", "dmd")
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Both halves must speak of the same tokens, and the context must leave room in a window."""
@@ -63,9 +64,6 @@ class UdeStage(StageKind[UdeConfig]):
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         return UdeGenerator(given["utt"], given.get("dmd"), stage.config)
-
-    def exported(self, config: UdeConfig) -> tuple[str, ...]:
-        return ("utt", "dmd")
 
     def export(self, stage: CompletedStage, target: Path) -> None:
         """Its settings are in the list of stages."""

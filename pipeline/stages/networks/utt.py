@@ -26,7 +26,7 @@ from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 
 if TYPE_CHECKING:
-    from motionloom.models.utt.module import UttModule
+    from motionloom.models.training.stage_module import StageModule
 
 
 class UttStageConfig(TrainedStageConfig):
@@ -73,6 +73,7 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
 
     name = "utt"
     summary = "conditions to motion tokens"
+    trainer = "motionloom.models.utt.module:UttModule"
     config = UttStageConfig
     offers = frozenset({"token_model"})
     inputs = UttInputs
@@ -113,9 +114,9 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
         timed = facts.fact("timed", list)
         return ConditionedUtt(mate, config, widths, tokenizer.streams, tokenizer.pattern, timed=timed)
 
-    def module(self, config: UttStageConfig, net: ConditionedUtt, inputs: UttInputs, seed: int) -> UttModule:
-        from motionloom.models.utt.module import UttModule
-
+    def module_settings(
+        self, config: UttStageConfig, net: ConditionedUtt, inputs: UttInputs
+    ) -> dict[str, object]:
         groups = config.max_frames // GROUP_FRAMES
         if groups > net.utt.max_groups:
             raise UserError(
@@ -123,16 +124,9 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
                 f"max_frames {config.max_frames} has {groups}; raise net.block_size, or set max_frames to "
                 f"{net.utt.max_groups * GROUP_FRAMES}"
             )
-        return UttModule(
-            net,
-            config.optim,
-            seed=seed,
-            max_steps=config.train.steps,
-            tokenizer=inputs.tokenizer.net,
-            loss=config.loss,
-        )
+        return {"tokenizer": inputs.tokenizer.net, "loss": config.loss}
 
-    def dry_module(self, config: UttStageConfig, net: ConditionedUtt, inputs: UttInputs) -> UttModule:
+    def dry_module(self, config: UttStageConfig, net: ConditionedUtt, inputs: UttInputs) -> StageModule:
         """With the adversarial term from the first step on."""
         loss = config.loss.model_copy(update={"adversarial_start": 0, "adversarial_ramp": 0})
         return self.module(config.model_copy(update={"loss": loss}), net, inputs, seed=0)
