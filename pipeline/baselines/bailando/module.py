@@ -207,14 +207,6 @@ class ActorCriticModule(AlternatingModule):
         return torch.from_numpy(np.stack(rows)).to(codes.device, torch.float32)
 
 
-class Unrewarded(ActorCriticModule):
-    """For dry runs, whose tensors hold no numbers that a dance could be made of."""
-
-    def rewards(self, codes: Tensor, beats: Tensor) -> Tensor:
-        """Nothing."""
-        return torch.zeros(codes.shape[:2], device=codes.device)
-
-
 def beat_rewards(
     joints: NDArray[np.floating], beats: NDArray[np.bool_], fps: float, code_frames: int, scale: float
 ) -> NDArray[np.float64]:
