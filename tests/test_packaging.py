@@ -190,7 +190,7 @@ def test_the_wheel_has_every_file_of_the_packages(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         inside = {name for name in archive.namelist() if ".dist-info/" not in name}
     assert inside == {f"motionloom/{name}" for name in (*TOP, *files_of(*FOLDERS))}
-    kinds = {".py", ".pyi", ".yaml", ".json", ".css", ".js", ".html", ".npz", ".typed", ".md"}
+    kinds = {".py", ".pyi", ".yaml", ".json", ".csv", ".css", ".js", ".html", ".npz", ".typed", ".md"}
     if any((ROOT / "models" / "pretrained").glob("*/bundle.json")):
         kinds |= {".safetensors"}
     assert {Path(name).suffix or Path(name).name for name in inside} == kinds

@@ -41,12 +41,6 @@ ODD = 0.2
 
 _RATE = 10.0
 """Frames a second that are looked at."""
-_WALKS = 0.3
-"""Metres a second from which a figure goes somewhere."""
-_WALKS_SECONDS = 0.5
-_BACKWARDS = -0.5
-_LEAST_WALKS = 3
-"""Fewer clips of walking say nothing about the set."""
 
 _NAMED = Skeleton.named("smpl22")
 _PELVIS, _HEAD = _NAMED.index("pelvis"), _NAMED.index("head")
@@ -92,8 +86,6 @@ class FigureMeasure:
     """Height of the lowest joint of all frames."""
     above_floor: float
     """Height of a frame's lowest joint above `floor`."""
-    forward: float | None
-    """Cosine between the way the figure goes and the way it faces; None where it stays in its place."""
     toes: float
     """Cosine of the feet's direction and the figure's, -1 to 1: negative where left and right are
     swapped."""
@@ -116,22 +108,11 @@ def measure(joints: NDArray[np.floating], fps: float) -> FigureMeasure:
         up=(float(up[0]), float(up[1]), float(up[2])),
         floor=floor,
         above_floor=float(np.median(lowest)) - floor,
-        forward=_forward(ground(body[:, _PELVIS]), heading, fps / step),
         toes=float(np.median(toes.real / np.maximum(np.abs(toes), 1e-9))),
     )
 
 
-def _forward(path: NDArray[np.complex128], heading: NDArray[np.complex128], fps: float) -> float | None:
-    """Mean cosine between steps and heading over the frames that go somewhere."""
-    steps = np.diff(path) * fps
-    speed = np.abs(steps)
-    walks = speed > _WALKS
-    if walks.sum() < _WALKS_SECONDS * fps:
-        return None
-    return float(np.mean((steps * heading[:-1].conj()).real[walks] / speed[walks]))
-
-
-Kind = Literal["size", "lying", "upside down", "floating", "below the floor", "left and right", "backwards"]
+Kind = Literal["size", "lying", "upside down", "floating", "below the floor", "left and right"]
 
 
 @dataclass(frozen=True)
@@ -152,26 +133,25 @@ class Oddity:
 
     @property
     def is_error(self) -> bool:
-        """Whether it is so in most clips; people do walk backwards, so that alone is none."""
-        return self.share > MOST and self.kind != "backwards"
+        """Whether it is so in most clips."""
+        return self.share > MOST
 
 
 class PlausibilityStats:
-    """Many clips together, in 24 bytes each."""
+    """Many clips together, in 20 bytes each."""
 
     def __init__(self) -> None:
         self._rows = array("f")
 
     def __len__(self) -> int:
-        return len(self._rows) // 6
+        return len(self._rows) // 5
 
     def add(self, clip: FigureMeasure) -> None:
-        forward = float("nan") if clip.forward is None else clip.forward
-        self._rows.extend((clip.height, clip.up[1], clip.floor, clip.above_floor, forward, clip.toes))
+        self._rows.extend((clip.height, clip.up[1], clip.floor, clip.above_floor, clip.toes))
 
     def _columns(self) -> list[NDArray[np.float64]]:
-        """Height, upward part, floor, distance from it, way and toes of the clips, each [n]."""
-        return list(np.array(self._rows, dtype=np.float64).reshape(-1, 6).T)
+        """Height, upward part, floor, distance from it and toes of the clips, each [n]."""
+        return list(np.array(self._rows, dtype=np.float64).reshape(-1, 5).T)
 
     @property
     def height(self) -> float:
@@ -188,16 +168,6 @@ class PlausibilityStats:
         """Median distance of a figure from the floor of its clip, metres; NaN without any."""
         return float(np.median(self._columns()[3])) if len(self) else float("nan")
 
-    @property
-    def walking(self) -> int:
-        """Clips in which the figure goes somewhere."""
-        return int(np.isfinite(self._columns()[4]).sum())
-
-    @property
-    def backwards(self) -> int:
-        """Number of these clips in which it goes backwards."""
-        return int((self._columns()[4] < _BACKWARDS).sum())
-
     def oddities(self, *, floor_at_zero: bool = False) -> list[Oddity]:
         """Return faults of more than a few of the clips, the most serious first.
 
@@ -205,7 +175,7 @@ class PlausibilityStats:
         """
         if not len(self):
             return []
-        height, up, floor, above, forward, toes = self._columns()
+        height, up, floor, above, toes = self._columns()
         small, tall = PERSON_METRES
         out: list[Oddity] = []
 
@@ -253,6 +223,4 @@ class PlausibilityStats:
                 "show feet that point backwards (left and right swapped?)",
                 standing,
             )
-        if self.walking >= _LEAST_WALKS and self.backwards > MOST * self.walking:
-            count("backwards", forward < _BACKWARDS, "in which somebody walks go backwards", self.walking)
         return sorted(out, key=lambda oddity: not oddity.is_error)

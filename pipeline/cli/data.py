@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from motionloom.datasets.base.printable import printable
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import grouped
 from motionloom.pipeline.cli.convert import convert_app, say_manifest
@@ -20,7 +17,6 @@ from motionloom.pipeline.store.files import require_file_place, require_folder
 
 if TYPE_CHECKING:
     from motionloom.datasets.check.files import FileRules
-    from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess
 
 _SUSPECTS = 60
 """Suspects on the page, at most: the worst."""
@@ -128,52 +124,6 @@ def _leaks(folders: list[Path], console: Console) -> list[str]:
     if len(folders) > 1:
         console.print(f"{len(found) or 'no'} clips of one data set are in another split of the next")
     return found
-
-
-@data_app.command()
-def joints(
-    source: Annotated[
-        str,
-        typer.Argument(help="A .bvh file, or a folder or archive of them; or a skeleton: smpl22, smplx52."),
-    ] = "smpl22",
-    skeleton: Annotated[
-        str, typer.Option(help="Of a file: the skeleton to map to, smpl22 or smplx52 (with fingers).")
-    ] = "smpl22",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Also write the joint map, to be completed.")
-    ] = None,
-) -> None:
-    """Joint names of a skeleton of ours; or the joints of a BVH file that stand for them, if certain.
-
-    Example: `motionloom data joints smplx52`
-
-    Example: `motionloom data joints walk.bvh -o joint_map.json`
-    """
-    from motionloom.datasets.base.files import write_text
-    from motionloom.datasets.convert.bvh.plan import guess_source
-    from motionloom.datasets.motion.bvh.joint_map import map_text
-    from motionloom.datasets.motion.skeleton import Skeleton
-
-    console = make_console()
-    if out is not None:
-        require_file_place(out)
-    if Path(source).exists():
-        guess = guess_source(Path(source), Skeleton.named(skeleton))
-        _show_guess(guess, console)
-        text = guess.text()
-    else:
-        try:
-            target = Skeleton.named(source)
-        except UserError as error:
-            raise UserError(f"{source}: no such file or folder, and {error}") from None
-        table = Table("", "joint", "parent", title=target.name)
-        for index, (joint, parent) in enumerate(zip(target.joints, target.parents, strict=True)):
-            table.add_row(str(index), joint, target.joints[parent] if parent >= 0 else "")
-        console.print(table)
-        text = map_text(target, [None] * len(target), note="a joint map to be filled in")
-    if out is not None:
-        write_text(out, text)
-        say(console, str(out))
 
 
 @data_app.command()
@@ -291,16 +241,3 @@ def _check_files(path: Path, rules: FileRules, console: Console) -> tuple[int, i
         warned += bool(verdict.ok and verdict.notes)
         found.append({**plain(verdict), "ok": verdict.ok})
     return bad, warned, {"files": found}
-
-
-def _show_guess(guess: JointGuess, console: Console) -> None:
-    table = Table("", guess.target.name, "stands for it", "found")
-    for index, row in enumerate(guess.rows):
-        names = " + ".join(row.sources) or " or ".join(row.candidates)
-        cells = (str(index), row.joint, names if row.sources else f"{names}?", row.how)
-        table.add_row(*(Text(printable(cell)) for cell in cells))
-    console.print(table)
-    say(console, f"{guess.source}: {guess.summary()}")
-    if guess.unmapped:
-        say(console, f"stand for nothing: {', '.join(guess.unmapped)}")
-    say(console, "certain" if guess.certain else f"not certain: {guess.doubts()}")

@@ -166,21 +166,10 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
     return found
 
 
-def guess_source(source: Path, target: Skeleton) -> JointGuess:
-    """The guess for the first clip of a .bvh file, of a folder of such files, or of an archive."""
-    batches = list_batches(source)
-    for batch in batches:
-        for file in batch.read():
-            if file.error:
-                raise UserError(f"{file.label}: {file.error}")
-            return guess_joint_map(read_motion(file.data, file.label), target)
-    raise UserError(f"{source}: no motion file in it")
-
-
 def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
     """Write the map of a guess; return what the user can do with it."""
     if folder is None:
-        return f"`motionloom data joints {guess.source} -o joint_map.json` writes a map to complete"
+        return "planned with `maps=FOLDER` it writes a map to complete"
     path = folder / MAPS_FOLDER / f"skeleton-{key}.json"
     if not path.exists():
         write_text(path, guess.text(key))

@@ -159,10 +159,6 @@ class SubsetLook:
     """Axis of the files along which the head lies from the pelvis in most clips: `+y`, `-z`."""
     above_floor: float | None
     """Metres from the floor of its clip to the lowest joint of the median frame."""
-    walking: int
-    """Clips in which the figure goes somewhere."""
-    backwards: int
-    """Clips in which it goes backwards."""
     fps: tuple[float, ...]
     """Frame rates of the files."""
 
@@ -190,19 +186,16 @@ class Look:
     def table(self) -> Table:
         of = "" if len(self.subsets) == self.all_subsets else f" ({len(self.subsets)} of {self.all_subsets})"
         table = Table(
-            *(f"subset{of}", "clips", "height", "head above pelvis", "lowest joint", "walking", "fps"),
-            title="seen",
+            *(f"subset{of}", "clips", "height", "head above pelvis", "lowest joint", "fps"), title="seen"
         )
         for seen in self.subsets:
             head = f"{seen.upright} of {seen.clips}, along {seen.head} of the files"
-            back = f", {seen.backwards} backwards" if seen.backwards else ""
             table.add_row(
                 escape(printable(seen.name)) or ".",
                 str(seen.clips) + (f", {seen.unreadable} unreadable" if seen.unreadable else ""),
                 "" if seen.height is None else f"{seen.height:.3g} m",
                 head if seen.clips else "",
                 "" if seen.above_floor is None else f"{seen.above_floor:.2f} m above the floor",
-                f"{seen.walking}{back}",
                 ", ".join(f"{fps:g}" for fps in seen.fps),
             )
         return table
@@ -311,8 +304,6 @@ def _subset(name: str, clips: list[SeenClip], unreadable: int) -> SubsetLook:
         upright=round(stats.upright * len(clips)) if clips else 0,
         head=head_axis(clips) if clips else "",
         above_floor=round(stats.above_floor, 4) if clips else None,
-        walking=stats.walking,
-        backwards=stats.backwards,
         fps=tuple(sorted({clip.file_fps for clip in clips})),
     )
 

@@ -176,7 +176,7 @@ def test_a_guess_needs_no_whole_first_file_and_no_folder(tmp_path: Path) -> None
     again = prepare(config, out=tmp_path / "out")
     assert again.options == prepared.options, "neither the folder nor an earlier run matters"
     toeless(tmp_path / "other")
-    with pytest.raises(UserError, match=r"data joints a.bvh"):
+    with pytest.raises(UserError, match=r"a\.bvh is not certain"):
         prepare(BvhConfig(source=tmp_path / "other", licence="CC0"))
 
 

@@ -125,7 +125,7 @@ def test_feet_without_a_toe_are_end_sites_or_estimated(
     assert guess.certain and row.sources == ("End Site of LeftFoot",)
     assert (row.how, bool(guess.ends)) == (("end", False) if end == "the ball" else ("estimate", True))
     written = tmp_path / "map.json"
-    written.write_text(guess.text(), encoding="utf-8")
+    written.write_text(guess.text("skeleton"), encoding="utf-8")
     found = JointMap.load(written).apply(motion, unit=style["unit"], up=style.get("up", "y"))
     wanted = world[:, [truth.names.index(f"{side}Toe") for side in ("Left", "Right")]]
     # The reader's own rounding; or our neutral foot under swinging hips and knees.

@@ -155,14 +155,11 @@ def test_a_clip_is_measured_as_it_was_made() -> None:
     assert measure(rest, FPS).height == pytest.approx(1.7, abs=1e-9)
     assert clip.height == pytest.approx(1.7, abs=0.05)
     assert clip.up[1] > 0.95 and clip.above_floor < 0.1
-    assert clip.forward is not None and clip.forward > 0.9 and clip.toes > 0.8
-    assert measure(person(0, speed=-1.2), FPS).forward == pytest.approx(-clip.forward, abs=0.1)
-    assert measure(person(0, speed=0.0), FPS).forward is None
+    assert clip.toes > 0.8
     twice = measure(person(0) * 2 + [5.0, 3.0, -1.0], FPS)
     assert twice.height == pytest.approx(2 * measure(person(0), FPS).height)
     assert twice.floor == pytest.approx(measure(person(0), FPS).floor * 2 + 3.0)
-    one = measure(person(0)[:1], FPS)
-    assert one.height == pytest.approx(1.7, abs=0.05) and one.forward is None
+    assert measure(person(0)[:1], FPS).height == pytest.approx(1.7, abs=0.05)
 
 
 @pytest.mark.parametrize("pose", [person, squat, jump], ids=["walking", "squatting", "jumping"])
@@ -170,15 +167,12 @@ def test_people_are_people(pose: Callable[[int], Floats]) -> None:
     assert kinds([pose(seed) for seed in range(6)], floor_at_zero=False) == []
 
 
-def test_a_few_who_lie_or_walk_backwards_are_no_error_and_many_who_lie_are() -> None:
+def test_a_few_who_lie_are_no_error_and_many_are() -> None:
     assert kinds([*PEOPLE[:5], lying(PEOPLE[5])]) == []
     assert kinds([*PEOPLE[:4], *map(lying, PEOPLE[4:])]) == [("lying", False)]
     assert kinds([*PEOPLE[:2], *map(lying, PEOPLE[2:])]) == [("lying", True)]
-    back = [person(seed, speed=-1.0) for seed in range(4)]
-    assert kinds(back) == [("backwards", False)]
-    assert kinds([*back[:2], *PEOPLE]) == []
-    (oddity,) = stats_of(back).oddities()
-    assert str(oddity.text).startswith("4 of 4 clips")
+    (oddity,) = stats_of([lying(clip) for clip in PEOPLE]).oddities()
+    assert str(oddity.text).startswith("6 of 6 clips")
 
 
 @pytest.mark.parametrize(
@@ -210,5 +204,5 @@ def test_floating_and_sinking_are_against_the_floor() -> None:
 def test_nothing_is_said_about_nobody() -> None:
     stats = PlausibilityStats()
     assert stats.oddities() == [] and len(stats) == 0 and np.isnan(stats.height)
-    stats.add(FigureMeasure(float("nan"), (0.0, 1.0, 0.0), 0.0, 0.0, None, 1.0))
+    stats.add(FigureMeasure(float("nan"), (0.0, 1.0, 0.0), 0.0, 0.0, 1.0))
     assert [oddity.kind for oddity in stats.oddities()] == ["size"]

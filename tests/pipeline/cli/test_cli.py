@@ -16,13 +16,10 @@ from typing import Any
 import pytest
 import typer
 from bvh_clips import write_clip, write_map
-from foreign_figures import build, write_figure
-from foreign_tools import FOREIGN
 from rich.console import Console
 
 from motionloom.datasets.check.files import FileRules
 from motionloom.datasets.convert.registry import converters
-from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.schema import Manifest
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.convert import say_manifest
@@ -229,28 +226,6 @@ def test_the_line_that_a_plan_proposes_converts_files_of_other_makers(
     assert call(*words[1:]).code == 0
     manifest = Manifest.load_json(tmp_path / "out" / "manifest.json")
     assert sum(shard.samples for shard in manifest.shards) == ODD[name]
-
-
-def test_joints_of_a_skeleton_and_of_a_file(tmp_path: Path, call: Call) -> None:
-    named = call("data", "joints", "smplx52", "-o", tmp_path / "empty.json")
-    assert named.code == 0 and "right_thumb3" in named.out and "left_wrist" in named.out
-    rows = json.loads((tmp_path / "empty.json").read_text())["smplx52"]
-    assert len(rows) == 52 and rows[22] == [22, "left_index1", None]
-    source = write_figure_of("Mixamo", tmp_path / "mocap" / "walk.bvh")
-    for where in (source, source.parent):
-        shown = call("data", "joints", where, "-o", tmp_path / "map.json")
-        assert shown.code == 0 and "mixamorig:LeftUpLeg" in shown.out and "22 by name" in shown.out
-        assert shown.out.rstrip().splitlines()[-2] == "certain"
-        assert JointMap.load(tmp_path / "map.json").sources[0] == ("mixamorig:Hips",)
-    fingers = call("data", "joints", source, "--skeleton", "smplx52")
-    assert "mixamorig:LeftHandIndex1" in fingers.out and "52 by name" in fingers.out
-    wrong = call("data", "joints", "nowhere.bvh")
-    assert wrong.code == 2 and "nowhere.bvh: " in wrong.err and "smpl22" in wrong.err
-
-
-def write_figure_of(tool: str, path: Path) -> Path:
-    write_figure(path, build(next(spec for spec in FOREIGN if spec.tool == tool)), frames=70)
-    return path
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""A foreign figure as a guess sees it: how tools name joints, as a table, then names, tree, and some poses.
+"""A foreign figure as a guess sees it: how tools name joints (`tools.csv`), then names, tree, and some poses.
 
 To know another tool, add a row. Words of the table are what is left of a name: no side, prefix, punctuation,
 capitals or leading zeros, so `mixamorig:LeftUpLeg` is `upleg`, `DEF-upper_arm.L` is `upperarm` and `spine_01`
@@ -11,11 +11,13 @@ tools (LAFAN1, Bandai-Namco, BONES) write all bones along one axis, so that the 
 
 from __future__ import annotations
 
+import csv
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -44,66 +46,22 @@ class Convention:
     """Words of the joints of each finger, outwards; none where the tool has no fingers."""
 
 
-_TABLE = """
-Mixamo, HumanIK, LAFAN1 | hips spine spine1 spine2 | neck head | upleg leg foot toebase | shoulder arm forearm hand
-CMU | hips lowerback spine spine1 | neck head | upleg leg foot toebase | shoulder arm forearm hand
-CMU (ASF) | root lowerback upperback thorax | lowerneck head | femur tibia foot toes | clavicle humerus radius wrist
-BONES, SOMA | hips spine1 spine2 chest | neck1 head | leg shin foot toebase | shoulder arm forearm hand
-Rokoko | hips spine1 spine2 spine3 spine4 | neck head | thigh shin foot toe | shoulder arm forearm hand
-Xsens MVN (BVH) | hips chest chest2 chest3 chest4 | neck head | hip knee ankle toe | collar shoulder elbow wrist
-Xsens MVN (segments) | pelvis l5 l3 t12 t8 | neck head | upperleg lowerleg foot toe | shoulder upperarm forearm hand
-Blender Rigify | spine spine1 spine2 spine3 | spine4 spine6 | thigh shin foot toe | shoulder upperarm forearm hand
-SMPL, SMPL-H, SMPL-X | pelvis spine1 spine2 spine3 | neck head | hip knee ankle foot | collar shoulder elbow wrist
-Unreal mannequin | pelvis spine1 spine2 spine3 spine4 spine5 | neck1 head | thigh calf foot ball | clavicle upperarm lowerarm hand
-Bandai-Namco, Unity, VRM | hips spine chest upperchest | neck head | upperleg lowerleg foot toes | shoulder upperarm lowerarm hand
-3ds Max Biped | pelvis spine spine1 spine2 | neck head | thigh calf foot toe0 | clavicle upperarm forearm hand
-DAZ, Poser | hip abdomen chest | neck head | thigh shin foot toe | collar shldr forearm hand
-DAZ Genesis 3, 8 | hip abdomenlower abdomenupper chestlower chestupper | necklower head | thighbend shin foot toe | collar shldrbend forearmbend hand
-MakeHuman (CMU rig) | root spine1 spine2 spine3 | neck head | upleg loleg foot toe | clavicle uparm loarm hand
-MakeHuman (default rig) | root spine5 spine4 spine3 spine2 spine1 | neck1 head | upperleg1 lowerleg1 foot toe11 | clavicle upperarm1 lowerarm1 wrist
-Kinect | spinebase spinemid spineshoulder | neck head | hip knee ankle foot | - shoulder elbow wrist
-"""  # noqa: E501 (a table)
-"""Tool | pelvis, spine upwards | neck, head | leg | arm; `-` is a joint that the tool does not have."""
+def _conventions() -> Iterator[Convention]:
+    """The rows of `tools.csv`, whose cells are words; `-` is a joint that the tool does not have.
 
-_HANDS = """
-Mixamo, HumanIK, LAFAN1 | handindex handmiddle handpinky handring handthumb | 1 2 3 4 | 1 2 3 4
-BONES, SOMA | handindex handmiddle handpinky handring handthumb | 1 2 3 4 | 1 2 3 4
-Rokoko | finger2 finger3 finger5 finger4 finger1 | proximal medial distal | metacarpal proximal distal
-Xsens MVN (segments) | second third fifth fourth first | pp mp dp | mc pp dp
-MakeHuman (CMU rig) | index middle pinky ring thumb | 1 2 3 4 | 1 2 3 4
-MakeHuman (default rig) | finger2 finger3 finger5 finger4 finger1 | 1 2 3 | 1 2 3
-Blender Rigify | findex fmiddle fpinky fring thumb | 1 2 3 4 | 1 2 3 4
-SMPL, SMPL-H, SMPL-X | index middle pinky ring thumb | 1 2 3 4 | 1 2 3 4
-Unreal mannequin | index middle pinky ring thumb | 1 2 3 4 | 1 2 3 4
-Bandai-Namco, Unity, VRM | index middle little ring thumb | proximal intermediate distal | metacarpal proximal distal
-"""  # noqa: E501 (a table)
-"""Tool | the fingers of `FINGERS` | their joints outwards | the thumb's: a word is finger and joint."""
+    A word of a finger is one of `fingers`, in the order of `FINGERS`, and one of the `joints`, or of the
+    `thumb`'s.
+    """
+    with Path(__file__).with_name("tools.csv").open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            tool = row.pop("tool")
+            words = {key: tuple(word.strip("-") for word in cell.split()) for key, cell in row.items()}
+            chains = zip(FINGERS, words["fingers"], [words["joints"]] * 4 + [words["thumb"]], strict=False)
+            fingers = {finger: tuple(name + joint for joint in outwards) for finger, name, outwards in chains}
+            yield Convention(tool, words["trunk"], words["neck"], words["leg"], words["arm"], fingers)
 
 
-def _cells(table: str) -> list[tuple[str, list[list[str]]]]:
-    """(tool, words of every other cell) of the rows of a table."""
-    rows = ([cell.strip() for cell in row.split("|")] for row in table.strip().splitlines())
-    return [(tool, [cell.split() for cell in cells]) for tool, *cells in rows]
-
-
-def _fingers(names: list[str], joints: list[str], thumb: list[str]) -> dict[str, tuple[str, ...]]:
-    parts = [joints] * 4 + [thumb]
-    rows = zip(FINGERS, names, parts, strict=True)
-    return {finger: tuple(name + joint for joint in outwards) for finger, name, outwards in rows}
-
-
-def _conventions() -> tuple[Convention, ...]:
-    hands = {tool: _fingers(*cells) for tool, cells in _cells(_HANDS)}
-    limbs = [
-        (tool, [tuple(word.strip("-") for word in cell) for cell in cells]) for tool, cells in _cells(_TABLE)
-    ]
-    return tuple(
-        Convention(tool, trunk, neck, leg, arm, hands.get(tool, {}))
-        for tool, (trunk, neck, leg, arm) in limbs
-    )
-
-
-CONVENTIONS = _conventions()
+CONVENTIONS = tuple(_conventions())
 
 _ENDS = ("end", "leaf", "nub", "site", "tip", "top")
 _HANDLES = ("ctrl", "eff", "effector", "helper", "ik", "pole", "prop", "target", "weapon")

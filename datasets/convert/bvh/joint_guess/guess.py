@@ -98,17 +98,16 @@ class JointGuess:
         shown = ", ".join(rows[:8]) + (f" and {len(rows) - 8} more" if len(rows) > 8 else "")
         return "; ".join([*self.problems, *([f"no certain joint for {shown}"] if rows else [])])
 
-    def text(self, skeleton: str = "") -> str:
-        """The map file; with `skeleton` it is for files of that one alone."""
+    def text(self, skeleton: str) -> str:
+        """The map file, for files of `skeleton` alone."""
         note = f"guessed from {self.source}: {self.summary()}"
         if not self.certain:
             todo = "Fill in the rows that say null" if self.open_rows else "Correct the rows"
             note += f". NOT CERTAIN: {self.doubts()}. {todo}"
         sources: list[tuple[str, ...] | None] = [row.sources or None for row in self.rows]
         candidates = {row.joint: list(row.candidates) for row in self.open_rows if row.candidates}
-        about = (("skeleton", skeleton), ("candidates", candidates), ("ends", dict(self.ends)))
-        more = {key: value for key, value in about if value}
-        return map_text(self.target, sources, note=note, unmapped=self.unmapped, **more)
+        more = {key: dict(value) for key, value in (("candidates", candidates), ("ends", self.ends)) if value}
+        return map_text(self.target, sources, note=note, unmapped=self.unmapped, skeleton=skeleton, **more)
 
 
 _SLOTS: dict[Kind, tuple[str, str, str, str]] = {
