@@ -11,7 +11,7 @@ Legend: B batch, T frames, D features (the columns of a part), N joints, P piece
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +20,6 @@ from torch import Tensor
 
 from motionloom.datasets.motion.features.torch_joints import torch_joints_of, torch_way
 from motionloom.datasets.motion.layout import LOWER, PIECES, ROOT, MotionLayout, piece_columns, step_columns
-from motionloom.datasets.schema import UserError
 
 PLACE_COLUMNS = 6
 """z, x, cosine and sine of the heading, whether the place is known, and whether the heading is."""
@@ -32,9 +31,8 @@ def observed_width(motion_dim: int) -> int:
 
 
 class Recovery:
-    """Recovers joints from the `columns` of a layout, normalised by `mean` and `std` [D] of its columns.
-
-    `UserError` where the columns do not hold the root.
+    """Recovers joints from the `columns` of a layout, where they hold the root (`possible`); `mean` and `std`
+    [D] of the layout's columns normalise them.
     """
 
     def __init__(
@@ -46,10 +44,6 @@ class Recovery:
     ) -> None:
         self.layout, self.columns = layout, columns
         self._mean, self._std = torch.from_numpy(mean[columns]), torch.from_numpy(std[columns])
-        if not self.possible(self.layout, columns):
-            raise UserError(
-                "places are recovered from motion features with the root; these columns have none"
-            )
         self._body = self.layout.without_face()
         own = self.layout.part("bodyhand")
         known = np.isin(own, columns)
@@ -102,8 +96,7 @@ def turned_back(place: Tensor, heading: Tensor) -> Tensor:
     return torch.stack([z * cosine + x * sine, x * cosine - z * sine], dim=-1)
 
 
-@dataclass(frozen=True)
-class Places:
+class Places(NamedTuple):
     """The root's place and heading where they are known, relative to each row's `anchor` frame."""
 
     anchor: Tensor
@@ -147,29 +140,23 @@ class Observations:
     """Draws what training observes of each motion.
 
     Args:
-        layout: The layout of whole frames; the motions have these `columns` of it.
-        recovery: Recovers the root's path; None where the columns hold no root, then no places are observed.
+        layout: The layout of whole frames; the motions have these `columns` of it. Where they hold no root,
+            no places are observed.
+        mean, std: Statistics of the layout's columns, by which the motions are normalised.
         share: Share of the motions of which anything is observed.
     """
 
     def __init__(
-        self, layout: MotionLayout, columns: NDArray[np.int64], recovery: Recovery | None, share: float
-    ) -> None:
-        self.layout, self.columns, self.recovery, self.share = layout, columns, recovery, share
-
-    @classmethod
-    def of(
-        cls,
+        self,
         layout: MotionLayout,
         columns: NDArray[np.int64],
         mean: NDArray[np.float32],
         std: NDArray[np.float32],
         share: float,
-    ) -> Observations:
-        """Return those of motion normalised by `mean` and `std`."""
+    ) -> None:
         rooted = Recovery.possible(layout, columns)
-        recovery = Recovery(layout, columns, mean, std) if rooted else None
-        return cls(layout, columns, recovery, share)
+        self.recovery = Recovery(layout, columns, mean, std) if rooted else None
+        self.layout, self.columns, self.share = layout, columns, share
 
     def __call__(self, motion: Tensor, length: Tensor) -> Tensor:
         """Return the observed columns [B, T, 2 D + 6] of motion [B, T, D] with `length` [B] real frames."""

@@ -21,8 +21,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
-
 _FPS = 60.0
 """Frame rate at which the published widths are counted."""
 
@@ -57,7 +55,7 @@ def motion_beats(
     from scipy.ndimage import gaussian_filter1d
     from scipy.signal import argrelextrema
 
-    how = _definition(definition)
+    how = DEFINITIONS[definition]
     steps = np.linalg.norm(np.diff(np.asarray(joints, dtype=np.float64), axis=0), axis=-1).mean(1)
     if how.late:
         steps = np.concatenate([[0.0], steps])
@@ -70,13 +68,13 @@ def motion_beats(
 def beat_align(
     joints: NDArray[np.floating], music: NDArray[np.floating], fps: float, definition: str = "bailando"
 ) -> float:
-    """Beat Align of joints [T, N, 3] and music beats in seconds [M], 0 to 1; 0 without motion beats."""
-    how = _definition(definition)
+    """Beat Align of joints [T, N, 3] and music beats in seconds [M], one of them within the motion; 0 to 1, 0
+    without motion beats.
+    """
+    how = DEFINITIONS[definition]
     last = len(joints) - (0 if how.late else 1)
     # Beats on the last frame have no step of their own; rounding keeps frame / fps * fps whole.
     inside = np.asarray(music, dtype=np.float64)[np.round(np.asarray(music) * fps, 6) < last]
-    if not len(inside):
-        raise UserError("Beat Align needs at least one beat of the music within the motion")
     return alignment(inside, motion_beats(joints, fps, definition), how.average, how.sigma / _FPS)
 
 
@@ -92,9 +90,3 @@ def alignment(
     away = np.abs(np.asarray(music, dtype=np.float64)[:, None] - np.asarray(motion, dtype=np.float64)[None])
     nearest = away.min(1 if average == "music" else 0)
     return float(np.exp(-(nearest**2) / (2 * sigma**2)).mean())
-
-
-def _definition(name: str) -> BeatDefinition:
-    if name not in DEFINITIONS:
-        raise UserError(f"no Beat Align definition '{name}'; known: {', '.join(DEFINITIONS)}")
-    return DEFINITIONS[name]

@@ -14,8 +14,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
-
 Array = NDArray[np.float64]
 
 KINETIC_SECONDS = 1 / 60
@@ -48,8 +46,6 @@ def zero_start(joints: NDArray[np.floating]) -> Array:
 def kinetic_features(joints: NDArray[np.floating]) -> Array:
     """Joints [T >= 3, N, 3], Y up -> [3 N]: horizontal and vertical energy, energy spent, joint by joint."""
     x = np.asarray(joints, dtype=np.float64)
-    if x.ndim != 3 or len(x) < 3:
-        raise UserError(f"kinetic features need joints [T >= 3, N, 3], not {list(x.shape)}")
     steps = np.diff(x, axis=0)
     velocity = _windowed(steps, 1, len(x)) / KINETIC_SECONDS
     horizontal = (velocity[..., [0, 2]] ** 2).sum(-1).mean(0)
@@ -75,10 +71,7 @@ def _windowed(values: Array, first: int, frames: int) -> Array:
 
 def manual_features(joints: NDArray[np.floating]) -> Array:
     """Joints [T >= 2, N >= 22, 3], Y up -> [32]: how often each of 32 geometric statements is true."""
-    if joints.ndim != 3 or len(joints) < 2 or joints.shape[1] < len(_NAMES):
-        raise UserError(f"geometric features need joints [T >= 2, N >= 22, 3], not {list(joints.shape)}")
-    poses = _Poses(np.asarray(joints, dtype=np.float64))
-    return np.asarray(poses.statements().mean(1))
+    return np.asarray(_Poses(np.asarray(joints, dtype=np.float64)).statements().mean(1))
 
 
 class _Poses:

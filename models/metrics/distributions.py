@@ -15,13 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from motionloom.datasets.schema import UserError
-
 
 def statistics(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean [Z] and covariance [Z, Z] (N - 1 in the denominator) of embeddings [N, Z], float64 on the CPU."""
-    if x.dim() != 2 or len(x) < 2:
-        raise ValueError(f"a covariance needs at least two rows of embeddings, got {tuple(x.shape)}")
+    """Mean [Z] and covariance [Z, Z], over N - 1, of embeddings [N >= 2, Z]; float64 on the CPU."""
     x = x.cpu().double()
     mean = x.mean(0)
     centred = (x - mean).numpy(force=True)
@@ -73,15 +69,13 @@ def diversity(x: Tensor, *, pairs: int = 300, seed: int = 0) -> Tensor:
 
 
 def multimodality(x: Tensor, *, pairs: int = 10, seed: int = 0) -> Tensor:
-    """Mean distance of `pairs` random pairs among the repeats of each text: x [texts, repeats, Z]. Scalar
-    float64.
+    """Mean distance of `pairs` random pairs among the repeats of each text: x [texts, repeats >= 2, Z].
+    Scalar float64.
 
     The published draw may pair a repeat with itself. With fewer repeats than `pairs` that would be most of
     what is drawn: then it is the mean of all pairs.
     """
     count = x.shape[1]
-    if count < 2:
-        raise UserError("MModality needs two samples of each text at least; sample more")
     if count < pairs:
         first, second = torch.triu_indices(count, count, 1)
     else:

@@ -43,20 +43,13 @@ class PositionErrors(NamedTuple):
 def position_errors(
     made: Tensor, real: Tensor, *, sides: tuple[tuple[int, int], ...] = _SIDES
 ) -> PositionErrors:
-    """Return the errors of a motion against the recorded one, [T, N, 3] each, metres, Y up.
+    """Return the errors of a motion against the recorded one, [T >= 2, N, 3] each, metres, Y up.
 
     Args:
         made: The motion that is judged.
         real: The recorded one.
         sides: (left, right) joints that say where the body faces; `PUBLIC_SIDES` for public code's figures.
-
-    Raises:
-        ValueError: The two have other shapes, or less than two frames, which have no variance.
     """
-    if made.shape != real.shape:
-        raise ValueError(f"motions [T, N, 3] of one shape, not {list(made.shape)} and {list(real.shape)}")
-    if len(made) < 2:
-        raise ValueError("APE and AVE need two frames or more")
     ape, ave = [], []
     for one, other in zip(_views(made, sides), _views(real, sides), strict=True):
         ape.append(torch.linalg.vector_norm(one - other, dim=-1).mean().item())

@@ -41,21 +41,10 @@ from motionloom.pipeline.render.body.mesh import (
 )
 from motionloom.pipeline.render.sound import Segments, embed_sounds, score_data
 
-SCRIPTS = [
-    "space",
-    "ground",
-    "sticks",
-    "clip",
-    "mesh",
-    "bones",
-    "shaders",
-    "gl",
-    "stage",
-    "board",
-    "score",
-    "sound",
+SCRIPTS = (
+    "space", "ground", "sticks", "clip", "mesh", "bones", "shaders", "gl", "stage", "board", "score", "sound",
     "app",
-]
+)  # fmt: skip
 """The files of `web/viewer`, in the order that they need each other."""
 FACE_STEP = 1e-3
 """Step of the integers that carry face controls."""

@@ -14,7 +14,7 @@ from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import PIECES, MotionLayout
 from motionloom.models.diffusion.module import DenoiserModule, InBetweenModule, TextDenoiserModule
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener, TextDenoiserConfig
-from motionloom.models.diffusion.observed import Observations, Recovery
+from motionloom.models.diffusion.observed import Observations
 from motionloom.models.evaluator.module import EvaluatorModule
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.models.gpt.losses import GptLossConfig
@@ -181,7 +181,7 @@ def inbetweener() -> tuple[StageModule, Batches]:
     layout, columns = BODY["layout"], BODY["layout"].part("all")
     config = InBetweenConfig(dim=16, ff=16, layers=1, heads=2, frames_per_token=1)
     net = InBetweener(config, 133, TEXT)
-    observations = EndsObserved(layout, columns, Recovery(layout, columns, BODY["mean"], BODY["std"]), 1.0)
+    observations = EndsObserved(layout, columns, BODY["mean"], BODY["std"], 1.0)
     module = undrawn(InBetweenModule)(net, OPTIM, seed=0, max_steps=STEPS, observations=observations)
     return module.eval(), lambda step: motion(step, 133) | captions(step)
 

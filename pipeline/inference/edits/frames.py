@@ -153,7 +153,7 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     if layout.has("face") and face is None:
         remarks.append("the clip has no face, so the model makes it")
     lead, clip_frames = round(task.lead * layout.fps), len(own)
-    total = lead + (clip_frames if task.seconds is None else max(1, round(task.seconds * layout.fps)))
+    total = lead + (clip_frames if task.seconds is None else max(2, round(task.seconds * layout.fps)))
     # A result that is shorter than the clip takes no notice of what the clip does later.
     own = own[: total - lead]
     features = features[: len(own)]

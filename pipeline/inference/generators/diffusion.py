@@ -99,9 +99,7 @@ class DiffusionMotion(DenoisedMotion):
         recovery = places = pins = None
         if Recovery.possible(layout, columns):
             recovery = Recovery(layout, columns, stats.mean, stats.std)
-            row = frames.places
-            known_places = (row.anchor, row.heading, row.place, row.heading_known, row.place_known)
-            places = Places(*(values.to(device) for values in known_places))
+            places = Places(*(values.to(device) for values in frames.places))
             if frames.pins:
                 at, joints = torch.tensor(list(frames.pins), device=device).T
                 pins = Pins(at, joints, torch.tensor(frames.model_pins, device=device))

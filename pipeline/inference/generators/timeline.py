@@ -11,6 +11,7 @@ Legend: B rows, G groups of four frames, L positions.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -28,28 +29,19 @@ from motionloom.pipeline.contract.generation import Stretch
 from motionloom.pipeline.contract.sampling import SamplingConfig
 
 
+@dataclass(frozen=True)
 class TokenTimeline:
-    """Makes tokens for stretches of conditions.
+    """Makes tokens for stretches of conditions."""
 
-    Args:
-        net: MATE and UTT.
-        window: Groups of a training window.
-        context: Groups that a window sees of what came before.
-        prepared: What the stages of the modalities give, by name, such as the statistics of music.
-        inject_z: Draw z.
-    """
-
-    def __init__(
-        self,
-        net: ConditionedUtt,
-        *,
-        window: int,
-        context: int,
-        prepared: Mapping[str, object],
-        inject_z: bool,
-    ) -> None:
-        self.net, self.window_groups, self.context = net, window, context
-        self.prepared, self.inject_z = prepared, inject_z
+    net: ConditionedUtt
+    window_groups: int
+    """Groups of a training window."""
+    context: int
+    """Groups that a window sees of what came before."""
+    prepared: Mapping[str, object]
+    """Outputs of the stages of the modalities, by name, such as the statistics of music."""
+    inject_z: bool
+    """Draw z."""
 
     @torch.no_grad()
     def tokens(self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig) -> Codes:

@@ -86,7 +86,7 @@ class UdeGenerator(OfTokens):
     def timeline(self) -> TokenTimeline:
         return TokenTimeline(
             self.utt.net,
-            window=self.utt.max_frames // GROUP_FRAMES,
+            window_groups=self.utt.max_frames // GROUP_FRAMES,
             context=self.config.context_frames // GROUP_FRAMES,
             prepared=self.prepared,
             inject_z=self.config.inject_z,

@@ -38,7 +38,7 @@ class InBetweenStage(DenoiserStage[InBetweenStageConfig, InBetweener]):
         # A dry run has no statistics.
         stats = inputs.stats or FeatureStats.unit(inputs.data.layout)
         share = config.net.observed_share
-        return {"observations": Observations.of(stats.layout, columns, stats.mean, stats.std, share)}
+        return {"observations": Observations(stats.layout, columns, stats.mean, stats.std, share)}
 
 
 register(InBetweenStage())

@@ -9,7 +9,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.dance import (
     dance_diversity,
     dance_fid,
@@ -102,10 +101,6 @@ def test_alignment_without_beats() -> None:
     assert beat_align(still, np.array([0.5]), 60.0) == 0
     assert alignment(np.array([1.0]), np.array([1.0, 5.0]), "music", 0.05) == 1
     assert np.isclose(alignment(np.array([1.0]), np.array([1.0, 5.0]), "motion", 0.05), 0.5)
-    with pytest.raises(UserError, match="beat of the music"):
-        beat_align(still, np.array([5.0]), 60.0)
-    with pytest.raises(UserError, match="bailando, ude"):
-        beat_align(still, np.array([0.5]), 60.0, "beatles")
 
 
 def test_sliding_feet_are_counted() -> None:
@@ -134,10 +129,6 @@ def test_accuracy_among_candidates() -> None:
     )
     first = float((near.argmax(1) == torch.arange(80)).double().mean())
     assert accuracy_among(motion, text, candidates=80)["top-1"] == first
-    same = torch.zeros(80, 80, dtype=torch.bool)
-    same[:, :40] = True
-    with pytest.raises(UserError, match="evaluate more clips"):
-        accuracy_among(motion, text, same=same)
     twins = torch.cat([text, text])
     equal = torch.eye(80, dtype=torch.bool).repeat(2, 2)
     assert accuracy_among(twins, twins, candidates=150, same=equal)["top-1"] == 1
@@ -184,9 +175,3 @@ def test_height_and_depth_are_millimetres_and_jitter_is_the_third_derivative() -
     joints = standing()
     joints[..., 2] += t[:, None] ** 2
     assert physics(joints, FPS).jitter == pytest.approx(0.0, abs=1e-9)
-
-
-def test_what_is_no_body_is_refused() -> None:
-    for shape in ((3, 22, 3), (40, 8, 3), (40, 22), (40, 22, 2)):
-        with pytest.raises(UserError, match=r"\[T >= 4"):
-            physics(np.zeros(shape), FPS)

@@ -8,7 +8,6 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.distributions import diversity, fid, frechet_distance, multimodality
 from motionloom.models.metrics.retrieval import matching_score, r_precision, ranks, recall
 
@@ -96,13 +95,6 @@ def test_a_collapsed_encoder_is_not_perfect() -> None:
     assert ranks(-(text @ text.T)).tolist() == [0.5, 0.5, 0, 0]
 
 
-def test_mistakes_are_named() -> None:
-    with pytest.raises(ValueError, match="needs both"):
-        recall(torch.eye(2), torch.eye(2), threshold=0.9)
-    with pytest.raises(ValueError, match="row-aligned"):
-        r_precision(torch.eye(2), torch.eye(3))
-
-
 # FID, Diversity and MModality against golden vectors of T2M-GPT and OpenTMA, and known Gaussians.
 
 WIDTH = 24
@@ -125,8 +117,6 @@ def test_of_few_repeats_all_pairs_count_whatever_the_seed(seed: int) -> None:
     assert multimodality(torch.tensor([[[0.0], [3.0]], [[1.0], [2.0]]]), seed=seed).item() == 2
     assert multimodality(torch.tensor([[[0.0], [1.0], [5.0]]]), seed=seed).item() == pytest.approx(10 / 3)
     assert diversity(torch.ones(5, 3)).item() == 0
-    with pytest.raises(UserError, match="two samples"):
-        multimodality(torch.zeros(2, 1, 3))
 
 
 def commuting(spread: torch.Tensor, other: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, float]:

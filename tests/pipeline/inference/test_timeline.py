@@ -53,7 +53,7 @@ def timeline(net: ConditionedUtt) -> TokenTimeline:
 
 def line_of(net: ConditionedUtt, **settings: Any) -> TokenTimeline:
     stats = FrameStats(np.full(2, MEAN, np.float32), np.full(2, STD, np.float32), 100)
-    given = {"window": WINDOW, "context": CONTEXT, "prepared": {"audio": stats}, "inject_z": True}
+    given = {"window_groups": WINDOW, "context": CONTEXT, "prepared": {"audio": stats}, "inject_z": True}
     return TokenTimeline(net, **{**given, **settings})
 
 

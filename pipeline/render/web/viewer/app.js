@@ -45,7 +45,7 @@ function mountViewer(root, data, options) {
   const state = { time: 0, playing: !calm, speed: 1, follow: true, draws: 0, close: false };
   const camera = { yaw: 0, pitch: 0, zoom: 1, panX: 0, panY: 0 };
   let theme, stale = true, dragging = 0, printing = false;
-  const stage = clips.some((clip) => clip.pose) ? openStage() : null, pace = stage && watchPace(stage);
+  const stage = clips.some((clip) => clip.pose) ? openStage() : null;
   const life = new AbortController(), whileHere = { signal: life.signal };
   const refresh = () => { stale = true; };
 
@@ -73,7 +73,6 @@ function mountViewer(root, data, options) {
     if (!on) state.time = player.halt(state.time);
     else if (state.time >= duration) state.time = 0;
     state.playing = on;
-    if (on && pace) pace.begin(clips.length);
     bar.play.textContent = on ? "❚❚" : "▶";
     bar.play.setAttribute("aria-label", on ? "Pause" : "Play");
     bar.play.title = on ? "Pause (space)" : "Play (space)";
@@ -164,7 +163,7 @@ function mountViewer(root, data, options) {
     const own = Math.round(local), over = state.time > clip.duration + 0.5 / clip.fps;
     cell.count.textContent = `${own + 1} / ${clip.frames}${over ? " · ended" : ""}`;
     if (stage && stage.ready && clip.pose) {
-      const item = stageItem(stage, clip, lens, local, face, theme, state.playing && !printing ? stage.quality : 0);
+      const item = stageItem(stage, clip, lens, local, face, theme, state.playing && !printing ? clips.length : 0);
       return item && Object.assign(item, { ctx });
     }
     drawSticks(ctx, lens, clip, local, theme);
@@ -178,7 +177,7 @@ function mountViewer(root, data, options) {
   let before = 0;
   const tick = (now) => {
     if (life.signal.aborted) return;
-    const between = now - before, passed = Math.min(between / 1000, 0.1);
+    const passed = Math.min((now - before) / 1000, 0.1);
     before = now;
     if (state.playing && !dragging && duration > 0) {
       state.time = player.advance(state.time, passed);
@@ -187,9 +186,7 @@ function mountViewer(root, data, options) {
     } else player.rest();
     if (stale && !printing) {
       stale = false;
-      const start = performance.now();
       paintAll(cells.filter((cell) => cell.visible));
-      if (pace && state.playing) pace.note(performance.now() - start, between);
       const shown = Math.min(state.time, duration);
       bar.scrub.value = frame();
       const segment = lead ? segmentAt(lead.score, state.time) : null;

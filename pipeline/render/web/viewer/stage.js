@@ -8,12 +8,7 @@ const LAMP_SLOPE = [LAMP_ABOVE[0] / LAMP_ABOVE[1], LAMP_ABOVE[2] / LAMP_ABOVE[1]
 const SHADOW_SPREAD = 0.11; // metres over which the shadow's rim is soft
 const BODY_REACH = 0.15, HEAD_REACH = 0.27; // how far the body goes beyond its joints, metres
 const NEAR_DETAIL = 400; // a figure of so many pixels is drawn with all vertices
-const SLOW = 21, OURS = 4; // milliseconds between frames from which on quality is traded for pace, where drawing takes so many of them
-
-/* Pixels a CSS pixel at most, and whether only the far detail is drawn; what stands still has the first. */
-const QUALITIES = [{ ratio: 2, coarse: false }, { ratio: 1, coarse: false }, { ratio: 1, coarse: true }, { ratio: 0.7, coarse: true }];
-const FIRST = 8; // pictures that say nothing yet: programs are compiled, meshes fitted, buffers made
-const FEW = 2; // without a GPU, more figures than that start with the far detail
+const FEW = 2; // without a GPU, more moving figures than that have the far detail
 
 /* The page's stage, or null: no WebGL2, no body, or `?view=2d` in the address. */
 const openStage = (() => {
@@ -36,7 +31,7 @@ function makeStage() {
   canvas.addEventListener("webglcontextlost", (event) => { event.preventDefault(); painter = null; changed(); });
   canvas.addEventListener("webglcontextrestored", () => { painter = makePainter(gl); changed(); });
 
-  const stage = { canvas, gl, software, quality: 0, watchers, get ready() { return painter !== null; } };
+  const stage = { canvas, gl, software, watchers, get ready() { return painter !== null; } };
   /* Draws the items and hands each to `show(item)`, its picture in `item.source` of the canvas. */
   stage.draw = (items, show) => {
     for (let rest = items; rest.length && painter;) {
@@ -94,17 +89,18 @@ function packed(items, limit) {
   return { group, width: steps(width), height: steps(y + shelf) };
 }
 
-/* What the stage needs to draw a clip's frame, or null where nothing of it is in view. */
-function stageItem(stage, clip, lens, frame, face, theme, quality) {
+/* What the stage needs to draw a clip's frame, or null where nothing of it is in view; `moving` figures, none in a still picture. */
+function stageItem(stage, clip, lens, frame, face, theme, moving) {
   const bones = bonesAt(clip, frame), pose = clip.pose, level = clip.floor - SOLE, size = pose.size;
   const field = shadowField(pose.places, level, size), box = figureBox(lens, clip, field, level);
   if (!box) return null;
-  const pixels = window.devicePixelRatio || 1, ratio = Math.min(stage.software && quality === 0 ? 2 * pixels : pixels, QUALITIES[quality].ratio);
+  const pixels = window.devicePixelRatio || 1, hasty = stage.software && moving > 0, coarse = hasty && moving > FEW;
+  const ratio = hasty ? Math.min(pixels, 1) : Math.min(stage.software ? 2 * pixels : pixels, 2);
   const tall = ((1.7 * size * lens.focal) / Math.max(lens.distance, NEAR)) * ratio;
-  const detail = QUALITIES[quality].coarse || tall < NEAR_DETAIL ? 1 : 0;
+  const detail = coarse || tall < NEAR_DETAIL ? 1 : 0;
   return {
     clip, lens, box, ratio, detail, field, level, palette: theme.palette, shadow: theme.fallen, face: faceWeights(face),
-    bones, taps: QUALITIES[quality].coarse ? 5 : 10,
+    bones, taps: coarse ? 5 : 10,
   };
 }
 
@@ -139,22 +135,4 @@ function figureBox(lens, clip, [x, z, width, depth], level) {
   const room = [lens.width, lens.height], start = [0, 1].map((i) => (near ? 0 : Math.floor(clamp(low[i], 0, room[i]))));
   const end = [0, 1].map((i) => (near ? room[i] : Math.ceil(clamp(high[i], 0, room[i]))));
   return end[0] > start[0] && end[1] > start[1] ? [...start, end[0] - start[0], end[1] - start[1]] : null;
-}
-
-/* Steps down through the qualities where pictures come late, a step a second at most; starts again with `begin`. */
-function watchPace(stage) {
-  let spent = 0, gap = 0, count = 0;
-  const begin = (figures) => { stage.quality = !stage.software ? 0 : figures > FEW ? 2 : 1; spent = gap = 0; count = -FIRST; };
-  const note = (milliseconds, between) => {
-    count += 1;
-    if (count <= 0) return;
-    const weight = Math.max(1 / count, 0.08);
-    spent += weight * (milliseconds - spent);
-    gap += weight * (Math.min(between, 100) - gap);
-    if (count >= 24 && gap > SLOW && spent > OURS && stage.quality < QUALITIES.length - 1) {
-      stage.quality += 1;
-      count = -FIRST;
-    }
-  };
-  return { begin, note };
 }
