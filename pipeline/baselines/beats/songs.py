@@ -17,8 +17,7 @@ from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.genres import GENRES
-from motionloom.datasets.synth.music.recording import record, render_song
-from motionloom.datasets.synth.music.scores import excerpt, scores
+from motionloom.datasets.synth.music.recording import render_song
 from motionloom.datasets.synth.music.song import Song, draw_song
 from motionloom.pipeline.contract.stage import (
     CompletedStage,
@@ -45,20 +44,6 @@ class SongsConfig(StageConfig):
     """Share of the songs that is not trained on: the last ones."""
     played: bool = True
     """By a band; otherwise by the built-in synthesiser, as metronomes."""
-
-    scores: Path | None = None
-    """A folder of MIDI files (*.mid); every second song is an excerpt of one of them."""
-
-    def annotated(self, number: int) -> AnnotatedSong:
-        """Return one of the songs, rendered; seconds of work."""
-        if self.scores is None or number % 2 == 0:
-            return AnnotatedSong.of(self.song(number))
-        pieces = scores(self.scores)
-        kept = max(1, round(len(pieces) * self.validation))  # whole pieces are kept back
-        own = pieces[-kept:] if number in self.split(True) else pieces[:-kept] or pieces
-        rng = np.random.default_rng([self.seed, number, 263])
-        dry, beats, downbeats = excerpt(own[number // 2 % len(own)], self.song_seconds, RENDER_RATE, rng)
-        return AnnotatedSong.of_samples(record(dry, RENDER_RATE, rng), beats, downbeats)
 
     def song(self, number: int) -> Song:
         """Return one of the band's songs."""
@@ -94,14 +79,8 @@ class AnnotatedSong:
         first = song.beat_number(0.0)
         beats = np.array(song.beats_within(0.0, song.seconds))
         downbeats = (first + np.arange(len(beats))) % song.meter == 0
-        return cls.of_samples(render_song.__wrapped__(song, RENDER_RATE), beats, downbeats)
-
-    @classmethod
-    def of_samples(
-        cls, samples: NDArray[np.float32], beats: NDArray[np.float64], downbeats: NDArray[np.bool_]
-    ) -> AnnotatedSong:
-        """Return the song of samples [n] at the rate of rendering, with the seconds of their beats."""
-        return cls(levels(band_power(Sound(samples, RENDER_RATE))).astype(np.float16), beats, downbeats)
+        sound = Sound(render_song.__wrapped__(song, RENDER_RATE), RENDER_RATE)
+        return cls(levels(band_power(sound)).astype(np.float16), beats, downbeats)
 
     def save(self, path: Path) -> None:
         """Write it as .npz."""
@@ -157,7 +136,7 @@ def _path(folder: Path, number: int) -> Path:
 
 
 def _render(config: SongsConfig, folder: Path, number: int) -> None:
-    config.annotated(number).save(_path(folder, number))
+    AnnotatedSong.of(config.song(number)).save(_path(folder, number))
 
 
 register(SongsStage())

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
-import mido
 import numpy as np
 import pytest
 
@@ -14,7 +12,6 @@ from motionloom.datasets.synth.music import band
 from motionloom.datasets.synth.music.band import Instruments, sound_font
 from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.recording import render_song
-from motionloom.datasets.synth.music.scores import excerpt, read_score, scores
 from motionloom.datasets.synth.music.song import Song, draw_song
 
 RATE = 16_000
@@ -81,70 +78,6 @@ def test_strokes_fall_on_the_grid_and_a_break_rings() -> None:
                 begin, end = song.times([beat, beat + 1])
                 assert not ((struck > begin - 1e-6) & (struck < end - 1e-6)).any()
     assert straight and breaks
-
-
-def composed(path: Path, ticks_of_notes: list[int], *meta: mido.MetaMessage, bars: int = 40) -> None:
-    """A MIDI file of 96 ticks a quarter with a struck snare at these ticks of every 384."""
-    track = mido.MidiTrack(meta)
-    now = 0
-    for at in (384 * bar + tick for bar in range(bars) for tick in ticks_of_notes):
-        track.append(mido.Message("note_on", channel=9, note=38, velocity=110, time=at - now))
-        track.append(mido.Message("note_off", channel=9, note=38, time=6))
-        now = at + 6
-    file = mido.MidiFile(ticks_per_beat=96)
-    file.tracks.append(track)
-    file.save(path)
-
-
-def tempo(bpm: float) -> mido.MetaMessage:
-    return mido.MetaMessage("set_tempo", tempo=mido.bpm2tempo(bpm))
-
-
-def test_scores_count_their_beats(tmp_path: Path) -> None:
-    file = tmp_path / "piece.mid"
-    composed(file, [0, 96, 192, 288], tempo(120))
-    plain = read_score(file)
-    assert plain.beats == pytest.approx(np.arange(len(plain.beats)) / 2) and plain.first == 0.0
-    assert np.flatnonzero(plain.downbeats).tolist() == list(range(0, len(plain.beats), 4))
-    composed(file, [0, 96, 192, 288], tempo(240))  # twice as fast as people count
-    assert np.diff(read_score(file).beats) == pytest.approx(0.5)
-    composed(file, [0, 96, 192, 288], tempo(40))
-    assert np.diff(read_score(file).beats) == pytest.approx(0.75)
-    waltz = mido.MetaMessage("time_signature", numerator=6, denominator=8)
-    composed(file, [0, 144, 288], tempo(120), waltz)
-    assert (
-        np.diff(read_score(file).beats) == pytest.approx(0.75) and read_score(file).downbeats[:4].sum() == 2
-    )
-
-
-@pytest.mark.parametrize(("ticks", "counted"), [([0, 96, 192, 288], True), ([48, 144, 240, 336], False)])
-def test_a_score_that_is_not_counted_on_its_beats_is_left_out(
-    tmp_path: Path, ticks: list[int], counted: bool
-) -> None:
-    composed(tmp_path / "piece.mid", ticks, tempo(120))
-    if counted:
-        assert len(scores(tmp_path)) == 1
-    else:
-        with pytest.raises(UserError, match="no MIDI file"):
-            scores(tmp_path)
-
-
-def test_a_damaged_score_is_named(tmp_path: Path) -> None:
-    (tmp_path / "piece.mid").write_bytes(b"MThd\0\0\0\x06nothing")
-    with pytest.raises(UserError, match=r"piece\.mid"):
-        read_score(tmp_path / "piece.mid")
-
-
-def test_an_excerpt_sounds_on_its_beats(tmp_path: Path) -> None:
-    _font()
-    composed(tmp_path / "piece.mid", [0, 96, 192, 288], tempo(100))
-    (piece,) = scores(tmp_path)
-    sounds, beats, downbeats = excerpt(piece, 8.0, RATE, np.random.default_rng(1))
-    assert len(sounds) == 8 * RATE and downbeats.sum() in (2, 3, 4)
-    power = np.convolve(np.square(sounds), np.ones(RATE // 50), "same")
-    for beat in beats[(beats > 0.1) & (beats < 7.8)]:
-        at = round(beat * RATE)
-        assert power[at : at + RATE // 20].max() > 10 * power[at - RATE // 20 : at - RATE // 40].max()
 
 
 def test_without_a_sound_font_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
