@@ -1,4 +1,4 @@
-"""Progress and telemetry of a training: the bar, and per rank speed, step times, waits, a profile on request.
+"""Progress and telemetry of a training: the bar, and per rank speed, use, waits, a profile on request.
 
 A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, which the report draws.
 """
@@ -12,7 +12,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import torch
@@ -27,7 +27,8 @@ from motionloom.datasets.base.progress import Pace, bar
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
 from motionloom.pipeline.store.files import open_own
-from motionloom.pipeline.store.training_log import FLIGHT, read_rows
+from motionloom.pipeline.store.training_log import FLIGHT, optional, read_rows
+from motionloom.pipeline.training.utilization import Utilization
 
 
 class WaitTimes(dict[str, float]):
@@ -35,11 +36,17 @@ class WaitTimes(dict[str, float]):
 
     `data`: for the next batch, what the reader had not prepared while the step before it was computed;
     `checkpoints`: for copying the state, and for the checkpoint before it if that was still being written;
+    `validation`: for the losses on held-out data;
     `ranks`: for ranks that came later to a step.
     """
 
     def __init__(self) -> None:
-        super().__init__(data=0.0, checkpoints=0.0, ranks=0.0)
+        super().__init__(data=0.0, checkpoints=0.0, validation=0.0, ranks=0.0)
+
+    @property
+    def aside(self) -> float:
+        """Seconds in which no step was taken."""
+        return self["checkpoints"] + self["validation"]
 
     @contextmanager
     def waiting_for(self, cause: str) -> Iterator[None]:
@@ -56,12 +63,26 @@ class WaitTimes(dict[str, float]):
 
 
 class Telemetry:
-    """Measures the steps of one process; `folder` is the stage's."""
+    """Measures the steps of one process; `folder` is the stage's. A step has `flops`, of a known `peak` or 0.
 
-    def __init__(self, folder: Path, module: StageModule, batch_size: int) -> None:
-        self.module, self.batch_size = module, batch_size
+    No error in writing ends the training: the rest of the rows are only shown then.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        module: StageModule,
+        batch_size: int,
+        console: Console,
+        flops: float = 0.0,
+        peak: float | None = None,
+    ) -> None:
+        self.module, self.batch_size, self.console = module, batch_size, console
         self.waits = WaitTimes()
-        self._log = folder / FLIGHT / f"rank_{rank()}.jsonl"
+        self.note = ""
+        """Speed, MFU and goodput of the last row, in words."""
+        self._shown: list[str] = []
+        self._log: Path | None = None
         self._first = module.step
         self._start = self._step_start = self._row_start = time.perf_counter()
         self._before = dict(self.waits)
@@ -73,9 +94,16 @@ class Telemetry:
         self._latest: deque[float] = deque(maxlen=100)
         self._lengths: list[Tensor] = []
         self._units, self._unit = 0.0, ""
-        # Rows of later steps, which come again, are dropped.
-        kept = [row for row in read_rows(self._log) if row["step"] <= module.step]
-        write_text(self._log, "".join(json.dumps(row) + "\n" for row in kept))
+        if module.device.type == "cuda":
+            torch.cuda.reset_peak_memory_stats(module.device)  # of the trainings before in this process
+        rows: list[dict[str, float]] = []
+        with self._optional():
+            path = folder / FLIGHT / f"rank_{rank()}.jsonl"
+            rows = read_rows(path)
+            # Rows of later steps, which come again, are dropped.
+            write_text(path, "".join(json.dumps(row) + "\n" for row in rows if row["step"] <= module.step))
+            self._log = path
+        self._use = Utilization(rows, module.step, flops=flops, peak=peak)
 
     def batch(self, batch: Batch) -> None:
         """A batch has been read: count its frames or tokens."""
@@ -93,6 +121,8 @@ class Telemetry:
         self._seconds.append(seconds)
         self._latest.append(seconds)
         self._own.append(seconds - (self.waits["data"] - self._data_before))
+        if self.module.step == self._first + 1:
+            self._use.start(self.waits.aside)
 
     def end_row(self) -> dict[str, float]:
         """Write a row; all ranks call this after the same step. What loggers get of it."""
@@ -104,19 +134,31 @@ class Telemetry:
         waited, self._before = self.waits.shares(self._before, wall), dict(self.waits)
         seconds, self._seconds, self._own = self._seconds, [], []
         units, latest = self._read_lengths(), sorted(self._latest)
+        has_first = self.module.step - self._first == len(seconds)
         row: dict[str, float] = {
             "samples_per_second": len(seconds) * self.batch_size / wall,
             "step_seconds": statistics.median(seconds),
             "step_seconds_p95": latest[-(-95 * len(latest) // 100) - 1],
             **{f"waited/{cause}": share for cause, share in waited.items()},
             "rss_mib": _rss_mib(),
+            **self._use.row(len(seconds) - has_first, self.waits.aside),
         }
         if self._unit:
             row[f"{self._unit}_per_second"] = units * world_size() / wall
         if self.module.device.type == "cuda":
             row["cuda_peak_mib"] = torch.cuda.max_memory_allocated(self.module.device) / 2**20
-        with open_own(self._log, "a") as file:
-            file.write(json.dumps({"step": self.module.step, **row}) + "\n")
+            # Between two rows, where it is waited for: a single step only starts its kernels.
+            row["step_seconds"] = self._use.step_seconds or row["step_seconds"]
+        self._shown = [f"goodput {100 * row['goodput']:.1f} %"]
+        if "mfu" in row:
+            self._shown.insert(0, f"MFU {100 * row['mfu']:.1f} %")
+        speed = [f"{row[f'{self._unit}_per_second']:,.0f} {self._unit}/s"] if self._unit else []
+        self.note = "  ".join(speed + self._shown)
+        path, self._log = self._log, None
+        if path is not None:
+            with self._optional(), open_own(path, "a") as file:
+                file.write(json.dumps({"step": self.module.step, **row}) + "\n")
+                self._log = path
         return {f"flight/{name}": value for name, value in row.items()}
 
     def summary(self) -> str:
@@ -133,7 +175,10 @@ class Telemetry:
             del shares["ranks"]
         named = {"ranks": "other ranks"}
         waits = [f"{100 * share:.1f} % for {named.get(cause, cause)}" for cause, share in shares.items()]
-        return f"{', '.join(speeds)}; waited {', '.join(waits)}"
+        return f"{', '.join(speeds + self._shown)}; waited {', '.join(waits)}"
+
+    def _optional(self) -> AbstractContextManager[None]:
+        return optional(f"telemetry of rank {rank()}", self.console)
 
     def _read_lengths(self) -> float:
         units = float(torch.cat([own.reshape(-1) for own in self._lengths]).sum()) if self._lengths else 0.0
@@ -174,26 +219,49 @@ WARM_UP = 10
 """Steps of a training before those that are profiled: kernels are chosen and caches filled in them."""
 
 
-def step_profiler(name: str, folder: Path, steps: int, left: int, console: Console) -> profile:
+class StepProfiler:
     """Profiles `steps` steps after the first `WARM_UP`, or the last of a training with fewer steps `left`.
 
-    Each process leaves a trace in the stage's `flight/` folder, which Perfetto and Chrome open.
+    Each process leaves a trace in the stage's `flight/` folder, which Perfetto and Chrome open. No error in
+    it ends the training.
     """
-    steps = min(steps, left)
-    before, path = min(WARM_UP, left - steps), folder / FLIGHT / f"profile_rank_{rank()}.json.gz"
 
-    def write(done: profile) -> None:
-        with atomic_path(path) as temporary:
+    def __init__(self, name: str, folder: Path, steps: int, left: int, console: Console) -> None:
+        self.name, self.steps, self.console = name, min(steps, left), console
+        self.path = folder / FLIGHT / f"profile_rank_{rank()}.json.gz"
+        self._profile: profile | None = None
+        if not self.steps:
+            return
+        before = min(WARM_UP, left - self.steps)
+        warm = min(1, before)
+        phases = schedule(wait=before - warm, warmup=warm, active=self.steps, repeat=1)
+        self._profile = profile(schedule=phases, on_trace_ready=self._write, record_shapes=True)
+
+    def start(self) -> None:
+        self._do("start")
+
+    def step(self) -> None:
+        """A step is over."""
+        self._do("step")
+
+    def stop(self) -> None:
+        self._do("stop")
+
+    def _do(self, name: str) -> None:
+        if self._profile is None:
+            return
+        with optional(f"profile of {self.name}", self.console):
+            getattr(self._profile, name)()
+            return
+        self._profile = None
+
+    def _write(self, done: profile) -> None:
+        with atomic_path(self.path) as temporary:
             whole = temporary.with_name(f"{temporary.name}.json.gz")  # torch packs what is called so
             done.export_chrome_trace(str(whole))
             whole.replace(temporary)
-        console.print(
-            f"    {name}: profile of {steps} steps in {path} (open it at ui.perfetto.dev)", soft_wrap=True
-        )
-
-    warm = min(1, before)
-    phases = schedule(wait=before - warm, warmup=warm, active=steps, repeat=1)
-    return profile(schedule=phases, on_trace_ready=write, record_shapes=True)
+        line = f"    {self.name}: profile of {self.steps} steps in {self.path} (open it at ui.perfetto.dev)"
+        self.console.print(line, soft_wrap=True)
 
 
 _REDRAW = 0.1
@@ -213,8 +281,8 @@ class StepProgress:
             self._bar.start()
             self._task = self._bar.add_task(name, total=steps, completed=first, note="")
 
-    def show(self, step: int, loss: Tensor) -> None:
-        """Move the bar, or print a line now and then."""
+    def show(self, step: int, loss: Tensor, more: str = "") -> None:
+        """Move the bar, or print a line now and then, with `more` behind loss and speed."""
         if self._bar is None:
             return
         terminal = self.console.is_terminal
@@ -225,7 +293,7 @@ class StepProgress:
             if now < self._next:  # reading a loss waits for the GPU
                 return
             self._next = now + _REDRAW
-        note = f"loss {float(loss):.4f}  {self.pace.speed(step):.1f} steps/s"
+        note = f"loss {float(loss):.4f}  {self.pace.speed(step):.1f} steps/s{more and f'  {more}'}"
         if terminal:
             self._bar.update(self._task, completed=step, note=note)
         else:

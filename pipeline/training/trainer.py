@@ -21,7 +21,6 @@ import torch
 import torch.distributed as dist
 from lightning.fabric import Fabric
 from torch import Tensor
-from torch.profiler import profile
 
 from motionloom.datasets.base.files import remove_temporaries
 from motionloom.datasets.schema import UserError
@@ -32,7 +31,7 @@ from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModul
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.process import Interrupted, TeamError
 from motionloom.pipeline.launch.team import lead_finds
-from motionloom.pipeline.store.training_log import CRASHES
+from motionloom.pipeline.store.training_log import CRASHES, optional
 from motionloom.pipeline.training.checkpointing import (
     BackgroundWriter,
     Checkpoint,
@@ -52,7 +51,8 @@ from motionloom.pipeline.training.execution import Execution, TrainingData, laun
 from motionloom.pipeline.training.failures import FailureGuard, StallTimer
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
-from motionloom.pipeline.training.telemetry import StepProgress, Telemetry, step_profiler
+from motionloom.pipeline.training.telemetry import StepProfiler, StepProgress, Telemetry
+from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 
 def fit(
@@ -119,6 +119,10 @@ class Training:
         # Validations fall on checkpoints, so that a resumed training makes the same ones.
         checkpoints = -(-config.validate_every // self.every)
         self.validate_every = checkpoints * self.every if data.validation is not None else 0
+        peak, flops = peak_flops(fabric.device, config.precision), 0.0
+        if peak is not None:
+            with optional(f"MFU of {name}", console):
+                flops = float(config.accumulate * pass_flops(module, data.train[0]))
         self.execution = Execution(fabric, module, config)
         self.average = AveragedWeights(module.net, config.ema) if config.ema else None
         title = f"{context.recipe}/{name}"
@@ -129,23 +133,21 @@ class Training:
             self._load(read_checkpoint(resume.checkpoint), longer=resume.longer)
         self.writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)
         self._saved, self._writing = module.step if resume.checkpoint else -1, False
-        self.telemetry = Telemetry(context.folder, module, config.batch_size)
+        self.telemetry = Telemetry(context.folder, module, config.batch_size, console, flops, peak)
         self.failures = FailureGuard(name, context.folder, module, data, console)
         self.stall = StallTimer(
             context.folder / CRASHES / f"stalled_rank_{rank()}.txt", hardware.stall_seconds
         )
-        self.profiler: profile | None = None
-        if hardware.profile and module.step < config.steps:
-            left = config.steps - module.step
-            self.profiler = step_profiler(name, context.folder, hardware.profile, left, console)
+        self.profiler = StepProfiler(
+            name, context.folder, hardware.profile, config.steps - module.step, console
+        )
 
     def run(self) -> None:
         self.log.open()
         self.progress = StepProgress(
             self.context.name, self.module.step, self.config.steps, self.context.console
         )
-        if self.profiler is not None:
-            self.profiler.start()
+        self.profiler.start()
         with Signals() as self.signals, self.stall.running():
             self.agreement = Agreement(self.signals, world_size())
             try:
@@ -159,8 +161,7 @@ class Training:
                 raise
             finally:
                 self.progress.close()
-                if self.profiler is not None:
-                    self.profiler.stop()
+                self.profiler.stop()
         summary = self.telemetry.summary()
         if summary:
             self.context.console.print(f"    {self.context.name}: {summary}")
@@ -194,13 +195,12 @@ class Training:
         if self.average is not None:
             self.average.update(self.module.net)
         self.telemetry.end_step()
-        if self.profiler is not None:
-            self.profiler.step()
+        self.profiler.step()
         if self.failures.due(step):
             self.failures.check(scaled=self.execution.scaler is not None)
         if step % LOG_EVERY == 0:
             self._log_row()
-        self.progress.show(step, loss)
+        self.progress.show(step, loss, self.telemetry.note)
         if self._writing and not self.writer.busy:
             self._finish_writing()
         self.stall.progress()
@@ -235,7 +235,8 @@ class Training:
         sums: dict[str, Tensor] = {}
         rows, cut = 0, False
         self.agreement.restart_pace()  # batches of a validation take another time than steps
-        with self.average.swapped(module.net) if self.average else nullcontext(), torch.no_grad():
+        averaged = self.average.swapped(module.net) if self.average else nullcontext()
+        with self.telemetry.waits.waiting_for("validation"), averaged, torch.no_grad():
             for number, batch in enumerate(loader):
                 batch = self.fabric.to_device(batch)
                 with self.fabric.autocast():

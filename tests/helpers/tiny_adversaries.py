@@ -76,7 +76,7 @@ class Vectors(Steps):
         generator = torch.Generator().manual_seed(step)
         rows = torch.randn(self.parts * self.batch, DIM, generator=generator, dtype=torch.float64)
         rows = rows[part * self.batch :][: self.batch][self.rows].to(self.dtype)
-        return {"x": rows, "length": torch.ones(len(rows)), "reader": torch.tensor(os.getpid())}
+        return {"x": rows, "length": torch.ones(len(rows)), "reader": os.getpid()}
 
 
 class Duel(AlternatingModule):
@@ -105,7 +105,7 @@ class Duel(AlternatingModule):
 
     def losses_of(self, group: str, batch: dict[str, Any], shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """Least-squares GAN with a reconstruction term."""
-        self.readers.add(int(batch["reader"]))
+        self.readers.add(batch["reader"])
         x = batch["x"]
         if group == "generator":
             made = self.net(x)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import json
 import re
+from io import StringIO
 from pathlib import Path
 
 import pytest
 import torch
-from tiny_adversaries import train
+from rich.console import Console
+from tiny_adversaries import DIM, Duel, Vectors, train
 
 from motionloom.datasets.base.files import write_text
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.stages.results.report_parts import draw_flights
 from motionloom.pipeline.store.run_state import RunState, StageState
-from motionloom.pipeline.store.training_log import read_flight, read_rows
+from motionloom.pipeline.store.training_log import read_flight, read_rows, read_training_log
 from motionloom.pipeline.training.telemetry import WaitTimes, waited_in_steps
+from motionloom.pipeline.training.utilization import Utilization, pass_flops
 
 
 def test_a_training_notes_speed_and_waits(tmp_path: Path) -> None:
@@ -25,7 +28,8 @@ def test_a_training_notes_speed_and_waits(tmp_path: Path) -> None:
     for row in rows:
         assert row["samples_per_second"] > 0 and row["frames_per_second"] == row["samples_per_second"]
         assert 0 < row["step_seconds"] <= row["step_seconds_p95"]
-        assert all(0 <= row[f"waited/{cause}"] <= 1 for cause in ("data", "checkpoints", "ranks"))
+        assert all(0 <= row[f"waited/{cause}"] <= 1 for cause in WaitTimes())
+        assert 0 < row["goodput"] < 1 and "mfu" not in row  # a CPU has no peak
 
 
 def test_a_rank_waits_for_the_one_that_comes_last() -> None:
@@ -33,8 +37,8 @@ def test_a_rank_waits_for_the_one_that_comes_last() -> None:
     assert [waited_in_steps(seconds, rank) for rank in (0, 1)] == [2.0, 0.0]
     waits = WaitTimes()
     waits["data"] = 3.0
-    before = {"data": 1.0, "checkpoints": 0.0, "ranks": 0.0}
-    assert waits.shares(before, 4.0) == {"data": 0.5, "checkpoints": 0.0, "ranks": 0.0}
+    nothing = dict.fromkeys(waits, 0.0)
+    assert waits.shares(nothing | {"data": 1.0}, 4.0) == nothing | {"data": 0.5}
 
 
 def test_steps_that_come_again_are_there_once(tmp_path: Path) -> None:
@@ -47,6 +51,61 @@ def test_steps_that_come_again_are_there_once(tmp_path: Path) -> None:
     assert [row["step"] for row in read_rows(path)] == [10, 20, 30, 40]
     (tmp_path / "flight/rank_x.jsonl").write_text(json.dumps({"step": 1}))
     assert list(read_flight(tmp_path)) == [0]
+
+
+def test_goodput_counts_the_steps_that_stay() -> None:
+    """Two processes: the second takes steps 11 to 20 again, which a kill has undone."""
+    now = 0.0
+    first = Utilization(flops=5e12, peak=20e12, clock=lambda: now)
+    now = 4.0  # its start and the first step
+    first.start(0.0)
+    now = 13.0
+    rows = [{"step": 10.0, **first.row(9, 0.0)}]
+    assert rows[0] == {"step": 10, "elapsed_seconds": 13, "goodput": 9 / 13, "tflops": 5, "mfu": 0.25}
+    now = 25.0
+    rows.append({"step": 20.0, **first.row(10, 2.0)})
+    assert rows[1]["goodput"] == 19 / 25 and rows[1]["mfu"] == 0.25
+    now = 100.0
+    second = Utilization(rows, 12, clock=lambda: now)
+    now = 101.0
+    second.start(0.0)
+    now = 108.0
+    assert second.row(7, 0.0) == {"elapsed_seconds": 33, "goodput": 16 / 33}
+
+
+def test_a_known_peak_gives_the_share_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU. Nothing of the training changes, and the line shows it."""
+    plain = train(tmp_path / "plain")
+    monkeypatch.setattr("motionloom.pipeline.training.trainer.peak_flops", lambda *_: 1e9)
+    said = StringIO()
+    counted = train(tmp_path / "counted", console=Console(file=said, width=500))
+    assert all(map(torch.equal, counted.state_dict().values(), plain.state_dict().values()))
+    assert re.search(r"duel: .*frames/s, MFU \d+\.\d %, goodput \d+\.\d %; waited", said.getvalue())
+    for row in read_flight(tmp_path / "counted")[0]:
+        assert row["mfu"] == pytest.approx(row["tflops"] * 1e3)
+
+
+def test_flops_are_those_of_the_matrix_products() -> None:
+    """Forward, gradients of weights, and of inputs but the first's: 2 M N K each."""
+    duel, batch = Duel(seed=3, max_steps=4), Vectors(8)[0]
+    first, second = 2 * 8 * DIM * 16, 2 * 8 * 16 * DIM
+    critic = 2 * 8 * (DIM * 8 + 8)
+    # The generator is judged by the critic once; the critic judges the batch and what was made, twice.
+    own = 2 * first + 3 * second + 3 * critic + 2 * 3 * critic - 2 * 2 * 8 * DIM * 8
+    before = torch.get_rng_state()
+    assert pass_flops(duel, batch) == own
+    assert torch.equal(torch.get_rng_state(), before) and not duel.figures
+    assert all(param.grad is None for param in duel.parameters())
+
+
+def test_telemetry_and_profile_end_no_training(tmp_path: Path) -> None:
+    """Their folder is a file: both are left out with a warning each."""
+    tmp_path.joinpath("flight").write_text("")
+    said = StringIO()
+    train(tmp_path, hardware={"profile": 2}, console=Console(file=said, width=500))
+    warnings = [line.split(":")[0].strip() for line in said.getvalue().splitlines() if "left out" in line]
+    assert warnings == ["telemetry of rank 0 is left out", "profile of duel is left out"]
+    assert read_training_log(tmp_path)[-1]["step"] == 24
 
 
 def test_the_report_shows_speed_and_waits(tmp_path: Path) -> None:

@@ -1,0 +1,119 @@
+"""Share of a card's peak that a training reaches (MFU), and share of its time that was good (goodput).
+
+MFU is as in PaLM (Chowdhery et al. 2022, appendix B): matrix products and convolutions of one forward and one
+backward pass, over the time of a step and the dense peak of the maker's data sheet. What is recomputed for
+checkpointed activations, and all that is elementwise, counts nothing.
+"""
+
+from __future__ import annotations
+
+import copy
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeCopyMode, FakeTensorMode
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
+
+from motionloom.models.training.alternating import AlternatingModule
+from motionloom.models.training.stage_module import Batch, StageModule
+
+PEAKS = {
+    "H100 PCIe": (756, 51),
+    "H100": (989, 67),
+    "H200": (989, 67),
+    "A100": (312, 19.5),
+    "L40S": (362, 91.6),
+    "L4": (121, 30.3),
+    "RTX 4090": (165, 82.6),
+    "RTX 3090": (71, 35.6),
+}
+"""Dense TFLOP/s by the makers' data sheets: half precision with float32 sums, and float32 without TF32."""
+
+
+def peak_flops(device: torch.device, precision: str) -> float | None:
+    """Return the FLOP/s that the device can reach in a `train.precision`; None where that is not known."""
+    if device.type != "cuda":
+        return None
+    name = torch.cuda.get_device_name(device)
+    found = next((pair for known, pair in PEAKS.items() if known in name), None)
+    return None if found is None else 1e12 * found[precision == "32-true"]
+
+
+def pass_flops(module: StageModule, batch: Batch) -> int:
+    """Return the FLOPs of a forward and a backward pass over one batch, by copies that hold no values.
+
+    Groups that take turns count as if each had one in every step.
+    """
+    with FakeTensorMode(allow_non_fake_inputs=True) as fake:
+        with FakeCopyMode(fake):
+            module, batch = copy.deepcopy((module, batch))
+        # Fused attention of CPUs is in no table of the counter; its parts are.
+        with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):
+            torch.autograd.backward(_loss(module, module.losses(batch)))
+    return int(counter.get_total_flops())
+
+
+def _loss(module: StageModule, values: Mapping[str, Tensor]) -> Tensor:
+    if not isinstance(module, AlternatingModule):
+        return values["loss"]
+    return torch.stack([values[f"{group.name}_loss"] for group in module.optimizer_groups()]).sum()
+
+
+class Utilization:
+    """MFU and goodput of one process, row by row; goodput goes on from the `rows` of the processes before.
+
+    Goodput is the share of the time that went into steps which count, waits for their data included. The rest
+    is validations, checkpoints, steps that a kill has undone, and the start of a process with its first step,
+    which compiles and chooses kernels. The time between two processes counts on neither side.
+    """
+
+    def __init__(
+        self,
+        rows: Sequence[Mapping[str, float]] = (),
+        step: int = 0,
+        *,
+        flops: float = 0.0,
+        peak: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        self.flops, self.peak, self._clock = flops, peak, clock
+        kept = [row for row in rows if row["step"] <= step]
+        self._spent, self._good = _seconds(rows)[0], _seconds(kept)[1]
+        self._since, self._aside = clock(), 0.0
+        self.step_seconds = 0.0
+        """Mean of the last row's steps, the first of a process left out."""
+
+    def start(self, aside: float) -> None:
+        """The first step of the process is over: time counts from here."""
+        now = self._clock()
+        self._spent += now - self._since
+        self._since, self._aside = now, aside
+
+    def row(self, steps: int, aside: float) -> dict[str, float]:
+        """Figures of a row of `steps` steps; call it where the device is waited for in any case.
+
+        `aside` are the seconds that this process has given to validations and checkpoints so far.
+        """
+        now = self._clock()
+        spent = now - self._since
+        good = max(0.0, spent - (aside - self._aside))
+        self._since, self._aside = now, aside
+        self._spent += spent
+        self._good += good
+        figures = {"elapsed_seconds": self._spent, "goodput": self._good / max(self._spent, 1e-9)}
+        self.step_seconds = max(good, 1e-9) / steps if steps else 0.0
+        if self.flops and steps:
+            reached = self.flops / self.step_seconds
+            figures |= {"tflops": reached / 1e12} | ({"mfu": reached / self.peak} if self.peak else {})
+        return figures
+
+
+def _seconds(rows: Sequence[Mapping[str, float]]) -> tuple[float, float]:
+    """Seconds spent up to the last of the rows, and the good ones among them."""
+    if not rows:
+        return 0.0, 0.0
+    spent = rows[-1].get("elapsed_seconds", 0.0)
+    return spent, spent * rows[-1].get("goodput", 0.0)
