@@ -1,7 +1,7 @@
 """Speed of what runs often, beside the usual way to do the same: the table "Speed" of docs/results.md.
 
     python benchmarks/speed.py [--only features smpl audio loader streaming] [--record speed]
-    python benchmarks/speed.py --only bvh --bvh ARCHIVES
+    python benchmarks/speed.py --only bvh --bvh FOLDER
 
 All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
 turns. `streaming` makes ten minutes of motion with a model of the package and looks at its memory.
@@ -27,7 +27,7 @@ from bench import Column, Record, arguments, command_line, cpu_seconds, process_
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features, fitting_octaves
-from motionloom.datasets.convert.common.scan import list_batches
+from motionloom.datasets.convert.common.scan import list_files, read_file
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
@@ -235,20 +235,20 @@ def streaming(args: Namespace) -> Record:
 
 
 def bvh(args: Namespace) -> Record:
-    """Archives to shards with one worker, beside parsing alone."""
+    """BVH to shards with one worker, beside parsing alone."""
     motion, begin = 0.0, process_seconds()
-    for batch in list_batches(args.bvh, ".bvh"):
-        for file in batch.read(".bvh"):
-            clip = read_bvh(file.data, name=file.label)
-            motion += clip.frames / clip.fps
+    folder, names = list_files(args.bvh)
+    for name in names:
+        clip = read_bvh(read_file(folder / name, name), name=name)
+        motion += clip.frames / clip.fps
     parsing = process_seconds() - begin
     command = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "data", "convert", "bvh"]
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as out:
         begin = process_seconds()
         options = ["--licence", "CC0", "--workers", "1"]
-        subprocess.run([*command, str(args.bvh), f"{folder}/shards", *options], check=True)
+        subprocess.run([*command, str(args.bvh), f"{out}/shards", *options], check=True)
         taken = process_seconds() - begin
-    title = "BVH archives to shards"
+    title = "BVH to shards"
     return row(title, f"{motion / taken:.0f} × real time", f"{motion / parsing:.0f} ×, parsing alone")
 
 
@@ -258,7 +258,7 @@ CASES = {case.__name__: case for case in (features, smpl, bvh, audio, loader, st
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--bvh", type=Path, help="a folder of archives; without one `bvh` is left out")
+    parser.add_argument("--bvh", type=Path, help="a folder of BVH files; without one `bvh` is left out")
     parser.add_argument("--model", type=Path, default=Path("synthetic"), help="of `streaming`")
     parser.add_argument("--minutes", type=float, default=10.0, help="of `streaming`'s motion")
     args = arguments(parser)

@@ -48,15 +48,16 @@ MOST_JSON_BYTES = 2**28
 """Larger JSON files are refused unread: the manifest of a million clips has a few megabytes."""
 
 
-def read_plain(path: Path, most: int = MOST_JSON_BYTES) -> bytes:
+def read_plain(path: Path, most: int = MOST_JSON_BYTES, name: str = "") -> bytes:
     """Content of a plain file of at most `most` bytes; `UserError` for anything else, such as a device or a
-    pipe, which would be read without end. `FileNotFoundError` when there is none.
+    pipe, which would be read without end. `FileNotFoundError` when there is none. Errors name it by its path,
+    or by `name`.
     """
     about = path.stat()
     if not stat.S_ISREG(about.st_mode):
-        raise UserError(f"{path}: not a plain file")
+        raise UserError(f"{name or path}: not a plain file")
     if about.st_size > most:
-        raise UserError(f"{path}: {about.st_size:,} bytes; at most {most:,} are read")
+        raise UserError(f"{name or path}: {about.st_size:,} bytes; at most {most:,} are read")
     return path.read_bytes()
 
 

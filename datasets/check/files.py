@@ -33,7 +33,7 @@ from motionloom.datasets.convert.captions.humanml_text import read_humanml_capti
 from motionloom.datasets.convert.common.arrays import load_array, read_array_header
 from motionloom.datasets.convert.common.features import require_human
 from motionloom.datasets.convert.common.files import read_text_file
-from motionloom.datasets.convert.common.scan import Batch
+from motionloom.datasets.convert.common.scan import read_file
 from motionloom.datasets.convert.common.splits import read_ids, read_split_files
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import SPLITS, Config, UserError
@@ -209,10 +209,7 @@ def _check_pickle(path: Path, rules: FileRules) -> Verdict:
 
 
 def _check_mocap(path: Path, rules: FileRules) -> Verdict:
-    (file,) = Batch(path.parent, None, (path.name,)).read()
-    if file.error:
-        raise UserError(f"{path}: {file.error}")
-    motion = read_mocap(file.data, str(path))
+    motion = read_mocap(read_file(path, str(path)), str(path))
     kind = path.suffix[1:].upper()
     return Verdict(path, f"{kind}, {len(motion.joints)} joints, {motion.frames} frames, {motion.fps:g} fps")
 

@@ -45,11 +45,9 @@ from motionloom.datasets.shards.tasks import (
 
 T = TypeVar("T")
 
-WORK_FOLDER = ".work"
-"""Inside the folder of the shards: unpacked archives and old shards; removed when the manifest stands."""
-
-OLD_FOLDER = "old"
-"""Inside it: shards of an earlier run whose clips are taken over."""
+OLD_FOLDER = ".old"
+"""Inside the folder of the shards: shards of an earlier run whose clips are taken over; removed when the
+manifest stands."""
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -103,7 +101,7 @@ class DatasetWriter(Generic[T]):
     def __init__(
         self, out: Path, tasks: list[ShardTask[T]], facts: DatasetFacts, how: WriteOptions, pool: Workers
     ) -> None:
-        self.out, self.pool = out, pool
+        self.out, self._pool = out, pool
         self._facts, self._how = facts, how
         self._tasks = [task for at, task in enumerate(tasks) if how.has(at)]
         with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
@@ -119,7 +117,7 @@ class DatasetWriter(Generic[T]):
 
     def _take_over(self, tasks: list[ShardTask[T]]) -> None:
         """Put the shards of an earlier run aside that are not as planned, and plan to keep their clips."""
-        folder = self.work_folder / OLD_FOLDER
+        folder = self.out / OLD_FOLDER
         # Shards that do not fit the plan move aside first: their names now belong to other clips.
         finished = {task.path for task, result in zip(tasks, self._results, strict=True) if result}
         for path in sorted(_shards_in(self.out, self._facts.name, ".tar")):
@@ -170,11 +168,6 @@ class DatasetWriter(Generic[T]):
         word = "finished already" if whole else "all shards are there"
         return f"{self.out}: {word}, {state}; nothing to convert"
 
-    @property
-    def work_folder(self) -> Path:
-        """For unpacked archives; removed with everything in it when the manifest stands."""
-        return self.out / WORK_FOLDER
-
     def pending(self) -> list[T]:
         """Items that must be converted."""
         tasks = [self._tasks[at] for at in self._todo]
@@ -220,14 +213,14 @@ class DatasetWriter(Generic[T]):
                 note = f"made on {kinds}: the last digits of clips may differ from those of a set made on one"
                 manifest = manifest.model_copy(update={"notes": [*manifest.notes, note]})
             write_json(self.out / MANIFEST_FILE, manifest.dump())
-            shutil.rmtree(self.work_folder, ignore_errors=True)
+            shutil.rmtree(self.out / OLD_FOLDER, ignore_errors=True)
         return manifest
 
     def _shards(self, convert: Convert[T]) -> list[Result]:
         done = len(self._tasks) - len(self._todo)
         with Meter("writing shards", len(self._tasks), done=done, shown=self._how.progress) as meter:
             tasks = [self._tasks[at] for at in self._todo]
-            for position, result in self.pool.run(partial(write_shard, convert=convert), tasks):
+            for position, result in self._pool.run(partial(write_shard, convert=convert), tasks):
                 self._results[self._todo[position]] = result
                 meter.advance()
         return [result for result in self._results if result is not None]

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
@@ -93,7 +92,7 @@ def captions(
 
 
 def read_clips(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped]:
-    """The clips of a file, an archive or a folder: BVH and ASF/AMC as the converter reads them; npz and GLB
+    """The clips of a file or a folder: BVH and ASF/AMC as the converter reads them; npz and GLB
     as they are written here. `UserError` where there are none.
     """
     if not source.exists():
@@ -133,8 +132,6 @@ def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped
         plan, converter = conversion.plan, conversion.converter
         yield from (*plan.broken, *plan.rejected, *plan.dropped)
         clips = [clip for _, clip in plan.items]
-        with Workers(1) as pool:
-            converter.unpack(clips, Path(maps), pool, progress=False)
         for clip in clips:
             try:
                 sample = converter.convert(clip)

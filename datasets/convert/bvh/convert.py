@@ -1,24 +1,13 @@
-"""BVH folders and archives -> shards: any skeleton, through a joint map (`datasets/motion/bvh/joint_map.py`).
-
-An archive can only be read from front to back and its clips go to many shards, so those that are wanted are
-copied, packed again one by one, to the work folder before shards are written.
-"""
+"""BVH and ASF/AMC -> shards: any skeleton, through a joint map (`datasets/motion/bvh/joint_map.py`)."""
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.files import sha256_of_json, write_bytes
-from motionloom.datasets.base.pool import Workers
-from motionloom.datasets.base.progress import Meter
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.bvh.plan import (
     BvhClip,
     BvhConfig,
@@ -32,7 +21,6 @@ from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.look import SourceJoints, named_unit
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.bvh.joint_map import JointMap, metres, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion
@@ -41,16 +29,13 @@ from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 
-_QUICK = 1
-"""Level of zlib: text of joints shrinks to a third, and little more with more effort."""
-
 
 class Bvh(Converter[BvhConfig, BvhClip]):
     """The BVH converter."""
 
     name = "bvh"
     title = "BVH"
-    summary = "BVH (and ASF/AMC) files of any skeleton, loose or in tar archives, to shards."
+    summary = "BVH (and ASF/AMC) files of any skeleton to shards."
     example = "mocap shards --captions captions.jsonl --licence CC-BY-4.0"
     config_class = BvhConfig
 
@@ -58,8 +43,6 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         super().__init__(config)
         self.own_maps = load_maps(config.joint_map, config.mapped_skeleton())  # a wrong one fails here
         self.maps: JointMaps = {}
-        self.unpacked: Path | None = None
-        """Folder of the clips of archives, by the sha256 of their files."""
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[BvhClip]:
         plan, self.maps = plan_bvh(self.config, self.own_maps, settings, self.published)
@@ -78,28 +61,14 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def licence(self, plan: ConversionPlan[BvhClip]) -> str:
         return self.config.licence or ""
 
-    def in_order(self, clip: BvhClip) -> bool:
-        return clip.batch.archive is not None
-
-    def unpack(self, clips: Sequence[BvhClip], folder: Path, pool: Workers, *, progress: bool) -> None:
-        self.unpacked = folder
-        wanted: dict[Batch, dict[str, str]] = {}
-        for clip in clips:
-            if clip.batch.archive is not None and not (folder / clip.found.sha256).exists():
-                wanted.setdefault(clip.batch, {})[clip.label()] = clip.found.sha256
-        with Meter("unpacking archives", len(wanted), shown=progress and bool(wanted)) as meter:
-            for _ in pool.run(partial(_copy, folder), list(wanted.items())):
-                meter.advance()
-
     def convert(self, clip: BvhClip) -> Sample:
-        """Return the sample of one clip. An archive that is not unpacked is read up to it."""
-        motion = self.encode(clip.label(), self._read(clip))
+        motion = self.encode(clip.label(), clip.read())
         hands = self.layout.num_joints > BODY_JOINTS and self.config.fingers != "missing"
         return Sample(meta=self.meta(clip, motion, hands=hands), motion=motion, texts=list(clip.texts))
 
     def joints(self, clip: BvhClip) -> SourceJoints:
         """The joints as the map reads them."""
-        motion = self._motion(self._read(clip), clip.label())
+        motion = self._motion(clip.read(), clip.label())
         joint_map = self._map_of(motion)
         joints = self._world(motion, joint_map)
         names = tuple(names[0] if len(names) == 1 else names for names in joint_map.sources)
@@ -150,28 +119,3 @@ class Bvh(Converter[BvhConfig, BvhClip]):
             return self.maps[skeleton_key(motion.joints, motion.parents)]
         except KeyError:
             raise UserError(f"{motion.name}: its skeleton has no joint map") from None
-
-    def _read(self, clip: BvhClip) -> bytes:
-        batch = clip.batch
-        if self.unpacked is not None:
-            with suppress(FileNotFoundError):
-                return zlib.decompress((self.unpacked / clip.found.sha256).read_bytes())
-        if batch.archive is None:  # no need to read the loose files before it
-            batch = Batch(batch.root, None, (clip.found.path,))
-        for file in batch.read():
-            if file.path == clip.found.path and not file.error:
-                return file.data
-        raise UserError(f"{clip.label()}: no longer in the source")
-
-
-def _copy(folder: Path, task: tuple[Batch, dict[str, str]]) -> None:
-    """Copy the named files of an archive into a folder, each packed and under the name given for it."""
-    batch, names = task
-    waiting = dict(names)
-    with suppress(UserError):  # damaged from here on, as the plan has said
-        for file in batch.read():
-            # A second member of the same name finds nothing.
-            if (name := waiting.pop(file.label, None)) is not None and not file.error:
-                write_bytes(folder / name, zlib.compress(file.data, _QUICK))
-            if not waiting:
-                return

@@ -7,7 +7,7 @@ order of their work change nothing.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from motionloom.datasets.convert.common.facts import Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.scan import Batch, BatchScan, FoundFile, list_batches, scan_batches
+from motionloom.datasets.convert.common.scan import FoundFile, Scan, list_files, read_file, scan_files
 from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import (
     JointMap,
@@ -92,7 +92,7 @@ def choose_maps(
                     maps[key] = one
                 except UserError as error:
                     misfits.setdefault(one.where, str(error))
-    # Only skeletons that need a guess or a measured unit are read here: in an archive that takes long.
+    # Only skeletons that need a guess or a measured unit are read here.
     settles = skeletons.keys() if "auto" in (config.unit, config.up) else set[str]()
     first_clips = _first_clips(plan, settles | (skeletons.keys() - maps.keys()))
     for key, motions in first_clips.items():
@@ -146,23 +146,14 @@ def _settle(
 
 
 def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str, list[BvhMotion]]:
-    """The first readable clips of each of the skeletons, of one batch each."""
-    wanted: dict[Batch, dict[str, str]] = {}
+    """The first readable clips of each of the skeletons."""
+    found: defaultdict[str, list[BvhMotion]] = defaultdict(list)
     for _, clip in plan.items:
-        if clip.found.skeleton in skeletons:
-            wanted.setdefault(clip.batch, {})[clip.label()] = clip.found.skeleton
-    found: dict[str, list[BvhMotion]] = {}
-    for batch, labels in wanted.items():
-        left = Counter({key: n for key, n in Counter(labels.values()).items() if key not in found})
-        with suppress(UserError):  # a damaged archive; its clips are reported when they are converted
-            for file in batch.read() if left else ():
-                key = labels.get(file.label, "")
-                if left[key] and len(found.get(key, ())) < _MEASURED:
-                    left[key] -= 1
-                    with suppress(UserError):  # likewise; the next clip of this skeleton may be whole
-                        found.setdefault(key, []).append(read_motion(file.data, file.label))
-                if all(not n or len(found.get(key, ())) == _MEASURED for key, n in left.items()):
-                    break
+        key = clip.found.skeleton
+        if key in skeletons and len(found.get(key, ())) < _MEASURED:
+            with suppress(UserError):  # told when it is converted; the next clip may be whole
+                motion = read_motion(clip.read(), clip.label())
+                found[key].append(motion)
     return found
 
 
@@ -187,7 +178,7 @@ class BvhConfig(CaptionConfig):
     everyday: ClassVar[tuple[str, ...]] = ("captions", "licence")
 
     source: Path
-    """A folder of .bvh files and/or tar archives of them, or one such file."""
+    """A folder of .bvh or .amc files, or one such file."""
     joint_map: Path | Literal["auto"] = "auto"
     """A JSON file that says which joints of the files stand for ours, or a folder of such files, each for its
     own skeleton (docs/sources.md). Where none fits, and with `auto`, the map is guessed from the names."""
@@ -210,9 +201,9 @@ class BvhConfig(CaptionConfig):
     have none, and each clip gets hands at rest, which count as motion (`resting`) or do not (`missing`).
     """
 
-    def batches(self) -> list[Batch]:
-        """Batches of the motion files."""
-        return list_batches(self.source)
+    def files(self) -> tuple[Path, list[str]]:
+        """A folder, and the motion files in it by name."""
+        return list_files(self.source)
 
     def about(self, path: str) -> Facts:
         """Facts of a file in the set's metadata; none for plain folders."""
@@ -236,7 +227,7 @@ class BvhConfig(CaptionConfig):
 class BvhClip:
     """A clip of the plan."""
 
-    batch: Batch
+    folder: Path
     found: FoundFile
     id: str
     split: Split
@@ -248,9 +239,9 @@ class BvhClip:
 
     @property
     def subset(self) -> str:
-        """Its archive, or the folder at the top of the source that it lies in; empty for neither."""
+        """The folder at the top of the source that it lies in; empty for none."""
         folders = PurePosixPath(self.found.path).parts[:-1]
-        return self.batch.archive or (folders[0] if folders else "")
+        return folders[0] if folders else ""
 
     @property
     def facts(self) -> dict[str, Fact]:
@@ -258,24 +249,27 @@ class BvhClip:
         return {"subset": self.subset, "seconds": seconds, "fps": self.fps, **self.about}
 
     def label(self) -> str:
-        return self.found.label
+        return self.found.path
+
+    def read(self) -> bytes:
+        """Return its file, for `read_motion`."""
+        return read_file(self.folder / self.found.path, self.label())
 
 
 def plan_bvh(
     config: BvhConfig, own_maps: Sequence[JointMap], settings: PlanSettings, stated: str
 ) -> tuple[ConversionPlan[BvhClip], JointMaps]:
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
-    batches = config.batches()
-    scans = scan_batches(
-        batches, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
+    folder, names = config.files()
+    scan = scan_files(
+        folder, names, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
-    draft = _decide(config, batches, scans, stated)
-    joints = {key: names for scan in scans for key, names in scan.joints.items()}
-    maps = choose_maps(config, own_maps, draft, joints, settings.maps)
+    draft = _decide(config, folder, scan, stated)
+    maps = choose_maps(config, own_maps, draft, scan.joints, settings.maps)
     draft.limit(lambda clip: clip.id)
     layout = config.motion_layout()
     draft.finish(
-        found=sum(len(scan.files) for scan in scans),
+        found=len(names),
         frames=lambda clip: frames_after(clip.frames, clip.fps, layout),
         licence=lambda clip: config.licence or "not stated yet",
     )
@@ -303,38 +297,33 @@ def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
     return section.frames, section.fps, key, names
 
 
-def _decide(
-    config: BvhConfig, batches: list[Batch], scans: list[BatchScan], stated: str
-) -> ConversionPlan[BvhClip]:
-    found = [(number, file) for number, scan in enumerate(scans) for file in scan.files]
-    listing = config.listing(
-        [file.path for _, file in found], [file.path for _, file in found if not file.problem]
-    )
-    broken = [scan.problem for scan in scans if scan.problem is not None]
-    draft = ConversionPlan[BvhClip](config, broken=broken, notes=listing.notes, stated=stated)
+def _decide(config: BvhConfig, folder: Path, scan: Scan, stated: str) -> ConversionPlan[BvhClip]:
+    found = scan.files.values()
+    listing = config.listing([file.path for file in found], [file.path for file in found if not file.problem])
+    draft = ConversionPlan[BvhClip](config, notes=listing.notes, stated=stated)
     contents: dict[str, str] = {}
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
-    for number, clip in sorted(found, key=lambda pair: pair[1].path not in listing.rows):
+    for clip in sorted(found, key=lambda file: file.path not in listing.rows):
         clip_id = listing.id_of(clip.path)
         try:
-            check_id(clip_id, clip.label)
+            check_id(clip_id, clip.path)
             if clip.problem:
                 raise UserError(clip.problem)
         except UserError as error:
-            draft.fail(clip.label, error)
+            draft.fail(clip.path, error)
             continue
-        frames = len(range(clip.frames)[config.cut(clip.label)])
+        frames = len(range(clip.frames)[config.cut(clip.path)])
         fps = config.source_fps or clip.fps
-        same = contents.setdefault(clip.sha256, clip.label)
+        same = contents.setdefault(clip.sha256, clip.path)
         reason = (
-            (f"same bytes as {same}" if same != clip.label else "")
+            (f"same bytes as {same}" if same != clip.path else "")
             or config.unfit(clip.path)
             or listing.problem(clip.path)
             or config.length_problem(frames / fps)
         )
         texts = listing.texts_of(clip.path)
         split, about = listing.split_of(clip.path), config.about(clip.path)
-        planned = BvhClip(batches[number], clip, clip_id, split, texts, frames, fps, about)
+        planned = BvhClip(folder, clip, clip_id, split, texts, frames, fps, about)
         keep = config.uncaptioned == "keep"
         draft.take(planned, reason, captioned=bool(texts), wanted=config.has_captions, keep=keep)
     settle_captions(config, draft, listing)

@@ -1,7 +1,4 @@
-"""`Conversion`: one source, planned and ready to be written; the same few steps for every converter.
-
-`run_conversion` goes straight down: archives are unpacked, then shards, index and manifest are written.
-"""
+"""`Conversion`: one source, planned and ready to be written; the same few steps for every converter."""
 
 from __future__ import annotations
 
@@ -73,9 +70,7 @@ class Conversion(Generic[C]):
         if not self.config.look or not self.plan.items:
             return None
         clips, converter = [clip for _, clip in self.plan.items], self.converter
-        return look_at(
-            clips, converter.joints, converter.subset, self.config, label=_label, in_order=converter.in_order
-        )
+        return look_at(clips, converter.joints, converter.subset, self.config, label=_label)
 
     def looked(self) -> Conversion[C]:
         self.plan.look = self.look()
@@ -86,11 +81,8 @@ class Conversion(Generic[C]):
         plan, convert = self.plan, self.converter.convert
         width = self.config.motion_layout().dim * (2 if self.config.motion_type == "float16" else 4)
         plan.bytes_needed = sum(plan.frames.values()) * width + len(plan.items) * 4096
-        clips = [clip for _, clip in plan.items]
-        if clips and not self.converter.in_order(clips[0]):
-            clips = [clip for _, clip in limited(plan.items, _label, _TRIAL_CLIPS)]
         start, count = time.perf_counter(), 0
-        for clip in clips[:_TRIAL_CLIPS]:
+        for _, clip in limited(plan.items, _label, _TRIAL_CLIPS):
             with contextlib.suppress(Exception):  # the real run reports it; here only time counts
                 convert(clip)
             count += 1
@@ -139,8 +131,6 @@ def run_conversion(
                 seen.require_people(plan.name)
                 for warning in seen.warnings:
                     say(f"warning: {warning}")
-        # Archives are read front to back once, before shards pick clips in their own order.
-        conversion.converter.unpack(writer.pending(), writer.work_folder, writer.pool, progress=progress)
         manifest = writer.write(conversion.converter.convert)
     if part is None:
         _require_most(conversion, manifest, out)

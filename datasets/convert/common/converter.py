@@ -7,7 +7,6 @@ recipes and clusters find both by name (`convert/registry.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.register import Table
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import SourceJoints
@@ -107,13 +105,6 @@ class Converter(ABC, Generic[Cfg, C]):
     def subset(self, clip: C) -> str:
         """Return the part of the source that a clip is in: some clips of each are looked at."""
         return str(facts_of(clip).get("subset", ""))
-
-    def in_order(self, clip: C) -> bool:
-        """Whether the first clips of a clip's subset are the cheapest to read, as in an archive."""
-        return False
-
-    def unpack(self, clips: Sequence[C], folder: Path, pool: Workers, *, progress: bool) -> None:
-        """Copy what cannot be read clip by clip, as in an archive, to a folder that `convert` then reads."""
 
     def meta(
         self,

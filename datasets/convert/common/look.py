@@ -224,14 +224,9 @@ def look_at(
     config: ConvertConfig,
     *,
     label: Callable[[T], str],
-    in_order: Callable[[T], bool] | None = None,
 ) -> Look:
-    """Read and measure `config.look` clips of every subset.
-
-    They are chosen by a hash of their names; where `in_order` says so of a clip, its subset gives its first
-    ones: in an archive, what comes late costs time.
-    """
-    chosen, subsets = _choose(items, subset_of, config.look, label, in_order)
+    """Read and measure `config.look` clips of every subset, chosen by a hash of their names."""
+    chosen, subsets = _choose(items, subset_of, config.look, label)
     clips: list[SeenClip] = []
     failed: list[tuple[str, Dropped]] = []
     names: Names = ()
@@ -270,11 +265,7 @@ def look_at(
 
 
 def _choose(
-    items: Sequence[T],
-    subset_of: Callable[[T], str],
-    count: int,
-    label: Callable[[T], str],
-    in_order: Callable[[T], bool] | None,
+    items: Sequence[T], subset_of: Callable[[T], str], count: int, label: Callable[[T], str]
 ) -> tuple[list[tuple[str, T]], int]:
     """(subset, item) of the clips to look at, and how many subsets there are."""
     by_subset: dict[str, list[T]] = defaultdict(list)
@@ -288,7 +279,7 @@ def _choose(
     chosen: list[tuple[str, T]] = []
     for name in names:
         members = by_subset[name]
-        if len(members) > each and not (in_order is not None and in_order(members[0])):
+        if len(members) > each:
             members = sorted(members, key=lambda item: sha256_of_json(label(item)))
         chosen += [(name, item) for item in members[:each]]
     return chosen, len(by_subset)

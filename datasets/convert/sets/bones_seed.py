@@ -1,8 +1,8 @@
 """BONES-SEED: BVH of the 77-joint SOMA skeleton at 120 fps, with metadata and temporal labels.
 
-`soma_uniform/bvh/DATE/NAME.bvh` (one skeleton for all) or `soma_proportional/` (each actor's own), loose or
-in the archives of the release; `metadata/seed_metadata_v00N.csv` and `..._temporal_labels.jsonl`. Lengths are
-in centimetres, Y up. The zero pose has every bone along an axis of its own joint: only positions are read, so
+`soma_uniform/bvh/DATE/NAME.bvh` (one skeleton for all) or `soma_proportional/` (each actor's own), unpacked
+from the release's archives; `metadata/seed_metadata_v00N.csv` and `..._temporal_labels.jsonl`. Lengths are in
+centimetres, Y up. The zero pose has every bone along an axis of its own joint: only positions are read, so
 it needs no correction to a T-pose. The same motion for the robot G1 (`g1/csv`) is left out: it is no
 person's.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.common.scan import ARCHIVES, Batch, list_batches
+from motionloom.datasets.convert.common.scan import list_files
 from motionloom.datasets.convert.common.tables import captions_of, read_csv, read_json_lines
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state
 from motionloom.datasets.schema import Caption, UserError
@@ -42,13 +42,11 @@ class BonesSeedConfig(BvhSetConfig):
     variant: Literal["uniform", "proportional"] = "uniform"
     """Motion on one skeleton for all, or on each actor's own."""
 
-    def batches(self) -> list[Batch]:
-        name = f"soma_{self.variant}"
-        places = [self.source / name, *(self.source / f"{name}{end}" for end in ARCHIVES)]
-        place = next((place for place in places if place.exists()), None)
-        if place is None:
-            raise UserError(f"{self.source}: no {name}/ and no archive {name}.tar.gz in it")
-        return list_batches(place)
+    def files(self) -> tuple[Path, list[str]]:
+        folder = self.source / f"soma_{self.variant}"
+        if not folder.is_dir():
+            raise UserError(f"{self.source}: no {folder.name}/ in it; unpack {folder.name}.tar.gz there")
+        return list_files(folder)
 
     def rows(self) -> dict[str, Row]:
         return _rows(self.source, state(*(self.source / "metadata").glob("*")))

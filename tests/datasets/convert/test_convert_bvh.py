@@ -1,12 +1,10 @@
-"""BVH conversion: real clips, folders and archives, broken inputs, and bytes that no worker count changes."""
+"""BVH conversion: real clips, broken inputs, and bytes that no worker count changes."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import shutil
-import tarfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,8 @@ from bvh_clips import unpack_bandai
 
 from motionloom.datasets.base.lock import LOCK_FILE
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
+from motionloom.datasets.convert.bvh.plan import BvhClip
 from motionloom.datasets.convert.common.conversion import run_conversion
-from motionloom.datasets.convert.common.scan import Batch
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
@@ -26,7 +24,6 @@ from motionloom.datasets.schema import Manifest, Split, UserError
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, index_path
 from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.shards.writer import WORK_FOLDER
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +97,6 @@ def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_p
 
 
 def test_worker_count_changes_no_byte(copy: Path, tmp_path: Path) -> None:
-    pack(copy, 2)
     outs = [tmp_path / "one", tmp_path / "two"]
     for workers, out in enumerate(outs, start=1):
         convert(config(copy), out, workers=workers, clips_per_shard=2)
@@ -108,22 +104,11 @@ def test_worker_count_changes_no_byte(copy: Path, tmp_path: Path) -> None:
     assert len(list(outs[0].glob("*.tar"))) == 4
 
 
-def test_archives_and_single_clips_give_the_same_features_as_files(copy: Path, tmp_path: Path) -> None:
-    convert(config(copy), tmp_path / "loose")
-    pack(copy, 3)
-    prepared = prepare(config(copy))
-    manifest = run_conversion(prepared, tmp_path / "packed", progress=False)
-    assert sum(s.samples for s in manifest.shards) == 6
-    for split in ("train", "val", "test"):
-        loose, packed = (
-            ShardDataset.open(tmp_path / kind, split)  # type: ignore[arg-type]
-            for kind in ("loose", "packed")
-        )
-        theirs = {clip_id: packed.motion(i) for i, clip_id in enumerate(packed.ids)}
-        for i, clip_id in enumerate(loose.ids):
-            np.testing.assert_array_equal(loose.motion(i), theirs[clip_id])
+def test_a_single_clip_is_converted_like_the_whole(clips: Path, tmp_path: Path) -> None:
+    prepared = prepare(config(clips))
+    run_conversion(prepared, tmp_path / "out", progress=False)
     (clip,) = [item for split, item in prepared.plan.items if split == "val"]
-    sample, dataset = prepared.converter.convert(clip), ShardDataset.open(tmp_path / "packed", "val")
+    sample, dataset = prepared.converter.convert(clip), ShardDataset.open(tmp_path / "out", "val")
     assert not isinstance(sample, list)
     np.testing.assert_array_equal(sample.motion, dataset.motion(0))
     assert (sample.meta, sample.texts) == (dataset.meta(0), dataset.texts(0))
@@ -134,7 +119,6 @@ def test_archives_and_single_clips_give_the_same_features_as_files(copy: Path, t
 def test_a_killed_run_resumes_to_the_same_bytes(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pack(copy, 3)
     convert(config(copy), tmp_path / "whole", clips_per_shard=2)
     real, calls = Bvh.encode, []
 
@@ -147,8 +131,6 @@ def test_a_killed_run_resumes_to_the_same_bytes(
     monkeypatch.setattr(Bvh, "encode", dies)
     with pytest.raises(KeyboardInterrupt):
         convert(config(copy), tmp_path / "out", clips_per_shard=2)
-    assert len(list((tmp_path / "out" / WORK_FOLDER).iterdir())) == 6
-    monkeypatch.setattr("motionloom.datasets.convert.bvh.convert._copy", pytest.fail)  # no archive again
     convert(config(copy), tmp_path / "out", clips_per_shard=2)
     assert len(calls) == 5 + 2  # two shards were kept, only the clips of the other two are made again
     assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "whole")
@@ -157,22 +139,18 @@ def test_a_killed_run_resumes_to_the_same_bytes(
 def test_a_finished_conversion_reads_nothing_again(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pack(copy, 2)
     given = config(copy, unit="cm", up="y")  # what is said need not be settled by the first clips
     first = convert(given, tmp_path / "out")
     before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")}
 
-    def never(*_: Any) -> Any:
-        raise AssertionError("an archive was read again")
-
-    monkeypatch.setattr(Batch, "read", never)
+    monkeypatch.setattr(BvhClip, "read", pytest.fail)
+    monkeypatch.setattr("motionloom.datasets.convert.common.scan.read_file", pytest.fail)
     assert convert(given, tmp_path / "out") == first
     assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")} == before
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_parts_and_one_last_run_give_the_same_bytes(copy: Path, tmp_path: Path, count: int) -> None:
-    pack(copy, 3)
     (copy / "broken.bvh").write_text("HIERARCHY\nMOTION\nFrames: 60\nFrame Time: 0.033333\n1 2 3\n")
     given = config(copy, uncaptioned="keep")
     whole = convert(given, tmp_path / "whole", clips_per_shard=2)
@@ -280,36 +258,6 @@ def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> Non
     assert any("same bytes as" in d.reason for d in kept.dropped)
 
 
-def test_archive_members_are_labels_never_paths(clips: Path, tmp_path: Path) -> None:
-    source = tmp_path / "source"
-    source.mkdir()
-    data = clip_file(clips, "bow_angry").read_bytes()
-    other = clip_file(clips, "bow_giant").read_bytes()
-    with tarfile.open(source / "bad.tar.gz", "w:gz") as archive:
-        for name in ("../../PWNED_bvh.bvh", "/tmp/PWNED_abs.bvh"):
-            add(archive, name, data)
-        link = tarfile.TarInfo("link.bvh")
-        link.type, link.linkname = tarfile.SYMTYPE, "/etc/hostname"
-        archive.addfile(link)
-        add(archive, "./good.bvh", other)
-    given = config(clips, source=source, captions=None, most_rejected=1)
-    manifest = convert(given, tmp_path / "out")
-    assert sum(s.samples for s in manifest.shards) == 1
-    assert Counter("plain relative name" in d.reason for d in manifest.dropped) == {True: 2}
-    assert not list(tmp_path.rglob("PWNED*")) and not Path("/tmp/PWNED_abs.bvh").exists()
-
-
-def test_damaged_archive_keeps_what_came_before(copy: Path, tmp_path: Path) -> None:
-    pack(copy, 1, suffix="tar")
-    path = copy / "part0.tar"
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * 0.6)])
-    manifest = convert(config(copy), tmp_path / "out")
-    told = reasons(manifest)
-    assert "damaged archive after" in told["part0.tar"]
-    assert 0 < sum(s.samples for s in manifest.shards) < 6
-    assert sum(" listed, " in r for r in told.values()) > 0
-
-
 def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
     layout = MotionLayout.named("body133")
     convert(config(copy, retarget=True, limit=2), tmp_path / "out")
@@ -330,19 +278,3 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
         prepare(config(copy, source=tmp_path / "none"))
     with pytest.raises(UserError, match="layout smpl75"):
         convert(config(copy, layout="smpl75"), tmp_path / "raw")
-
-
-def pack(folder: Path, parts: int, suffix: str = "tar.xz") -> None:
-    """Move the clips of `folder` into `parts` archives."""
-    files = sorted((folder / "dataset-1").glob("*.bvh"))
-    for part in range(parts):
-        with tarfile.open(folder / f"part{part}.{suffix}", "w:xz" if suffix == "tar.xz" else "w") as archive:
-            for path in files[part::parts]:
-                add(archive, f"dataset-1/{path.name}", path.read_bytes())
-    shutil.rmtree(folder / "dataset-1")
-
-
-def add(archive: tarfile.TarFile, name: str, data: bytes) -> None:
-    member = tarfile.TarInfo(name)
-    member.size = len(data)
-    archive.addfile(member, io.BytesIO(data))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tarfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -128,20 +126,6 @@ def test_seed_has_facts_timelines_and_splits_by_actor(built: Callable[[str], Pat
         planned("bones_seed", built("bones_seed"), where="categry=Dances")
     splits = {clip.id: split for split, clip in planned("bones_seed", built("bones_seed")).plan.items}
     assert splits["walk_001__A1"] == splits["walk_001__A1_M"]
-
-
-def test_seed_is_read_from_its_archive(tmp_path: Path) -> None:
-    source = trees.bones_seed(tmp_path / "in")
-    make("bones_seed", source, tmp_path / "folder")
-    loose = features(tmp_path / "folder")
-    with tarfile.open(source / "soma_uniform.tar.gz", "w:gz") as archive:
-        archive.add(source / "soma_uniform", "soma_uniform")
-    shutil.rmtree(source / "soma_uniform")
-    make("bones_seed", source, tmp_path / "packed")
-    packed = features(tmp_path / "packed")
-    assert packed.keys() == loose.keys() == {"walk_001__A1", "walk_001__A1_M", "talk_002__A2"}
-    assert all((packed[name] == motion).all() for name, motion in loose.items())
-    assert meta_of(tmp_path / "packed", "talk_002__A2")[1][0].text.endswith("and talks.")
 
 
 def nan_at(path: Path, key: str | None = None) -> None:
