@@ -8,15 +8,23 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.launch.process import local_rank
+
+_MOST_WORKERS = 4
+_FEW_BATCHES = 100
+"""Batches that are loaded sooner than processes are started."""
+_WORKER_ROOM = 2**28
+"""Bytes of shared memory for the batches of one worker: two that are ready and one on its way, of some 80 MB
+(256 whole-body clips of 196 frames and their captions)."""
 
 LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
 
@@ -32,8 +40,9 @@ class Hardware(Config):
     process may use. Threads of one process wait for each other at every operation, processes once a
     step, so small networks often train faster in several processes of one thread."""
     nodes: int = Field(1, ge=1)
-    workers: int = Field(0, ge=0)
-    """Loader worker processes per rank."""
+    workers: Annotated[int, Field(ge=0)] | Literal["auto"] = "auto"
+    """Processes that load batches, for each one that trains; 0 loads in that one. `auto`: on a GPU one for
+    each core that is left, up to four; on a CPU none."""
     convert_workers: int = Field(2, ge=1)
     """Processes that convert or synthesise shards."""
     threads: int = Field(0, ge=0)
@@ -92,6 +101,19 @@ class Hardware(Config):
                 f"hardware.devices is {self.devices} and no GPU is here; to train in so many processes on "
                 f"the CPU set hardware.accelerator to cpu"
             )
+
+    def workers_for(self, batches: int) -> int:
+        """Loader processes of one process, for so many batches."""
+        if self.workers != "auto":
+            return self.workers
+        if self.resolved_accelerator() == "cpu" or batches < _FEW_BATCHES:
+            return 0
+        processes = self.resolved_devices()
+        try:  # containers have 64 MiB by default, where a batch that does not fit ends the training
+            room = shutil.disk_usage("/dev/shm").free // _WORKER_ROOM
+        except OSError:
+            return 0
+        return max(0, min(_MOST_WORKERS, usable_cores() // processes - 1, room // processes))
 
     def world(self) -> int:
         return self.resolved_devices() * self.nodes

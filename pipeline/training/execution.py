@@ -1,12 +1,9 @@
-"""Execution of a training: devices, processes and precision, the module on them, and its loaders."""
+"""Execution of a training: devices, processes and precision, and the module on them."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import AbstractContextManager
-from functools import partial
-from multiprocessing import resource_tracker
 from typing import Any, cast
 
 import torch
@@ -20,18 +17,13 @@ from torch import Tensor, nn
 from torch.amp import GradScaler
 from torch.distributed.device_mesh import DeviceMesh
 from torch.optim import Optimizer
-from torch.utils.data import DataLoader
 
-from motionloom.datasets.loading.steps import Steps
 from motionloom.models.layers.transformer import Transformer
-from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.sharding import sharded
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.launch.process import end_with_parent
 from motionloom.pipeline.launch.team import environment
-from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.training.preemption import unsignalled
+from motionloom.pipeline.training.config import TrainConfig
 
 
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
@@ -165,57 +157,3 @@ class Execution:
         self.module.configure_gradient_clipping(optimizer)
         self.scaler.step(optimizer)  # passes over a step whose gradients overflow
         self.scaler.update()
-
-
-class TrainingData:
-    """The loaders of one training."""
-
-    def __init__(
-        self, train: BatchSource, validation: EvalSource | None, config: TrainConfig, hardware: Hardware
-    ) -> None:
-        self.config, self.hardware = config, hardware
-        self.train = train(config.batch_size // config.accumulate, rank(), world_size())
-        self.validation = validation
-        self._held_out: DataLoader[Batch] | None = None
-
-    def batches(self, step: int) -> Iterator[Batch]:
-        """All micro-batches from those of step `step` (from 0) to the end of the training."""
-        parts = self.config.accumulate
-        steps = Steps(lambda _, __: self.train, self.config.steps * parts, step * parts)
-        return iter(loader(steps, self.hardware))
-
-    def held_out(self) -> DataLoader[Batch]:
-        """All validation batches; workers stay from one validation to the next."""
-        if self._held_out is None:
-            assert self.validation is not None
-            self._held_out = loader(every_batch(self.validation), self.hardware)
-        return self._held_out
-
-
-def every_batch(validation: EvalSource) -> Steps[Batch]:
-    """All validation batches, in every process."""
-    batches = validation()
-    return Steps(lambda _, __: batches, len(batches))
-
-
-class _Loader(DataLoader[Batch]):
-    def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
-        if self.num_workers:
-            # Started with the first process of all, it would let SIGTERM through to that one.
-            resource_tracker.ensure_running()
-        with unsignalled():
-            return super().__iter__()
-
-
-def loader(steps: Steps[Batch], hardware: Hardware) -> DataLoader[Batch]:
-    """A loader of batches that are whole already."""
-    workers = hardware.workers
-    return _Loader(
-        steps,
-        batch_size=None,
-        num_workers=workers,
-        pin_memory=hardware.resolved_accelerator() == "gpu",
-        persistent_workers=workers > 0,  # from validation to validation; their start takes seconds
-        multiprocessing_context="spawn" if workers else None,
-        worker_init_fn=partial(end_with_parent, os.getpid()) if workers else None,
-    )

@@ -31,7 +31,7 @@ from motionloom.models.training.stage_module import LOG_EVERY, StageModule
 from motionloom.pipeline.launch.process import TeamError
 from motionloom.pipeline.store.files import open_own
 from motionloom.pipeline.store.training_log import CRASHES
-from motionloom.pipeline.training.execution import TrainingData
+from motionloom.pipeline.training.loaders import TrainingData
 from motionloom.pipeline.training.telemetry import all_ranks
 
 

@@ -16,7 +16,8 @@ from motionloom.pipeline.contract.lookup import outside_stage
 from motionloom.pipeline.contract.stage import CompletedStage, Inputs, StageCache, stage_kind
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import every_batch, loader, prepare_module, set_threads
+from motionloom.pipeline.training.execution import prepare_module, set_threads
+from motionloom.pipeline.training.loaders import every_batch, loader
 from motionloom.pipeline.training.trained_stage import Batches, TrainedStage, hyper_parameters
 
 

@@ -32,7 +32,7 @@ from motionloom.pipeline.training.utilization import Utilization
 
 
 class WaitTimes(dict[str, float]):
-    """Seconds that this process has waited, by cause.
+    """Seconds that this process has waited, by cause; on a GPU seconds after all that was queued was done.
 
     `data`: for the next batch, what the reader had not prepared while the step before it was computed;
     `checkpoints`: for copying the state, and for the checkpoint before it if that was still being written;
@@ -40,8 +40,12 @@ class WaitTimes(dict[str, float]):
     `ranks`: for ranks that came later to a step.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, device: torch.device) -> None:
         super().__init__(data=0.0, checkpoints=0.0, validation=0.0, ranks=0.0)
+        self.process = 0.0
+        """Seconds that the process itself has waited, whatever its GPU did meanwhile."""
+        self._on_gpu = device.type == "cuda"
+        self._unread: list[tuple[str, torch.cuda.Event, torch.cuda.Event]] = []
 
     @property
     def aside(self) -> float:
@@ -52,14 +56,34 @@ class WaitTimes(dict[str, float]):
     def waiting_for(self, cause: str) -> Iterator[None]:
         """Count the time inside as a wait for `cause`."""
         begin = time.perf_counter()
+        # A GPU comes to the first mark when all that was queued is done, to the second when it may go on.
+        mark = _mark() if self._on_gpu else None
         try:
             yield
         finally:
-            self[cause] += time.perf_counter() - begin
+            seconds = time.perf_counter() - begin
+            self.process += seconds
+            if mark is None:
+                self[cause] += seconds
+            else:
+                self._unread.append((cause, mark, _mark()))
+
+    def read(self) -> None:
+        """Add the waits of a GPU since the last call; it must come to the end of each."""
+        for cause, begin, end in self._unread:
+            end.synchronize()
+            self[cause] += begin.elapsed_time(end) / 1000
+        self._unread.clear()
 
     def shares(self, before: Mapping[str, float], seconds: float) -> dict[str, float]:
         """Shares of the last `seconds` spent waiting since `before`, a copy made then: 0 to 1, by cause."""
         return {cause: min(1.0, (now - before[cause]) / max(seconds, 1e-9)) for cause, now in self.items()}
+
+
+def _mark() -> torch.cuda.Event:
+    mark = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]
+    mark.record()
+    return mark
 
 
 class Telemetry:
@@ -78,7 +102,7 @@ class Telemetry:
         peak: float | None = None,
     ) -> None:
         self.module, self.batch_size, self.console = module, batch_size, console
-        self.waits = WaitTimes()
+        self.waits = WaitTimes(module.device)
         self.note = ""
         """Speed, MFU and goodput of the last row, in words."""
         self._shown: list[str] = []
@@ -114,14 +138,15 @@ class Telemetry:
 
     def begin_step(self) -> None:
         """Validations and checkpoints do not count in the time of a step."""
-        self._step_start, self._data_before = time.perf_counter(), self.waits["data"]
+        self._step_start, self._waited_before = time.perf_counter(), self.waits.process
 
     def end_step(self) -> None:
         seconds = time.perf_counter() - self._step_start
         self._seconds.append(seconds)
         self._latest.append(seconds)
-        self._own.append(seconds - (self.waits["data"] - self._data_before))
+        self._own.append(seconds - (self.waits.process - self._waited_before))
         if self.module.step == self._first + 1:
+            self.waits.read()
             self._use.start(self.waits.aside)
 
     def end_row(self) -> dict[str, float]:
@@ -129,6 +154,7 @@ class Telemetry:
         # The step times of all ranks, so that each knows how long it has waited for the slowest.
         late = all_ranks(([0.0] * LOG_EVERY + self._own)[-LOG_EVERY:], self.module.device)
         self.waits["ranks"] += waited_in_steps(late, rank())
+        self.waits.read()
         now = time.perf_counter()
         wall, self._row_start = max(now - self._row_start, 1e-9), now
         waited, self._before = self.waits.shares(self._before, wall), dict(self.waits)
@@ -165,12 +191,13 @@ class Telemetry:
         """Speed and waits since this process began to train, in words; "" if it took no step."""
         steps, wall = self.module.step - self._first, time.perf_counter() - self._start
         self._read_lengths()
+        self.waits.read()
         if not steps:
             return ""
         speeds = [f"{steps * self.batch_size / wall:,.1f} samples/s"]
         if self._unit:
             speeds.append(f"{self._units * world_size() / wall:,.0f} {self._unit}/s")
-        shares = self.waits.shares(WaitTimes(), wall)
+        shares = self.waits.shares(dict.fromkeys(self.waits, 0.0), wall)
         if world_size() == 1:
             del shares["ranks"]
         named = {"ranks": "other ranks"}

@@ -47,8 +47,9 @@ from motionloom.pipeline.training.checkpointing import (
     weights_of,
 )
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.training.execution import Execution, TrainingData, launch, set_threads
+from motionloom.pipeline.training.execution import Execution, launch, set_threads
 from motionloom.pipeline.training.failures import FailureGuard, StallTimer
+from motionloom.pipeline.training.loaders import TrainingData, on_device
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
 from motionloom.pipeline.training.telemetry import StepProfiler, StepProgress, Telemetry
@@ -174,7 +175,8 @@ class Training:
             if not self.validation_is_due:
                 self._save(again=True)  # else a second kill would validate this step twice
             self._answer(self.agreement.now())
-        batches = self.data.batches(module.step) if module.step < steps else iter(())
+        left = self.data.batches(module.step) if module.step < steps else ()
+        batches = on_device(left, self.fabric)
         while module.step < steps:
             self._step(batches)
             border = module.step % self.every == 0 or module.step == steps
@@ -210,7 +212,6 @@ class Training:
         for _ in range(self.config.accumulate):
             with self.telemetry.waits.waiting_for("data"):
                 batch = next(batches)
-            batch = self.fabric.to_device(batch)
             self.telemetry.batch(batch)
             yield batch
 
@@ -237,8 +238,7 @@ class Training:
         self.agreement.restart_pace()  # batches of a validation take another time than steps
         averaged = self.average.swapped(module.net) if self.average else nullcontext()
         with self.telemetry.waits.waiting_for("validation"), averaged, torch.no_grad():
-            for number, batch in enumerate(loader):
-                batch = self.fabric.to_device(batch)
+            for number, batch in enumerate(on_device(loader, self.fabric)):
                 with self.fabric.autocast():
                     values = module.validation_step(batch, number)
                 size = len(batch["length"])

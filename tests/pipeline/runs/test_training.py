@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import lightning as L
 import pytest
 import torch
+from rank_shares import require_rows
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.tma.module import TmaModule
@@ -48,7 +50,9 @@ def test_a_trainer_makes_the_weights_of_the_run(stage: str, request: Any, tmp_pa
     for name, value in module.state_dict().items():
         assert torch.equal(value, wanted["state_dict"][name]), name
     trainer.save_checkpoint(tmp_path / "trainer.ckpt")
-    batch = data.batches.train(8, 0, 1)[0]
+    batches = data.batches.train(8, 0, 1)
+    batch = batches[0]
+    require_rows(batch, [pickle.loads(pickle.dumps(batches))[0]])  # a loader's worker gets a copy
     losses = []
     for loaded in (StageModule.load_from_checkpoint(path) for path in (first, tmp_path / "trainer.ckpt")):
         assert type(loaded) is type(module) and loaded.hparams["config"] == module.hparams["config"]

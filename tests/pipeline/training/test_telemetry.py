@@ -28,17 +28,46 @@ def test_a_training_notes_speed_and_waits(tmp_path: Path) -> None:
     for row in rows:
         assert row["samples_per_second"] > 0 and row["frames_per_second"] == row["samples_per_second"]
         assert 0 < row["step_seconds"] <= row["step_seconds_p95"]
-        assert all(0 <= row[f"waited/{cause}"] <= 1 for cause in WaitTimes())
+        assert all(0 <= row[f"waited/{cause}"] <= 1 for cause in WaitTimes(torch.device("cpu")))
         assert 0 < row["goodput"] < 1 and "mfu" not in row  # a CPU has no peak
 
 
 def test_a_rank_waits_for_the_one_that_comes_last() -> None:
     seconds = torch.tensor([[3.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
     assert [waited_in_steps(seconds, rank) for rank in (0, 1)] == [2.0, 0.0]
-    waits = WaitTimes()
+    waits = WaitTimes(torch.device("cpu"))
     waits["data"] = 3.0
     nothing = dict.fromkeys(waits, 0.0)
     assert waits.shares(nothing | {"data": 1.0}, 4.0) == nothing | {"data": 0.5}
+
+
+def test_a_gpu_waits_only_when_it_has_nothing_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The process waits a moment twice; the GPU has work left the first time, none the second."""
+    free_at = iter([5.0, 5.0, 7.0, 9.0])
+
+    class Event:
+        def __init__(self, *, enable_timing: bool) -> None:
+            assert enable_timing
+            self.done = False
+
+        def record(self) -> None:
+            self.at = next(free_at)
+
+        def synchronize(self) -> None:
+            self.done = True
+
+        def elapsed_time(self, end: Event) -> float:
+            assert end.done
+            return 1000 * (end.at - self.at)
+
+    monkeypatch.setattr(torch.cuda, "Event", Event)
+    waits = WaitTimes(torch.device("cuda"))
+    for wanted in (0.0, 2.0):
+        before = waits.process
+        with waits.waiting_for("data"):
+            pass
+        waits.read()
+        assert waits["data"] == wanted and waits.process > before
 
 
 def test_steps_that_come_again_are_there_once(tmp_path: Path) -> None:

@@ -1,0 +1,102 @@
+"""The loaders of a training, in workers beside it, and their batches on its device."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from functools import partial
+from multiprocessing import resource_tracker
+
+import torch
+from lightning.fabric import Fabric
+from torch import Tensor
+from torch.utils._pytree import tree_leaves
+from torch.utils.data import DataLoader
+
+from motionloom.datasets.loading.steps import Steps
+from motionloom.models.training.distributed import rank, world_size
+from motionloom.models.training.stage_module import Batch
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import end_with_parent
+from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
+from motionloom.pipeline.training.preemption import unsignalled
+
+
+class TrainingData:
+    """The loaders of one training."""
+
+    def __init__(
+        self, train: BatchSource, validation: EvalSource | None, config: TrainConfig, hardware: Hardware
+    ) -> None:
+        self.config, self.hardware = config, hardware
+        self.train = train(config.batch_size // config.accumulate, rank(), world_size())
+        self.validation = validation
+        self._held_out: DataLoader[Batch] | None = None
+
+    def batches(self, step: int) -> DataLoader[Batch]:
+        """All micro-batches from those of step `step` (from 0) to the end of the training."""
+        parts = self.config.accumulate
+        return loader(Steps(lambda _, __: self.train, self.config.steps * parts, step * parts), self.hardware)
+
+    def held_out(self) -> DataLoader[Batch]:
+        """All validation batches; workers stay from one validation to the next."""
+        if self._held_out is None:
+            assert self.validation is not None
+            self._held_out = loader(every_batch(self.validation), self.hardware)
+        return self._held_out
+
+
+def every_batch(validation: EvalSource) -> Steps[Batch]:
+    """All validation batches, in every process."""
+    batches = validation()
+    return Steps(lambda _, __: batches, len(batches))
+
+
+class _Loader(DataLoader[Batch]):
+    def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
+        if self.num_workers:
+            # Started with the first process of all, it would let SIGTERM through to that one.
+            resource_tracker.ensure_running()
+        with unsignalled():
+            return super().__iter__()
+
+
+def loader(steps: Steps[Batch], hardware: Hardware) -> DataLoader[Batch]:
+    """A loader of batches that are whole already."""
+    workers = hardware.workers_for(steps.last - steps.first)
+    return _Loader(
+        steps,
+        batch_size=None,
+        num_workers=workers,
+        pin_memory=hardware.resolved_accelerator() == "gpu",
+        persistent_workers=workers > 0,  # from validation to validation; their start takes seconds
+        multiprocessing_context="spawn" if workers else None,
+        worker_init_fn=partial(end_with_parent, os.getpid()) if workers else None,
+    )
+
+
+def on_device(batches: Iterable[Batch], fabric: Fabric) -> Iterator[Batch]:
+    """The batches where `fabric` computes; a GPU gets the next one while this one is computed.
+
+    Pinned memory is copied by a stream of its own, which the computing one waits for batch by batch.
+    """
+    if fabric.device.type != "cuda":
+        yield from map(fabric.to_device, batches)
+        return
+    copies = torch.cuda.Stream(fabric.device)  # type: ignore[no-untyped-call]
+
+    def copied(batch: Batch) -> tuple[Batch, torch.cuda.Event]:
+        with torch.cuda.stream(copies):
+            return fabric.to_device(batch), copies.record_event()
+
+    coming = map(copied, batches)
+    ahead = next(coming, None)
+    while ahead is not None:
+        batch, done = ahead
+        ahead = next(coming, None)  # on its way before this one's work is queued
+        computing = torch.cuda.current_stream(fabric.device)
+        computing.wait_event(done)
+        for value in tree_leaves(batch):
+            if isinstance(value, Tensor):  # the copying stream must not have its memory back while it is read
+                value.record_stream(computing)
+        yield batch

@@ -1,0 +1,109 @@
+"""Loaders beside the training: how many workers, and batches that are copied while others are computed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from motionloom.datasets.conditions import Condition
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.training.loaders import on_device
+
+GIB = 2**30
+
+
+@pytest.mark.parametrize(
+    ("settings", "cores", "shared", "batches", "wanted"),
+    [
+        ({"accelerator": "gpu", "devices": 1}, 16, 8 * GIB, 1000, 4),
+        ({"accelerator": "gpu", "devices": 8}, 24, 8 * GIB, 1000, 2),
+        ({"accelerator": "gpu", "devices": 8}, 8, 8 * GIB, 1000, 0),
+        ({"accelerator": "gpu", "devices": 2}, 64, GIB, 1000, 2),
+        ({"accelerator": "gpu", "devices": 1}, 64, 2**26, 1000, 0),
+        ({"accelerator": "gpu", "devices": 1}, 64, None, 1000, 0),
+        ({"accelerator": "gpu", "devices": 1}, 16, 8 * GIB, 20, 0),
+        ({"accelerator": "cpu"}, 16, 8 * GIB, 1000, 0),
+        ({"accelerator": "cpu", "workers": 3}, 1, 0, 1, 3),
+        ({"accelerator": "gpu", "devices": 1, "workers": 0}, 16, 8 * GIB, 1000, 0),
+    ],
+)
+def test_workers_by_cores_processes_and_shared_memory(
+    settings: dict[str, Any],
+    cores: int,
+    shared: int | None,
+    batches: int,
+    wanted: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def usage(path: str) -> SimpleNamespace:
+        if shared is None:
+            raise FileNotFoundError(path)
+        return SimpleNamespace(free=shared)
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(shutil, "disk_usage", usage)
+    assert Hardware.parse(settings, "hardware").workers_for(batches) == wanted
+
+
+@pytest.mark.parametrize("workers", [-1, "many"])
+def test_other_workers_are_refused(workers: object) -> None:
+    with pytest.raises(UserError, match="workers"):
+        Hardware.parse({"workers": workers}, "hardware")
+
+
+def test_the_next_batch_is_copied_while_one_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU's calls: batch 1 is on its way before batch 0 is given out, and each is waited for."""
+    calls: list[object] = []
+    now = ["computing"]
+
+    class Stream:
+        def __init__(self, name: object) -> None:
+            self.name = str(name) if isinstance(name, str) else "copies"
+
+        def record_event(self) -> str:
+            return f"copy {sum(str(call).startswith('copy') for call in calls) - 1}"
+
+        def wait_event(self, event: str) -> None:
+            calls.append(f"{self.name} waits for {event}")
+
+    @contextmanager
+    def within(stream: Stream) -> Iterator[None]:
+        now.append(stream.name)
+        yield
+        now.pop()
+
+    def to_device(batch: dict[str, Any]) -> dict[str, Any]:
+        assert now[-1] == "copies"
+        calls.append(f"copy {int(batch['motion'])}")
+        return batch
+
+    kept = []
+    monkeypatch.setattr(torch.cuda, "Stream", Stream)
+    monkeypatch.setattr(torch.cuda, "stream", within)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda _: Stream(now[-1]))
+    monkeypatch.setattr(torch.Tensor, "record_stream", lambda tensor, stream: kept.append(stream.name))
+    fabric: Any = SimpleNamespace(device=torch.device("cuda"), to_device=to_device)
+    given = [
+        {"motion": torch.tensor(k), "conditions": {"text": Condition(torch.zeros(1), torch.ones(1))}}
+        for k in range(3)
+    ]
+    for k, batch in enumerate(on_device(given, fabric)):
+        assert batch is given[k]
+        calls.append(f"compute {k}")
+        assert kept == 3 * (k + 1) * ["computing"], "memory of every tensor is held back"
+    assert calls == [
+        "copy 0", "copy 1", "computing waits for copy 0", "compute 0",
+        "copy 2", "computing waits for copy 1", "compute 1",
+        "computing waits for copy 2", "compute 2",
+    ]  # fmt: skip
+    on_cpu: Any = SimpleNamespace(device=torch.device("cpu"), to_device=lambda batch: batch)
+    reading = iter(on_device(map(calls.append, range(2)), on_cpu))
+    assert next(reading) is None and calls[-1] == 0, "a CPU reads no batch before its turn"
