@@ -1,6 +1,6 @@
 """1-D convolutional encoder and decoder of the motion tokenizers (HumanTOMATO B.2).
 
-- Borders are channels-last (`[B, T, D]`); inside, convolutions run channels-first (`[B, C, T]`).
+- All is channels-last (`[B, T, C]`), as `Conv` takes it.
 - Down: kernel 4, stride 2. Up: nearest x2, then a convolution. Each resolution carries residual blocks with
   dilations growth^(depth-1), ..., growth, 1: the wide view first, as in the public T2M-GPT configuration.
 - Weights start as He et al. (2015) have it for ReLU and residual branches near zero: with torch's own,
@@ -17,14 +17,38 @@ from torch.nn import functional
 
 
 def frame_padding(valid: Tensor | None, frames: int, stride: int) -> Tensor | None:
-    """True where a position of a sequence at 1/stride of the frame rate is padding, [B, 1, frames/stride].
+    """True where a position of a sequence at 1/stride of the frame rate is padding, [B, frames/stride, 1].
 
     `valid` [B] counts frames and must be a multiple of `stride`; None means that nothing is padded.
     """
     if valid is None:
         return None
     position = torch.arange(0, frames, stride, device=valid.device)
-    return (position >= valid[:, None])[:, None]
+    return (position >= valid[:, None])[..., None]
+
+
+class Conv(nn.Conv1d):
+    """`nn.Conv1d` of [B, T, C], padded with zeros by a number.
+
+    torch copies the input of every 1-D convolution to [B, C, T], and cudnn and oneDNN copy it back before
+    they compute. A 2-D one of height 1 keeps channels last; one with a kernel of 1 is a matrix product.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.kernel_size == self.stride == (1,):
+            return functional.linear(x, self.weight[..., 0], self.bias)
+        step, padding, dilation = (1, *self.stride), (0, int(self.padding[0])), (1, *self.dilation)
+        weight = self.weight[:, :, None]
+        out = functional.conv2d(x.mT[:, :, None], weight, self.bias, step, padding, dilation)
+        return out[:, :, 0].mT
+
+
+class ConvTranspose(nn.ConvTranspose1d):
+    """`nn.ConvTranspose1d` of [B, T, C], for the same reason."""
+
+    def forward(self, x: Tensor, output_size: list[int] | None = None) -> Tensor:
+        step, padding, weight = (1, *self.stride), (0, int(self.padding[0])), self.weight[:, :, None]
+        return functional.conv_transpose2d(x.mT[:, :, None], weight, self.bias, step, padding)[:, :, 0].mT
 
 
 @torch.no_grad()
@@ -40,20 +64,20 @@ def start_weights(net: nn.Module, slope: float = 0.0) -> None:
 
 
 def zero_padded(x: Tensor, padding: Tensor | None) -> Tensor:
-    """x [B, C, T] with zeros where `padding` [B, 1, T]; None = nothing is padded."""
+    """x [B, T, C] with zeros where `padding` [B, T, 1]; None = nothing is padded."""
     return x if padding is None else x.masked_fill(padding, 0.0)
 
 
 class ResidualBlock(nn.Module):
-    """ReLU, dilated convolution, ReLU, 1x1 convolution, plus the input; [B, C, T] -> [B, C, T]."""
+    """ReLU, dilated convolution, ReLU, 1x1 convolution, plus the input; [B, T, C] -> [B, T, C]."""
 
     def __init__(self, width: int, dilation: int) -> None:
         super().__init__()
-        self.spread = nn.Conv1d(width, width, 3, padding=dilation, dilation=dilation)
-        self.mix = nn.Conv1d(width, width, 1)
+        self.spread = Conv(width, width, 3, padding=dilation, dilation=dilation)
+        self.mix = Conv(width, width, 1)
 
     def forward(self, x: Tensor, padding: Tensor | None) -> Tensor:
-        """`padding` [B, 1, T] marks the positions to ignore."""
+        """`padding` [B, T, 1] marks the positions to ignore."""
         hidden = self.spread(zero_padded(functional.relu(x), padding))
         mixed: Tensor = self.mix(functional.relu(hidden))
         return x + mixed
@@ -82,22 +106,22 @@ class ConvEncoder(nn.Module):
         self, dim: int, out_dim: int, *, width: int, halvings: int, depth: int, dilation_growth: int
     ) -> None:
         super().__init__()
-        self.enter = nn.Conv1d(dim, width, 3, padding=1)
+        self.enter = Conv(dim, width, 3, padding=1)
         # Kernel 4 with stride 2 and padding 1 halves T exactly and covers every frame equally often (twice).
-        self.down = nn.ModuleList(nn.Conv1d(width, width, 4, stride=2, padding=1) for _ in range(halvings))
+        self.down = nn.ModuleList(Conv(width, width, 4, stride=2, padding=1) for _ in range(halvings))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(halvings))
-        self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
+        self.leave = Conv(width, out_dim, 3, padding=1)
         start_weights(self)
 
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = frames that are not padding, a multiple of 2^halvings; T is a multiple of it too."""
         frames = x.shape[1]
         padding = [frame_padding(valid, frames, 2**i) for i in range(len(self.down) + 1)]
-        hidden = functional.relu(self.enter(zero_padded(x.transpose(1, 2), padding[0])))
+        hidden = functional.relu(self.enter(zero_padded(x, padding[0])))
         for i, (down, stack) in enumerate(zip(self.down, self.stacks, strict=True)):
             hidden = stack(down(zero_padded(hidden, padding[i])), padding[i + 1])
         latents: Tensor = self.leave(zero_padded(hidden, padding[-1]))
-        return latents.transpose(1, 2)
+        return latents
 
 
 class ConvDecoder(nn.Module):
@@ -109,12 +133,12 @@ class ConvDecoder(nn.Module):
         super().__init__()
         self.stride = 2**doublings
         """Frames of one latent."""
-        self.enter = nn.Conv1d(dim, width, 3, padding=1)
+        self.enter = Conv(dim, width, 3, padding=1)
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(doublings))
         # Nearest up-sampling, then a convolution: a transposed one leaves a pattern of uneven overlaps.
-        self.up = nn.ModuleList(nn.Conv1d(width, width, 3, padding=1) for _ in range(doublings))
-        self.refine = nn.Conv1d(width, width, 3, padding=1)
-        self.leave = nn.Conv1d(width, out_dim, 3, padding=1)
+        self.up = nn.ModuleList(Conv(width, width, 3, padding=1) for _ in range(doublings))
+        self.refine = Conv(width, width, 3, padding=1)
+        self.leave = Conv(width, out_dim, 3, padding=1)
         start_weights(self)
         with torch.no_grad():
             self.leave.weight.mul_(0.1)  # near the mean pose, which is zero
@@ -124,13 +148,13 @@ class ConvDecoder(nn.Module):
         doublings = len(self.up)
         frames = z.shape[1] * 2**doublings
         padding = [frame_padding(valid, frames, 2**i) for i in range(doublings + 1)]
-        hidden = functional.relu(self.enter(zero_padded(z.transpose(1, 2), padding[-1])))
+        hidden = functional.relu(self.enter(zero_padded(z, padding[-1])))
         for i, (stack, up) in enumerate(zip(self.stacks, self.up, strict=True)):
             level = doublings - i
-            hidden = stack(hidden, padding[level]).repeat_interleave(2, dim=2)
+            hidden = stack(hidden, padding[level]).repeat_interleave(2, dim=1)
             hidden = up(zero_padded(hidden, padding[level - 1]))
         hidden = functional.relu(self.refine(zero_padded(hidden, padding[0])))
-        return zero_padded(self.leave(zero_padded(hidden, padding[0])), padding[0]).transpose(1, 2)
+        return zero_padded(self.leave(zero_padded(hidden, padding[0])), padding[0])
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""

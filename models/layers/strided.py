@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.layers.conv import ResidualStack, frame_padding, start_weights, zero_padded
+from motionloom.models.layers.conv import Conv, ResidualStack, frame_padding, start_weights, zero_padded
 
 SLOPE = 0.2
 """Slope of the leaky ReLU below zero."""
@@ -30,19 +30,19 @@ class StridedEncoder(nn.Module):
     def __init__(self, dim: int, out_dim: int, *, width: int, depth: int, dilation_growth: int = 1) -> None:
         super().__init__()
         widths = [dim, width, width]
-        self.down = nn.ModuleList(nn.Conv1d(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths))
+        self.down = nn.ModuleList(Conv(a, b, 4, stride=2, padding=1) for a, b in pairwise(widths))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
-        self.out = nn.Conv1d(width, out_dim, 3, padding=1)
+        self.out = Conv(width, out_dim, 3, padding=1)
         start_weights(self, SLOPE)
 
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = frames that are not padding; T and `valid` are multiples of 4."""
         padding = [frame_padding(valid, x.shape[1], 2**i) for i in range(3)]
-        hidden = x.transpose(1, 2)
+        hidden = x
         for i, (down, stack) in enumerate(zip(self.down, self.stacks, strict=True)):
             hidden = stack(_active(down(zero_padded(hidden, padding[i]))), padding[i + 1])
         latents: Tensor = self.out(zero_padded(hidden, padding[2]))
-        return latents.transpose(1, 2)
+        return latents
 
 
 class StridedDecoder(nn.Module):
@@ -53,9 +53,9 @@ class StridedDecoder(nn.Module):
         widths = [dim, width, width]
         self.stride = 4
         """Frames of one latent."""
-        self.up = nn.ModuleList(nn.Conv1d(a, b, 3, padding=1) for a, b in pairwise(widths))
+        self.up = nn.ModuleList(Conv(a, b, 3, padding=1) for a, b in pairwise(widths))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
-        self.out = nn.Conv1d(width, out_dim, 3, padding=1)
+        self.out = Conv(width, out_dim, 3, padding=1)
         start_weights(self, SLOPE)
         with torch.no_grad():
             self.out.weight.mul_(0.1)  # near the mean pose, which is zero
@@ -63,12 +63,12 @@ class StridedDecoder(nn.Module):
     def forward(self, z: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = *frames* that are not padding, a multiple of 4; padded frames come out as zero."""
         padding = [frame_padding(valid, z.shape[1] * 4, 2**i) for i in range(3)]
-        hidden = z.transpose(1, 2)
+        hidden = z
         for i, (up, stack) in enumerate(zip(self.up, self.stacks, strict=True)):
             level = 1 - i
-            wide = zero_padded(hidden, padding[level + 1]).repeat_interleave(2, dim=2)
+            wide = zero_padded(hidden, padding[level + 1]).repeat_interleave(2, dim=1)
             hidden = stack(_active(up(wide)), padding[level])
-        return zero_padded(self.out(zero_padded(hidden, padding[0])), padding[0]).transpose(1, 2)
+        return zero_padded(self.out(zero_padded(hidden, padding[0])), padding[0])
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.layers.conv import ConvDecoder, ConvEncoder
+from motionloom.models.layers.conv import Conv, ConvDecoder, ConvEncoder
 from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.ema import EmaQuantizer
 from motionloom.models.tokenizer.base import (
@@ -105,7 +105,7 @@ class H2VQ(BodyHandTokenizer):
         self.body_encoder = ConvEncoder(len(body), d, halvings=1, **sizes)
         self.hand_quantizer = EmaQuantizer(config.quantizer(), salt=0)
         self.transform = nn.Linear(d, d)
-        self.fuse = nn.Conv1d(2 * d, d, 3, padding=1)
+        self.fuse = Conv(2 * d, d, 3, padding=1)
         self.body_quantizer = EmaQuantizer(config.quantizer(), salt=1)
         self.decoder = ConvDecoder(2 * d, self.dim, doublings=1, **sizes)
 
@@ -125,7 +125,7 @@ class H2VQ(BodyHandTokenizer):
         both = torch.cat([hint, z_body], dim=-1)
         if mask is not None:
             both = both.masked_fill(~mask[..., None], 0.0)
-        fused = self.fuse(both.transpose(1, 2)).transpose(1, 2)
+        fused = self.fuse(both)
         body = self.body_quantizer(fused, mask, update=update)
         return Latents(
             self._join({"body": body.quantized, "hand": hand_vectors}),

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config
-from motionloom.models.layers.conv import ResidualBlock, start_weights
+from motionloom.models.layers.conv import Conv, ConvTranspose, ResidualBlock, start_weights
 from motionloom.models.quantize.base import QuantizerConfig
 from motionloom.models.quantize.ema import EmaQuantizer
 
@@ -78,23 +78,23 @@ class _Stack(nn.Sequential):
 
 
 def _encoder(config: DanceVqConfig, dim: int) -> nn.Sequential:
-    """Frames [B, dim, T] to latents [B, code_dim, L]."""
+    """Frames [B, T, dim] to latents [B, L, code_dim]."""
     parts: list[nn.Module] = []
     for level in range(config.halvings):
-        parts.append(nn.Conv1d(config.width if level else dim, config.width, 4, stride=2, padding=1))
+        parts.append(Conv(config.width if level else dim, config.width, 4, stride=2, padding=1))
         parts.append(_Stack(config.width, _dilations(config)))
-    return nn.Sequential(*parts, nn.Conv1d(config.width, config.code_dim, 3, padding=1))
+    return nn.Sequential(*parts, Conv(config.width, config.code_dim, 3, padding=1))
 
 
 def _decoder(config: DanceVqConfig, dim: int) -> nn.Sequential:
-    """Code vectors [B, code_dim, L] to frames [B, dim, T]."""
-    parts: list[nn.Module] = [nn.Conv1d(config.code_dim, config.width, 3, padding=1)]
+    """Code vectors [B, L, code_dim] to frames [B, T, dim]."""
+    parts: list[nn.Module] = [Conv(config.code_dim, config.width, 3, padding=1)]
     for level in range(config.halvings):
         last = level == config.halvings - 1
         parts.append(_Stack(config.width, _dilations(config)[::-1]))
         out = config.code_dim if last else config.width
-        parts.append(nn.ConvTranspose1d(config.width, out, 4, stride=2, padding=1))
-    return nn.Sequential(*parts, nn.Conv1d(config.code_dim, dim, 3, padding=1))
+        parts.append(ConvTranspose(config.width, out, 4, stride=2, padding=1))
+    return nn.Sequential(*parts, Conv(config.code_dim, dim, 3, padding=1))
 
 
 @torch.no_grad()
@@ -102,7 +102,7 @@ def _start_decoder(decoder: nn.Sequential) -> None:
     """Fresh weights; what comes out is near zero at first."""
     start_weights(decoder)
     last = decoder[-1]
-    assert isinstance(last, nn.Conv1d)
+    assert isinstance(last, Conv)
     last.weight.mul_(0.1)
 
 
@@ -128,8 +128,8 @@ class HalfVq(nn.Module):
         _start_decoder(self.decoder)
 
     def latents(self, x: Tensor) -> Tensor:
-        out: Tensor = self.encoder(x.transpose(1, 2))
-        return out.transpose(1, 2)
+        out: Tensor = self.encoder(x)
+        return out
 
     def forward(self, x: Tensor) -> HalfOutput:
         """Training updates the codebook."""
@@ -146,8 +146,8 @@ def places(columns: Tensor) -> Tensor:
 def decoded(decoder: nn.Sequential, vectors: Tensor) -> Tensor:
     """Code vectors [B, L, d] through a decoder, [B, T, D]."""
     weights = next(decoder.parameters())  # codebooks are float32 whatever the network is
-    out: Tensor = decoder(vectors.transpose(1, 2).to(weights.dtype))
-    return out.transpose(1, 2)
+    out: Tensor = decoder(vectors.to(weights.dtype))
+    return out
 
 
 class DanceVq(nn.Module):

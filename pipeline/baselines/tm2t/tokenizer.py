@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.layers.conv import frame_padding, start_weights, zero_padded
+from motionloom.models.layers.conv import Conv, frame_padding, start_weights, zero_padded
 from motionloom.models.layers.strided import SLOPE
 from motionloom.models.quantize.gradient import GradientQuantizer
 from motionloom.models.tokenizer.base import Recon, Stream, Tokenizer
@@ -53,8 +53,8 @@ class _Block(nn.Module):
 
     def __init__(self, width: int, dilation: int = 1) -> None:
         super().__init__()
-        self.spread = nn.Conv1d(width, width, 3, padding=dilation, dilation=dilation)
-        self.mix = nn.Conv1d(width, width, 3, padding=dilation, dilation=dilation)
+        self.spread = Conv(width, width, 3, padding=dilation, dilation=dilation)
+        self.mix = Conv(width, width, 3, padding=dilation, dilation=dilation)
 
     def forward(self, x: Tensor, padding: Tensor | None) -> Tensor:
         hidden = functional.leaky_relu(self.spread(zero_padded(x, padding)), SLOPE)
@@ -72,7 +72,7 @@ class Tm2tEncoder(nn.Module):
         self.register_buffer("heard", heard, persistent=False)
         widths = (width, out_dim)
         self.down = nn.ModuleList(
-            nn.Conv1d(a, b, 4, stride=2, padding=1) for a, b in zip((len(heard), width), widths, strict=True)
+            Conv(a, b, 4, stride=2, padding=1) for a, b in zip((len(heard), width), widths, strict=True)
         )
         self.blocks = nn.ModuleList(map(_Block, widths))
         start_weights(self, SLOPE)
@@ -80,11 +80,11 @@ class Tm2tEncoder(nn.Module):
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = frames that are not padding; T and `valid` are multiples of 4."""
         padding = [frame_padding(valid, x.shape[1], 2**i) for i in range(3)]
-        hidden = x[..., self.heard].transpose(1, 2)
+        hidden = x[..., self.heard]
         for i, (down, block) in enumerate(zip(self.down, self.blocks, strict=True)):
             hidden = functional.leaky_relu(down(zero_padded(hidden, padding[i])), SLOPE)
             hidden = block(hidden, padding[i + 1])
-        return hidden.transpose(1, 2)
+        return hidden
 
 
 class Tm2tDecoder(nn.Module):
@@ -97,20 +97,20 @@ class Tm2tDecoder(nn.Module):
         dilations = [dilation_growth**i for i in reversed(range(depth))]
         self.reach = 2 * sum(dilations)
         self.blocks = nn.ModuleList(_Block(dim, dilation) for dilation in dilations)
-        self.up = nn.ModuleList(nn.Conv1d(a, b, 3, padding=1) for a, b in ((dim, width), (width, out_dim)))
-        self.out = nn.Conv1d(out_dim, out_dim, 3, padding=1)
+        self.up = nn.ModuleList(Conv(a, b, 3, padding=1) for a, b in ((dim, width), (width, out_dim)))
+        self.out = Conv(out_dim, out_dim, 3, padding=1)
         start_weights(self, SLOPE)
 
     def forward(self, z: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = *frames* that are not padding, a multiple of 4; padded frames come out as zero."""
         padding = [frame_padding(valid, z.shape[1] * 4, 2**i) for i in range(3)]
-        hidden = z.transpose(1, 2)
+        hidden = z
         for block in self.blocks:
             hidden = block(hidden, padding[2])
         for i, up in enumerate(self.up):
-            wide = zero_padded(hidden, padding[2 - i]).repeat_interleave(2, dim=2)
+            wide = zero_padded(hidden, padding[2 - i]).repeat_interleave(2, dim=1)
             hidden = functional.leaky_relu(up(wide), SLOPE)
-        return zero_padded(self.out(zero_padded(hidden, padding[0])), padding[0]).transpose(1, 2)
+        return zero_padded(self.out(zero_padded(hidden, padding[0])), padding[0])
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""
