@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import Dropped, UserError
-from motionloom.pipeline.cli.options import AsJson, Device, ModelFolder, print_json
+from motionloom.pipeline.cli.options import AsJson, At, Device, ModelFolder, print_json
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place
 
@@ -24,6 +24,7 @@ def caption(
         Path | None,
         typer.Option("--out", "-o", help="Also write JSON lines, for `data convert … --captions`."),
     ] = None,
+    at: At = None,
     device: Device = "auto",
     as_json: AsJson = False,
 ) -> None:
@@ -34,22 +35,25 @@ def caption(
     Example: `motionloom caption runs/mine takes -o captions.jsonl --k 1`
     """
     from motionloom.datasets.base.files import write_text
+    from motionloom.pipeline.contract.stage import CAPTIONER
     from motionloom.pipeline.inference.captioning import captions
     from motionloom.pipeline.inference.model import MotionModel
+    from motionloom.pipeline.runs.snapshot import run_at
 
     console = make_console(aside=as_json)
     if out is not None:
         require_file_place(out)
-    model, found, left_out = MotionModel(run_folder, device), [], []
-    for one in captions(model, clips, count):
-        if isinstance(one, Dropped):
-            left_out.append(one)
-            say(console, f"left out: {one.source}: {one.reason}")
-            continue
-        found.append(one)
-        say(console, f"{one.file} ({one.seconds:.1f} s)")
-        for sentence in one.sentences:
-            say(console, f"  {sentence.probability:6.1%}  {sentence.text}")
+    found, left_out = [], []
+    with run_at(run_folder, at, CAPTIONER) as folder:
+        for one in captions(MotionModel(folder, device), clips, count):
+            if isinstance(one, Dropped):
+                left_out.append(one)
+                say(console, f"left out: {one.source}: {one.reason}")
+                continue
+            found.append(one)
+            say(console, f"{one.file} ({one.seconds:.1f} s)")
+            for sentence in one.sentences:
+                say(console, f"  {sentence.probability:6.1%}  {sentence.text}")
     if not found:
         raise UserError(
             f"{left_out[0].source}: {left_out[0].reason}" if left_out else f"{clips[0]}: no clip in it"

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.cli.options import AsJson, Device, print_json
+from motionloom.pipeline.cli.options import AsJson, At, Device, print_json
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.process import process_rank
 
@@ -22,6 +22,7 @@ def evaluate(
     repeats: Annotated[
         int | None, typer.Option(help="Repetitions of everything that draws at random.")
     ] = None,
+    at: At = None,
     device: Device = "auto",
     table: Annotated[
         str | None,
@@ -37,13 +38,15 @@ def evaluate(
 
     Example: `motionloom evaluate runs/humantomato-tiny --repeats 5`
 
+    With --at figures go to RUN/at/, and one process measures.
+
     Example: `motionloom evaluate --table humantomato/7 runs/baselines-tiny runs/humantomato-tiny -o seven.md`
     """
     runs = run_folders or []
     if table is not None:
         if as_json:
             raise UserError("--json is of figures measured anew; leave it out")
-        _show_table(table, runs, out, measuring=clips or repeats or device != "auto")
+        _show_table(table, runs, out, measuring=clips or repeats or at or device != "auto")
         return
     if out is not None:
         raise UserError("--out is of a table; name one, like --table humantomato/7")
@@ -56,7 +59,9 @@ def evaluate(
     from motionloom.pipeline.runs.api import evaluate_run
 
     console = make_console(aside=as_json)
-    folder = evaluate_run(runs[0], clips=clips, repeats=repeats, device=device, share=True, console=console)
+    folder = evaluate_run(
+        runs[0], at=at, clips=clips, repeats=repeats, device=device, share=True, console=console
+    )
     if as_json and process_rank() == 0:
         print_json(figures_in(folder))
 
@@ -67,7 +72,7 @@ def _show_table(table: str, runs: list[Path], out: Path | None, *, measuring: ob
 
     if measuring:
         raise UserError(
-            "--clips, --repeats and --device measure anew, and a table shows what was measured; "
+            "--clips, --repeats, --at and --device measure anew, and a table shows what was measured; "
             "leave them out"
         )
     if table != "list":

@@ -16,7 +16,7 @@ import typer
 from rich.console import Console
 
 from motionloom.datasets.schema import UserError, nearest
-from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
+from motionloom.pipeline.cli.options import At, Device, ModelFolder, Settings, settings_of
 from motionloom.pipeline.inference.writers import WRITERS, default_formats, formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place, require_folder
@@ -58,6 +58,7 @@ def generate(
     seconds: Annotated[float | None, typer.Option(help="Length; default: the model decides.")] = None,
     seed: Annotated[int, typer.Option(help="Same seed, captions and options: same motions.")] = 0,
     settings: Settings = None,
+    at: At = None,
     device: Device = "auto",
 ) -> None:
     """Motions from captions, music or a script of both, as numbers and a page; other files on request.
@@ -79,6 +80,7 @@ def generate(
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.inference.requests import require_seed, require_words
     from motionloom.pipeline.inference.shown import FigureOptions
+    from motionloom.pipeline.runs.snapshot import run_at
 
     fields, figure, more = settings_of(
         settings, SamplingConfig.model_fields, FigureOptions.model_fields, ("face", "seed_motion")
@@ -99,16 +101,19 @@ def generate(
         raise UserError(f"--samples {samples}: take 1 or more")
     require_seed(seed)
     require_words(texts)
-    asked = _Request(run_folder, device, texts, faces, songs, file, seconds, seed, sampling)
-    if formats is not None and STREAM in formats.split(","):
-        if samples != 1 or formats != STREAM or seed_motion is not None:
-            raise UserError(
-                f"--format {STREAM} writes one motion while it is made: leave other formats, --samples and "
-                f"seed_motion out"
-            )
-        _stream(asked, out)
-        return
-    _generate_files(asked, formats_of(formats), out or Path("motions"), samples, figure, seed_motion)
+    streamed = formats is not None and STREAM in formats.split(",")
+    if streamed and (samples != 1 or formats != STREAM or seed_motion is not None):
+        raise UserError(
+            f"--format {STREAM} writes one motion while it is made: leave other formats, --samples and "
+            f"seed_motion out"
+        )
+    wanted = [] if streamed else formats_of(formats)
+    with run_at(run_folder, at) as folder:
+        asked = _Request(folder, device, texts, faces, songs, file, seconds, seed, sampling)
+        if streamed:
+            _stream(asked, out)
+        else:
+            _generate_files(asked, wanted, out or Path("motions"), samples, figure, seed_motion)
 
 
 @dataclass(frozen=True)

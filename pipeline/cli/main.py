@@ -29,6 +29,7 @@ from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.generate import generate
 from motionloom.pipeline.cli.options import (
     AsJson,
+    At,
     Device,
     ModelFolder,
     RunFolder,
@@ -273,6 +274,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The page; default RUN/report/report.html.")
     ] = None,
+    at: At = None,
 ) -> None:
     """One self-contained page: motions to watch, figures, where they err, curves, codebooks, what was run.
 
@@ -282,7 +284,7 @@ def report(
     """
     from motionloom.pipeline.runs.api import report_run
 
-    report_run(run_folder, out, console=make_console())
+    report_run(run_folder, out, at=at, console=make_console())
 
 
 @app.command()
@@ -310,6 +312,7 @@ def export(
     out: Annotated[Path, typer.Option("--out", "-o", help="New folder.")] = Path("exported"),
     half: Annotated[bool, typer.Option("--half", help="Weights in half precision: half the size.")] = False,
     settings: Settings = None,
+    at: At = None,
 ) -> None:
     """One folder with all that generate needs: weights (safetensors), configs, statistics.
 
@@ -323,7 +326,7 @@ def export(
     from motionloom.pipeline.runs.api import export_run
 
     sampling = SamplingConfig.parse(fields_of(settings, "--set"), "--set")
-    export_run(run_folder, out, half=half, sampling=sampling, console=make_console())
+    export_run(run_folder, out, at=at, half=half, sampling=sampling, console=make_console())
 
 
 def main() -> None:

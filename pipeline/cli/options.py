@@ -24,6 +24,14 @@ Sets = Annotated[
     list[str] | None,
     typer.Option("--set", "-s", help="Override one value: stage.field=value. May be repeated."),
 ]
+At = Annotated[
+    str | None,
+    typer.Option(
+        "--at",
+        metavar="STEP",
+        help="Take trainings that are not finished from a checkpoint: `newest`, a step, or STAGE:STEP.",
+    ),
+]
 Device = Annotated[
     str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
 ]

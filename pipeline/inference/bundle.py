@@ -50,7 +50,7 @@ from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.known_captions import Unknown
-from motionloom.pipeline.store.run_folder import BUNDLE_FILE, owner_of
+from motionloom.pipeline.store.run_folder import BUNDLE_FILE, hint_at, owner_of
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -108,7 +108,8 @@ class Bundle:
         except UserError as error:
             if str(error).startswith(str(folder)):
                 raise
-            raise UserError(f"{folder}: {error}") from None
+            hint = hint_at(folder) if str(error) == _NO_BODY else ""
+            raise UserError(f"{folder}: {error}{hint}") from None
 
     def _open(self, stage: CompletedStage) -> None:
         """Load a stage's inputs, and theirs, as far as generation needs them."""

@@ -32,9 +32,10 @@ from motionloom.pipeline.runs.dry_run import (
 from motionloom.pipeline.runs.execute import context_of, execute, perform
 from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.runs.snapshot import run_at
 from motionloom.pipeline.store.artifact import require_consistent, require_unchanged
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
-from motionloom.pipeline.store.run_folder import owner_of, require_own, require_run, stage_folder
+from motionloom.pipeline.store.run_folder import hint_at, owner_of, require_own, require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, run_state
 
 
@@ -111,17 +112,18 @@ def run_recipe(
 def _stages_again(
     folder: Path,
     what: str,
-    target: str,
+    target: Path,
     console: Console,
     changes: Mapping[str, object],
     device: str = "auto",
     share: bool = False,
     state: RunState | None = None,
 ) -> Path:
-    """Run the stages of a run that give `what` again, into folder `target` of the run.
+    """Run the stages of a run that give `what` again, into the folder `target`.
 
-    The first one writes there, of those of kind `target` if there are some; the others into folders of their
-    names within. On `device`: auto is what the recipe's hardware says, and with `share` in as many processes.
+    The first one writes there, of those of the kind of its name if there are some; the others into folders of
+    their names within. On `device`: auto is what the recipe's hardware says, and with `share` in as many
+    processes.
     With `state` they get those of their inputs that are finished, else all must be.
     """
     require_run(folder)
@@ -131,22 +133,22 @@ def _stages_again(
     stage_cache = StageCache(recipe.hardware.device() if device == "auto" else choose_device(device))
     stages = [s for s in recipe.stages if what in s.kind.gives(s.config)]
     if not stages:
-        raise UserError(f"{folder}: its recipe has no {target} stage; add one and run it again")
-    stages.sort(key=lambda s: s.kind.name != target)
+        raise UserError(f"{folder}: its recipe has no {target.name} stage; add one and run it again")
+    stages.sort(key=lambda s: s.kind.name != target.name)
     wanted = {name: value for name, value in changes.items() if value is not None}
     for number, stage in enumerate(stages):
-        out = folder / target / stage.name if number else folder / target
+        out = target / stage.name if number else target
         applied = {name: value for name, value in wanted.items() if name in stage.kind.config.model_fields}
-        config = stage.kind.config.parse({**stage.config.dump(), **applied}, target)
+        config = stage.kind.config.parse({**stage.config.dump(), **applied}, target.name)
         inputs = _inputs_again(folder, recipe, stage, state)
         if team.leads:
-            out.mkdir(exist_ok=True)
+            out.mkdir(parents=True, exist_ok=True)
             remove_tree(out / WORK)  # of an evaluation that was killed, maybe with other settings
         context = context_of(recipe, folder, stage, out, console, team, stage_cache)
         again = None if state is None else folder
         context = dataclasses.replace(context, config=config, inputs=inputs, again=again)
         perform(stage.kind, context, team, folder)
-    return folder / target
+    return target
 
 
 def _inputs_again(
@@ -158,7 +160,7 @@ def _inputs_again(
     if state is None:
         gone = [message for (name, _), message in recipe.gone.items() if name == stage.name]
         unfinished = [
-            f"{folder}: stage '{name}' (role {role}) is not finished; run the recipe first"
+            f"{folder}: stage '{name}' (role {role}) is not finished; run the recipe first{hint_at(folder)}"
             for role, name in stage.inputs.items()
             if role not in inputs
         ]
@@ -183,6 +185,7 @@ def _inputs_again(
 def evaluate_run(
     folder: Path,
     *,
+    at: str | None = None,
     clips: int | None = None,
     repeats: int | None = None,
     device: str = "auto",
@@ -191,23 +194,43 @@ def evaluate_run(
 ) -> Path:
     """Figures of a finished run by all its stages that make some; returns the folder RUN/evaluate.
 
+    With `at` trainings that are not finished are taken from a checkpoint (`snapshot.run_at`), this process
+    alone measures, and the folder is RUN/at/NAME/evaluate.
+
     With `share` all processes of the recipe's hardware take part, as in `run_recipe`, which start by the
     command that started this one; else this process alone.
     """
     console = console or make_console()
     changes = {"clips": clips, "repeats": repeats}
-    return _stages_again(folder, "figures", "evaluate", console, changes, device, share)
+    with run_at(folder, at) as run:
+        out, share = _beside(folder, run) / "evaluate", share and at is None
+        return _stages_again(run, "figures", out, console, changes, device, share)
+
+
+def _beside(folder: Path, run: Path) -> Path:
+    """Where results of `run` go, which is the run in `folder` or a snapshot of it."""
+    require_own(folder)
+    return folder if run == folder else folder / "at" / run.name
 
 
 def report_run(
-    folder: Path, out: Path | None, *, device: str = "auto", console: Console | None = None
+    folder: Path,
+    out: Path | None,
+    *,
+    at: str | None = None,
+    device: str = "auto",
+    console: Console | None = None,
 ) -> Path:
-    """The page of a run; returns its path. Of an unfinished run: what there is, and what is missing."""
+    """The page of a run; returns its path. Of an unfinished run: what there is, and what is missing.
+
+    With `at` it shows what the trainings make at a checkpoint (`snapshot.run_at`), and lies in RUN/at.
+    """
     console = console or make_console()
     if out is not None:
         require_file_place(out)
-    state = run_state(folder)
-    page = _stages_again(folder, "page", "report", console, {}, device, state=state) / "report.html"
+    with run_at(folder, at) as run:
+        state, made = run_state(run), _beside(folder, run) / "report"
+        page = _stages_again(run, "page", made, console, {}, device, state=state) / "report.html"
     if missing := [stage for stage in state.unfinished if stage.kind != "report"]:
         console.print(f"not finished: {', '.join(f'{stage.name} ({stage.say()})' for stage in missing)}")
     if out is not None:
@@ -222,6 +245,7 @@ def export_run(
     folder: Path,
     out: Path,
     *,
+    at: str | None = None,
     half: bool = False,
     sampling: SamplingConfig | Mapping[str, object] | None = None,
     console: Console | None = None,
@@ -229,7 +253,8 @@ def export_run(
     """Copy what generation needs into one folder; with `half`, weights in half precision.
 
     `sampling` are fields of `SamplingConfig` that motions of this model are drawn with where nobody says
-    otherwise.
+    otherwise. With `at` trainings that are not finished are taken from a checkpoint (`snapshot.run_at`);
+    their artifacts say the step.
     """
     from motionloom.pipeline.inference.exported import write_bundle
 
@@ -237,8 +262,8 @@ def export_run(
     require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
-    with new_folder(out.absolute()) as whole:
-        write_bundle(folder, whole, half=half, sampling=SamplingConfig.of(sampling))
+    with run_at(folder, at) as run, new_folder(out.absolute()) as whole:
+        write_bundle(run, whole, half=half, sampling=SamplingConfig.of(sampling))
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     console.print(
         f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"',

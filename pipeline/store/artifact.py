@@ -27,7 +27,7 @@ FILE_NAME = "artifact.json"
 
 # What no result depends on: a stage's own notes, and settings that a later run may change.
 _PRIVATE = {
-    *("checkpoints", "logs", "flight", "crash", "started.json", "timing.json", "reader.json"),
+    *("checkpoints", "logs", "flight", "samples", "crash", "started.json", "timing.json", "reader.json"),
     FILE_NAME,
 }
 
@@ -77,6 +77,8 @@ class Artifact(Config):
     """sha256 of the code from other packages than motionloom that made it, by module."""
     lengthened: tuple[int, ...] = ()
     """Steps at which learning-rate schedules ended that were lengthened when more steps were asked for."""
+    step: int | None = Field(None, exclude_if=lambda step: step is None)
+    """Of weights that were taken from a training before its end: their step."""
     inputs: dict[str, InputStage]
     outputs: dict[str, OutputFile] = Field(default_factory=dict)
 

@@ -81,6 +81,12 @@ def stages_of(run: Path) -> dict[str, dict[str, Any]]:
     return stages
 
 
+def hint_at(run: Path) -> str:
+    """The end of a message on what is not finished in a run: how to use a training as far as it is."""
+    begun = (path.parents[1] / "artifact.json" for path in run.glob("stages/*/checkpoints/*.ckpt"))
+    return "" if all(map(Path.is_file, begun)) else ", or take a training as far as it is: --at newest"
+
+
 def require_own(run: Path) -> None:
     """Refuse a run folder in which a link leads out of it: what is written there would land elsewhere.
 

@@ -157,6 +157,8 @@ class StageState:
             if self.steps is None or self.step is None:
                 return "started, not finished"
             return f"in training, step {self.step:,} of {self.steps:,}"
+        if self.artifact is not None and self.artifact.step is not None:
+            return f"at step {self.artifact.step:,} of {self.steps:,}"
         return {"finished": "finished", "missing": "not run yet"}[self.progress]
 
 

@@ -18,6 +18,8 @@ from motionloom.datasets.schema import UserError
 FILE_NAME = "metrics.jsonl"
 FLIGHT = "flight"
 """Folder of the flight logs, in a stage's."""
+SAMPLES, SAMPLE_FIGURES = "samples", "figures.jsonl"
+"""Folder of the motions that are drawn meanwhile, in a stage's, and the file of their figures in it."""
 CRASHES = "crash"
 """Folder of what failed steps have read, in a stage's."""
 

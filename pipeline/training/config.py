@@ -66,6 +66,9 @@ class TrainConfig(Config):
     """Newest checkpoints that are kept: the newest, and at least one more in case that is torn or damaged."""
     keep_every: int = Field(0, ge=0, json_schema_extra=RUNTIME)
     """Also keep, for ever, each checkpoint whose step is a multiple of this; 0 keeps none of them."""
+    sample_every: int = Field(0, ge=0, json_schema_extra=RUNTIME)
+    """Steps between samples, rounded up to checkpoints: a generator's motions for a few validation clips, and
+    figures of them, drawn on the CPU by a process beside the training; 0 turns them off."""
     validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
     """Steps between validations, rounded up to checkpoints; 0 turns them off."""
 

@@ -73,13 +73,19 @@ def _open_module(
     net, _ = kind.build(config, inputs, seed)
     module = kind.module(config, net, inputs, seed)
     prepare_module(module, config.train)
-    folders = {role: str(stage.folder.resolve()) for role, stage in given.items()}
-    module.save_hyperparameters(hyper_parameters(kind.name, config, seed, folders))
+    module.save_hyperparameters(hyper_parameters(kind.name, config, seed, given))
     return module, inputs
 
 
 def rebuild(content: object, path: object, inputs: Mapping[str, str | Path]) -> StageModule:
     """Return the module that a checkpoint's hyper-parameters describe, with its first weights."""
+    return _open_module(*describe(content, path, inputs))[0]
+
+
+def describe(
+    content: object, path: object, inputs: Mapping[str, str | Path]
+) -> tuple[TrainedStage[Any, Any, Any], Any, dict[str, CompletedStage], int]:
+    """Return kind, config, inputs and seed of a checkpoint's training; `inputs` overrule its folders."""
     hyper = content.get("hyper_parameters") if isinstance(content, dict) else None
     if not isinstance(hyper, dict) or not {"kind", "config", "seed", "inputs"} <= hyper.keys():
         raise UserError(f"{path}: no hyper-parameters of a stage; build the module and give net= and optim=")
@@ -97,4 +103,4 @@ def rebuild(content: object, path: object, inputs: Mapping[str, str | Path]) -> 
                 f'{path}: input {place} is no finished stage; give inputs={{"{role}": its folder}}'
             )
         given[role] = found
-    return _open_module(kind, config, given, int(hyper["seed"]))[0]
+    return kind, config, given, int(hyper["seed"])

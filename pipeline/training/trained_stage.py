@@ -33,6 +33,7 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.files import copy_files
+from motionloom.pipeline.store.run_folder import identity_of
 from motionloom.pipeline.store.weights import (
     MODEL_FILES,
     ModelFacts,
@@ -173,8 +174,8 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
                 save_model(context.folder, net, facts)
             return
         module = self.module(config, net, inputs, seed)
-        folders = {role: relpath(stage.folder, context.folder) for role, stage in context.inputs.items()}
-        module.save_hyperparameters(hyper_parameters(self.name, config, seed, folders))
+        hyper = hyper_parameters(self.name, config, seed, context.inputs, context.folder)
+        module.save_hyperparameters(hyper)
         batches = self.batches(config, net, inputs, seed, log)
         part, whole = trained_share(net)
         if part < whole:
@@ -226,10 +227,23 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
 
 
 def hyper_parameters(
-    kind: str, config: TrainedStageConfig, seed: int, inputs: Mapping[str, str]
+    kind: str,
+    config: TrainedStageConfig,
+    seed: int,
+    given: Mapping[str, CompletedStage],
+    base: Path | None = None,
 ) -> dict[str, object]:
-    """Return what rebuilds a stage's module, as plain values; `inputs` are the folders of stages by role."""
-    return {"kind": kind, "config": config.dump(), "seed": seed, "inputs": dict(inputs)}
+    """Return what rebuilds a stage's module, as plain values; folders of inputs are as seen from `base`."""
+    folders = {role: stage.folder.resolve() for role, stage in given.items()}
+    return {
+        "kind": kind,
+        "config": config.dump(),
+        "seed": seed,
+        "inputs": {
+            r: str(place) if base is None else relpath(place, base.resolve()) for r, place in folders.items()
+        },
+        "identities": {role: identity_of(place) for role, place in folders.items()},
+    }
 
 
 def _frozen(net: N) -> N:

@@ -52,6 +52,7 @@ from motionloom.pipeline.training.failures import FailureGuard, StallTimer
 from motionloom.pipeline.training.loaders import TrainingData, on_device
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
+from motionloom.pipeline.training.samples import SampleProcess
 from motionloom.pipeline.training.telemetry import StepProfiler, StepProgress, Telemetry
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
@@ -133,6 +134,8 @@ class Training:
         if resume.checkpoint is not None:
             self._load(read_checkpoint(resume.checkpoint), longer=resume.longer)
         self.writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)
+        sample_every = -(-config.sample_every // self.every) * self.every
+        self.samples = SampleProcess(context, str(module.hparams.get("kind")), sample_every)
         self._saved, self._writing = module.step if resume.checkpoint else -1, False
         self.telemetry = Telemetry(context.folder, module, config.batch_size, console, flops, peak)
         self.failures = FailureGuard(name, context.folder, module, data, console)
@@ -287,6 +290,7 @@ class Training:
         if self._writing:
             self._writing = False
             self.log.saved(self._saved)
+            self.samples.saved(self._saved)
 
     def _state(self) -> Checkpoint:
         module, execution = self.module, self.execution

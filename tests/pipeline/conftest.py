@@ -117,7 +117,7 @@ stages:
     train: {steps: 30, batch_size: 8, checkpoint_every: 6, validate_every: 12}
   face_gpt:
     net: {layers: 1, dim: 32, heads: 4, ff: 64}
-    train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}
+    train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8, ema: 0.9}
   face_vae:
     kind: tma
     part: face

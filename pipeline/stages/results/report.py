@@ -112,7 +112,7 @@ class ReportStage(StageKind):
         ]
         draw_showings(page, "Figures on held-out clips", FigureTable, shown)
         draw_showings(page, "Worst and best", Clips, shown)
-        draw_curves(page, stages if state is None else _logged(stages, state))
+        draw_curves(page, stages if state is None else _logged(stages, state), samples=state is not None)
         draw_showings(page, "Codebooks", Bars, shown)
         if state is not None:
             draw_flights(page, state)

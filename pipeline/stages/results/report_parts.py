@@ -6,18 +6,29 @@ A page made within a run names no times and no machine, since equal runs write e
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from motionloom.datasets.base.progress import duration
+from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import CompletedStage, StageContext, stage_kind
 from motionloom.pipeline.evaluation.cases import Clips
-from motionloom.pipeline.render.charts import curve_label, log_lines
+from motionloom.pipeline.render.charts import Line, curve_label, log_lines
 from motionloom.pipeline.render.page import Page
+from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.run_state import RunState
-from motionloom.pipeline.store.training_log import CRASHES, read_flight, read_training_log
+from motionloom.pipeline.store.training_log import (
+    CRASHES,
+    SAMPLE_FIGURES,
+    SAMPLES,
+    read_flight,
+    read_rows,
+    read_training_log,
+)
 from motionloom.pipeline.store.yaml import flatten, setting_text
 
 SPLITS = ("train", "val", "test")
@@ -39,8 +50,11 @@ def draw_showings(page: Page, heading: str, kind: type[Showing], shown: Sequence
             page.add_histogram(uses, ends, thing.title, thing.x_label, thing.y_label)
 
 
-def draw_curves(page: Page, stages: Sequence[CompletedStage]) -> None:
-    """The curves of trainings, finished or going on, that the kinds of stages find worth drawing."""
+def draw_curves(page: Page, stages: Sequence[CompletedStage], *, samples: bool = False) -> None:
+    """The curves of trainings, finished or going on, that the kinds of stages find worth drawing.
+
+    With `samples` what was drawn meanwhile is below them.
+    """
     page.add_heading("Training")
     for stage in stages:
         rows = read_training_log(stage.folder)
@@ -54,6 +68,29 @@ def draw_curves(page: Page, stages: Sequence[CompletedStage]) -> None:
             ]
             if lines:
                 page.add_plot(lines, f"{stage.name}: {curve.title or curve_label(curve.prefix)}")
+        if samples:
+            _draw_samples(page, stage)
+
+
+def _draw_samples(page: Page, stage: CompletedStage) -> None:
+    """The figures of the motions that were drawn during a training (`train.sample_every`), and the newest."""
+    folder = stage.folder / SAMPLES
+    rows = read_rows(folder / SAMPLE_FIGURES)
+    for name in sorted({key.partition("/")[2] for row in rows for key in row if "/" in key}):
+        lines = []
+        for who in ("drawn", "recorded"):
+            known = [row for row in rows if f"{who}/{name}" in row]
+            steps, values = [row["step"] for row in known], [row[f"{who}/{name}"] for row in known]
+            lines.append(Line(who, steps, values, dashed=who == "recorded"))
+        page.add_plot(lines, f"{stage.name}: {name} of samples")
+    motions = []
+    for path in sorted(folder.glob(f"step={int(rows[-1]['step']):08d}/*.npz") if rows else ()):
+        with NpzFile(path) as stored:
+            facts, joints = json.loads(str(stored.array("metadata"))), stored.numbers("joints")
+        parents = Skeleton.named(facts["skeleton"]).parents
+        motions.append(ViewerMotion(joints, facts["fps"], parents, path.parent.name, facts["caption"]))
+    if motions:
+        page.add_viewer(motions, f"{stage.name}: motions for captions or music of held-out clips.")
 
 
 # What the flight recorders noted: it holds times, so a page made within a run does not have it.

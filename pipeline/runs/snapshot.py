@@ -1,0 +1,226 @@
+"""A run in the middle of its trainings: those that are not finished, with the weights of a checkpoint.
+
+`run_at` writes a run folder for as long as it is needed. In it each such training is a finished stage, and so
+are generators that train nothing and are made of it; evaluation and report read these. The finished stages of
+the run are inputs from outside. So every command takes it as any other run, also while the run goes on.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Set
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, TypeVar
+
+from rich.console import Console
+
+from motionloom.datasets.base.files import write_text
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import CAPTIONER, GENERATOR, CompletedStage, Every, Stage, StageCache
+from motionloom.pipeline.launch.console import make_console, say
+from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.execute import context_of
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.store.artifact import Artifact, InputStage
+from motionloom.pipeline.store.files import fingerprint_of
+from motionloom.pipeline.store.run_folder import identity_of, place_from, require_run, stage_folder
+from motionloom.pipeline.store.training_log import FILE_NAME
+from motionloom.pipeline.store.weights import save_model
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.training.checkpointing import Checkpoint
+
+NEWEST = "newest"
+
+P = TypeVar("P", Path, str)
+
+
+@contextmanager
+def run_at(run: P, at: str | None, what: str = GENERATOR) -> Iterator[P]:
+    """Give a run folder that holds `run` as of a checkpoint until the block ends; `run` itself without `at`.
+
+    `at` is "newest", or the step of one training, others that are not finished being taken at their newest;
+    "gpt:443" names the training. A step may also be of a finished training. Where two trainings have it, it
+    is of one that is not finished, then of one that gives `what`.
+
+    Raises:
+        UserError: There is no checkpoint, or not of this step, or it was made from other inputs.
+    """
+    if at is None:
+        yield run
+        return
+    folder = Path(run)
+    require_run(folder)
+    recipe, finished = load_recipe(folder / "recipe.yaml", strict=False), finished_stages(folder)
+    chosen = _chosen(folder, recipe, finished, at, what)
+    if not chosen:
+        yield run  # all trainings are finished
+        return
+    with TemporaryDirectory(prefix="motionloom-") as temporary:
+        yield type(run)(_write(Path(temporary), folder, recipe, finished, chosen))
+
+
+def _chosen(
+    run: Path, recipe: Recipe, finished: Mapping[str, CompletedStage], at: str, what: str
+) -> dict[str, int]:
+    """Trainings and the steps to take them at, the one that is asked for first."""
+    from motionloom.pipeline.training.checkpointing import step_of
+
+    steps: dict[str, list[int]] = {}
+    for stage in recipe.stages:
+        found = [step_of(path) for path in (stage_folder(run, stage.name) / "checkpoints").glob("*.ckpt")]
+        if own := sorted(step for step in found if step is not None):
+            steps[stage.name] = own
+    newest = {name: own[-1] for name, own in steps.items() if name not in finished}
+    named, _, when = at.rpartition(":")
+    if named:
+        there = steps.get(recipe.stage(named, "--at").name, [])
+        own = [step for step in there if when in (str(step), NEWEST)]
+        having = {named: own[-1]} if own else {}
+    elif when == NEWEST:
+        having = newest
+    else:
+        having = {name: int(when) for name, own in steps.items() if when in map(str, own)}
+    if not having:
+        if at == NEWEST and all(stage.name in finished for stage in recipe.stages if stage.kind.trains):
+            return {}
+        listed = "; ".join(f"{name}: {', '.join(map(str, own))}" for name, own in steps.items())
+        raise UserError(f"{run}: no such checkpoint for --at {at}; there is {listed or 'none yet'}")
+    first = min(having, key=lambda name: (name in finished, not _gives(recipe.stage(name), what)))
+    return {first: having[first]} | {**newest, first: having[first]}
+
+
+def _gives(stage: Stage, *what: str) -> bool:
+    return not stage.kind.gives(stage.config).isdisjoint(what)
+
+
+def _write(
+    place: Path, run: Path, recipe: Recipe, finished: Mapping[str, CompletedStage], chosen: Mapping[str, int]
+) -> Path:
+    """Write the run folder into `place`, and say how far each training is; returns it."""
+    first, aside = next(iter(chosen)), make_console(aside=True)
+    label = f"{first}-{chosen[first]}"
+    folder = place / f"{run.resolve().name}-{label}"
+    own, outside = list[Stage](), dict(recipe.outside)
+    names = {name: name for name in outside}  # in the new recipe: stages outside it have paths
+    for stage in recipe.stages:
+        given = {role: names[source] for role, source in stage.inputs.items() if source in names}
+        lacking = stage.inputs.keys() - given.keys()
+        if stage.name in chosen:
+            try:
+                own.append(_take(stage.name, chosen[stage.name], run, folder, outside, aside))
+            except UserError as error:
+                if stage.name == first:
+                    raise
+                say(aside, f"without {stage.name}: {error}", "yellow")
+                continue
+            names[stage.name] = stage.name
+        elif stage.name in finished and not lacking and outside.keys() >= set(given.values()):
+            names[stage.name] = str(finished[stage.name].folder.resolve())
+            outside[names[stage.name]] = finished[stage.name]
+        elif not stage.kind.trains and _remains(stage, lacking):
+            # The first generator is the default: one of a checkpoint comes before finished ones.
+            given = dict(sorted(given.items(), key=lambda item: item[1] in outside))
+            own.append(replace(stage, inputs=given))
+            names[stage.name] = stage.name
+    name = f"{recipe.name}-{label}"
+    new = replace(recipe, name=name, stages=tuple(own), outside=outside, gone={})
+    write_text(folder / "recipe.yaml", new.to_yaml(folder))
+    for stage in own:
+        if not stage.kind.trains and _gives(stage, GENERATOR, CAPTIONER):
+            home = stage_folder(folder, stage.name)
+            home.mkdir(parents=True)
+            stage.kind.run(context_of(new, folder, stage, home, aside, Team()))
+            _finish(stage, folder, outside, new.seed_of(stage))
+    return folder
+
+
+def _remains(stage: Stage, lacking: Set[str]) -> bool:
+    """Whether a stage that trains nothing is of use: a generator with all inputs, or one that reads any."""
+    if _gives(stage, GENERATOR, CAPTIONER):
+        return not lacking
+    roles = stage.kind.roles()
+    required = {role.name for role in roles if not role.optional}
+    return any(isinstance(role, Every) for role in roles) and not lacking & required
+
+
+def _take(
+    name: str, step: int, run: Path, folder: Path, outside: dict[str, CompletedStage], aside: Console
+) -> Stage:
+    """Write a training's checkpoint as a finished stage of the run `folder`; returns its stage there."""
+    from motionloom.models.training.averaging import AveragedWeights
+    from motionloom.pipeline.training.lightning_data import describe
+
+    source, home = stage_folder(run, name), stage_folder(folder, name)
+    path, content = _read(source / "checkpoints", step)
+    hyper = content["hyper_parameters"]
+    for role, place in hyper["inputs"].items():
+        if identity_of((source / place).resolve()) != hyper["identities"][role]:
+            raise UserError(
+                f"{path}: was trained on another '{role}' than is there now; "
+                f"go on with the run: motionloom run {run / 'recipe.yaml'} -o {run}"
+            )
+    kind, config, given, seed = describe(content, path, {})
+    net, facts = kind.build(config, kind.inputs.of(StageCache().given(given)), seed)
+    weights, prefix = content["state_dict"], "net."
+    try:
+        net.load_state_dict({k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)})
+    except RuntimeError as error:
+        raise UserError(f"{path}: of another version; {' '.join(str(error).split())[:200]}") from None
+    if content["average"] is not None:
+        average = AveragedWeights(net, config.train.ema)
+        average.load_state_dict(content["average"])
+        average.fill(net)
+    kind.trained(config, net)
+    home.mkdir(parents=True)
+    save_model(home, net, facts)
+    rows = json.loads(content["log"]["rows"])
+    write_text(home / FILE_NAME, "".join(f"{json.dumps(row)}\n" for row in rows))
+    places = {role: str(stage.folder.resolve()) for role, stage in given.items()}
+    outside.update(zip(places.values(), given.values(), strict=True))
+    stage, done = Stage(name, kind, config, places), content["global_step"]
+    _finish(stage, folder, outside, seed, done)
+    averaged = "" if content["average"] is None else ", averaged weights"
+    say(aside, f"{name} at step {done:,} of {content['steps']:,}{averaged}")
+    return stage
+
+
+def _read(folder: Path, step: int) -> tuple[Path, Checkpoint]:
+    """A checkpoint and its content; a newer one, where the training deletes it meanwhile."""
+    from motionloom.pipeline.training.checkpointing import DamagedError, name_of, read_checkpoint, step_of
+
+    while True:
+        path = folder / name_of(step)
+        try:
+            return path, read_checkpoint(path)
+        except DamagedError as error:
+            newest = max((step_of(file) or 0 for file in folder.glob("*.ckpt")), default=0)
+            if path.is_file() or newest <= step:
+                raise UserError(f"{path}: {error}; take another one by --at") from None
+            step = newest
+
+
+def _finish(
+    stage: Stage, folder: Path, outside: Mapping[str, CompletedStage], seed: int, step: int | None = None
+) -> None:
+    """Write the artifact of a stage of the new run."""
+    inputs = {}
+    for role, name in stage.inputs.items():
+        place = outside[name].folder if name in outside else stage_folder(folder, name)
+        made, seen = str(identity_of(place)), place_from(folder, place)
+        inputs[role] = InputStage(stage=place.name, fingerprint=made, folder=seen)
+    config, made_of = stage.config.dump(), [source.fingerprint for source in inputs.values()]
+    Artifact(
+        stage=stage.name,
+        kind=stage.kind.name,
+        version=stage.kind.version,
+        fingerprint=fingerprint_of([config, seed, step, made_of]),
+        seed=seed,
+        config=config,
+        step=step,
+        inputs=inputs,
+    ).finish(stage_folder(folder, stage.name))

@@ -1,0 +1,149 @@
+"""Trainings that are not finished, used by every command (`--at`), and samples drawn beside them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file
+
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.runs.samples import draw_samples
+from motionloom.pipeline.runs.snapshot import run_at
+from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.training.checkpointing import readable
+
+MODEL = ("artifact.json", "model.json", "model.safetensors")
+ASKED: dict[str, Any] = {"captions": ["a person waves", "a person bows"], "seconds": 2, "seed": 5}
+
+
+def cut(run: Path, target: Path, *stages: str) -> Path:
+    """A copy of a run in which trainings are at their last step and not finished; nothing is below them."""
+    shutil.copytree(run, target)
+    for name in stages:
+        for file in MODEL:
+            (target / "stages" / name / file).unlink()
+    for name in ("ude", "generate", "evaluate", "report"):
+        shutil.rmtree(target / "stages" / name, ignore_errors=True)
+    return target
+
+
+@pytest.fixture(scope="module")
+def begun(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return cut(small_run.folder, tmp_path_factory.mktemp("begun") / "small", "gpt", "face_gpt")
+
+
+def drawn(folder: Path | str, **more: Any) -> list[Any]:
+    return MotionModel(folder, "cpu").generate(**ASKED, **more)
+
+
+def assert_same(ours: list[Any], theirs: list[Any]) -> None:
+    for one, other in zip(ours, theirs, strict=True):
+        assert (one.joints == other.joints).all()
+        assert one.face is None or (one.face == other.face).all()
+
+
+def test_the_last_checkpoint_is_the_finished_model(
+    begun: Path, small_run: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the averaged weights where there are any."""
+    with run_at(begun, "newest") as folder:
+        assert_same(drawn(folder, face=["a happy face"]), drawn(small_run.folder, face=["a happy face"]))
+        for name in ("gpt", "face_gpt"):
+            made, whole = (load_file(run / "stages" / name / MODEL[2]) for run in (folder, small_run.folder))
+            assert made.keys() == whole.keys() and all(torch.equal(made[k], whole[k]) for k in made)
+    assert not folder.exists()
+    said = capsys.readouterr().err
+    assert "gpt at step 30 of 30\n" in said and "face_gpt at step 8 of 8, averaged weights\n" in said
+    trained = next(readable(begun / "stages/face_gpt/checkpoints"))[1]["state_dict"]
+    assert any(not torch.equal(trained[f"net.{name}"], value) for name, value in whole.items())
+    with run_at(small_run.folder, "newest") as folder:
+        assert folder == small_run.folder, "all is finished"
+
+
+def test_a_generator_of_several_trainings(ude_run: Any, tmp_path: Path) -> None:
+    """It trains nothing itself, and is made of what is there."""
+    with run_at(cut(ude_run.folder, tmp_path / "run", "dmd"), "newest") as folder:
+        assert_same(drawn(folder), drawn(ude_run.folder))
+
+
+def test_every_command(begun: Path, small_run: Any, tmp_path: Path, call: Callable[..., Any]) -> None:
+    before = sorted(begun.rglob("*"))
+    for command in (("generate", begun, "a person waves"), ("evaluate", begun)):
+        assert (done := call(*command)).code == 2 and "--at newest" in done.err
+    for step in ("7", "gpt:8", "yesterday"):
+        done = call("export", begun, "--at", step, "-o", tmp_path / "none")
+        assert done.code == 2 and "gpt: 24, 30" in done.err and not (tmp_path / "none").exists()
+    assert call("caption", begun, tmp_path, "--at", "30").code == 2
+    assert "gpt at step 24 of 30" in call("export", begun, "--at", "gpt:24", "-o", tmp_path / "model").err
+    artifact = Artifact.find(tmp_path / "model/gpt")
+    assert artifact is not None and artifact.step == 24
+    assert before == sorted(begun.rglob("*"))
+    with run_at(small_run.folder, "24") as folder:  # of a training that is finished
+        assert_same(drawn(tmp_path / "model"), drawn(folder))
+    assert call("evaluate", begun, "--at", "newest", "--json").code == 0
+    assert call("report", begun, "--at", "newest").code == 0
+    place = begun / "at/small-gpt-30"
+    figures, finished = (
+        json.loads((folder / "metrics.json").read_text())["figures"]
+        for folder in (place / "evaluate", small_run.folder / "stages/evaluate")
+    )
+    assert figures == finished
+    assert "generated" in (place / "report/report.html").read_text()
+
+
+def test_what_a_training_was_not_made_from_is_refused(begun: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(begun, run)
+    path = run / "stages/tokens/artifact.json"
+    path.write_text(path.read_text().replace('"fingerprint": "', '"fingerprint": "0', 1))
+    with pytest.raises(UserError, match="another 'tokens'"), run_at(run, "newest"):
+        pass
+    shutil.rmtree(run / "stages/gpt/checkpoints")
+    shutil.rmtree(run / "stages/face_gpt/checkpoints")
+    with pytest.raises(UserError, match="--at newest"), run_at(run, "newest"):
+        pass
+
+
+def test_while_it_trains(small_run: Any, start: Callable[..., Any], tmp_path: Path, call: Any) -> None:
+    """Its checkpoints come and go every two steps; samples are drawn meanwhile, and the report has them."""
+    recipe, run = yaml.safe_load(small_run.recipe.read_text()), tmp_path / "run"
+    recipe["stages"]["gpt"]["train"] |= {"steps": 10**6, "checkpoint_every": 2, "sample_every": 3}
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(recipe))
+    shutil.copytree(small_run.folder, run)
+    process = start("run", tmp_path / "small.yaml", "-o", run, "--until", "gpt", "--replace")
+    figures, steps, end = run / "stages/gpt/samples/figures.jsonl", [], time.monotonic() + 120
+    try:
+        while len(steps) < 3 or not figures.is_file():
+            assert process.poll() is None and time.monotonic() < end, process.communicate()[0]
+            if not (run / "stages/gpt/artifact.json").exists():
+                with run_at(run, "newest") as folder:
+                    steps.append(Artifact.find(folder / "stages/gpt").step)  # type: ignore[union-attr]
+    finally:
+        os.killpg(process.pid, signal.SIGTERM)
+        process.communicate()
+    assert steps == sorted(steps) and steps[-1] > 30
+    row = json.loads(figures.read_text().splitlines()[0])
+    assert row["recorded/agreement.everything"] == 1 and row["drawn/position.ape_joints"] > 0
+    motions = figures.parent / f"step={row['step']:08d}"
+    assert (motions / "index.html").is_file() and list(motions.glob("*.npz"))
+    done = call("report", run)
+    page = (run / "report/report.html").read_text()
+    assert done.code == 0 and "position.ape_joints of samples" in page and motions.name in page
+
+
+def test_samples_of_dances(ude_run: Any, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(ude_run.folder, run)
+    out = draw_samples(run, "utt")
+    assert out.name == "step=00000012" and list(out.glob("*.npz"))
