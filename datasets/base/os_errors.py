@@ -8,7 +8,9 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shutil
 from collections.abc import Iterator
+from pathlib import Path
 
 _AGAIN = "what was finished is kept, and nothing half-written is left under a final name"
 
@@ -37,12 +39,31 @@ _OF_THE_MACHINE = {*_NO_MORE, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOME
 
 _RUST = re.compile(r"\(os error (\d+)\)")
 _NUMPY_SHORT = re.compile(r"\d+ requested and \d+ written")
+SHARED_MEMORY = "/dev/shm"
+_SHARED_FULL = (
+    f"shared memory ({SHARED_MEMORY}), where loader workers put batches, is full; give the container "
+    f"more (docker run --shm-size 8g), or set hardware.workers: 0; {_AGAIN}"
+)
+_OF_SHARED_MEMORY = ("shared memory", "unable to write to file </torch", "unable to resize file </torch")
+"""In torch's messages, those about loader workers that died of it included."""
+_SPARE = 2**26
+"""Bytes with less than which a file system counts as full."""
 _TORCH = ("PytorchStreamWriter", "PytorchStreamReader", "inline_container")
 
 
 def of_the_machine(error: BaseException) -> bool:
     """Whether an error says that the machine is at its limits, whatever file was read or written."""
     return isinstance(error, OSError) and error.errno in _OF_THE_MACHINE
+
+
+def full_place(error: OSError, folder: Path) -> str:
+    """The place of an error that names no file: shared memory where that is full and the disk of `folder` is
+    not, else `folder`.
+    """
+    if error.errno not in _NO_MORE or not Path(SHARED_MEMORY).is_dir():
+        return str(folder)
+    shared_is_full = shutil.disk_usage(SHARED_MEMORY).free < _SPARE <= shutil.disk_usage(folder).free
+    return SHARED_MEMORY if shared_is_full else str(folder)
 
 
 def sentence_of(error: BaseException) -> str | None:
@@ -52,11 +73,15 @@ def sentence_of(error: BaseException) -> str | None:
     what it was raised from.
     """
     if isinstance(error, OSError):
+        if error.errno in _NO_MORE and str(error.filename).startswith(SHARED_MEMORY):
+            return _SHARED_FULL
         if error.errno in _WORDS:
             return _named(error, _WORDS[error.errno])
         if error.errno is not None and error.filename is not None:
             return _named(error, (error.strerror or os.strerror(error.errno)).lower())
     text = str(error)
+    if isinstance(error, RuntimeError) and any(words in text for words in _OF_SHARED_MEMORY):
+        return _SHARED_FULL
     rust = _RUST.search(text)
     if rust is not None and int(rust[1]) in _WORDS:  # safetensors
         return _WORDS[int(rust[1])]

@@ -1,6 +1,8 @@
 """Exponential moving average of a network's weights, kept beside the weights that are trained.
 
-The average begins with the weights after the first step. Validation and the saved model use it; training
+The average begins with the weights after the first step. Until it is as long as the decay has it, the decay
+after n further steps is (1 + n) / (10 + n), as TensorFlow's and diffusers' averages have it: else a short
+training would save little but its first weights. Validation and the saved model use the average; training
 does not. Buffers (codebooks, which are averages already, and statistics) are those of the trained network.
 """
 
@@ -13,13 +15,20 @@ import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+_Tensors = tuple[Tensor, ...] | list[Tensor]
+
 
 class AveragedWeights:
     """Average of the weights of `net`, a network on its device; equal on every rank."""
 
     def __init__(self, net: nn.Module, decay: float) -> None:
-        average = get_ema_multi_avg_fn(decay)  # type: ignore[no-untyped-call]
-        self.average = AveragedModel(net, multi_avg_fn=average)
+        self.average = AveragedModel(net, multi_avg_fn=self._take_in)
+        self.decay, self._count = decay, 0
+
+    def _take_in(self, average: _Tensors, weights: _Tensors, _: Tensor | int) -> None:
+        """Move the average towards the weights; the count on the device is not waited for."""
+        decay = min(self.decay, (1 + self._count) / (10 + self._count))
+        get_ema_multi_avg_fn(decay)(average, weights, None)  # type: ignore[no-untyped-call]
 
     def state_dict(self) -> dict[str, Tensor]:
         state: dict[str, Tensor] = self.average.state_dict()
@@ -27,9 +36,11 @@ class AveragedWeights:
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         self.average.load_state_dict(state)
+        self._count = int(state["n_averaged"])
 
     def update(self, net: nn.Module) -> None:
         self.average.update_parameters(net)
+        self._count += 1
 
     @contextmanager
     def swapped(self, net: nn.Module) -> Iterator[None]:

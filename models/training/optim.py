@@ -40,6 +40,16 @@ class OptimConfig(Config):
         dropped = self.drop_factor ** sum(step >= at for at in self.drop_at)
         return dropped * self._scheduled(step, max_steps)
 
+    def doubts(self, max_steps: int) -> list[str]:
+        """What will hardly do what is meant in a training of `max_steps`: keys of this config, and why."""
+        if self.warmup_steps <= max_steps:
+            return []
+        reached = self.lr * max_steps / self.warmup_steps
+        return [
+            f"warmup_steps {self.warmup_steps:,} is longer than the training, {max_steps:,} steps: its rate "
+            f"ends at {reached:.2g} of {self.lr:.2g}"
+        ]
+
     def _scheduled(self, step: int, max_steps: int) -> float:
         if step < self.warmup_steps:
             return (step + 1) / self.warmup_steps

@@ -116,11 +116,19 @@ def run(
     until: Annotated[
         str | None, typer.Option(help="Only this stage and what it needs; several as A,B.")
     ] = None,
+    go_on: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--go-on",
+            metavar="STAGE",
+            help="Go on with this training's weights although its optim, loss or train settings changed.",
+        ),
+    ] = None,
     replace: Annotated[
         bool,
         typer.Option(
             "--replace",
-            help="Go on in this folder even where that replaces finished trainings, or another recipe's run.",
+            help="Go on in this folder even where that replaces trainings, or another recipe's run.",
         ),
     ] = False,
     verify: Annotated[
@@ -130,15 +138,17 @@ def run(
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
-    Finished stages are skipped, changed ones and those below them run again; before a finished training is
-    replaced it asks for --replace, or for another folder. Kill it at any moment and start it again: it goes
-    on where it was.
+    Finished stages are skipped, changed ones and those below them run again; before a training is replaced
+    that is finished or took ten minutes, it asks for --replace, or for another folder. Kill it at any moment
+    and start it again: it goes on where it was, also with other steps, precision, accumulation or processes.
 
     Example: `motionloom run humantomato-tiny --dry-run`
 
     Example: `motionloom run humantomato-tiny -o runs/second --set tma.optim.lr=2e-4 --until tma`
 
     Example: `motionloom run humantomato-tiny --set face_gpt.train.steps=900 --replace`
+
+    Example: `motionloom run humantomato-tiny --set gpt.optim.lr=1e-4 --go-on gpt`
     """
     from motionloom.pipeline.runs.plan import Selection
 
@@ -148,7 +158,7 @@ def run(
         from motionloom.pipeline.runs.dry_run import plan_record
 
         select = Selection(first, until)
-        print_json(plan_record(recipe, out, overrides=sets or (), select=select))
+        print_json(plan_record(recipe, out, overrides=sets or (), select=select, go_on=go_on or ()))
         return
     from motionloom.pipeline.runs.api import run_recipe
 
@@ -157,6 +167,7 @@ def run(
         out,
         overrides=sets or (),
         select=Selection(first, until),
+        go_on=go_on or (),
         dry_run=dry_run,
         replace=replace,
         verify=verify,

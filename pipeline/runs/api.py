@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -22,6 +22,7 @@ from motionloom.pipeline.contract.units import WORK
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.dry_run import (
     explain_replacements,
     plan_table,
@@ -45,6 +46,7 @@ def run_recipe(
     *,
     overrides: Sequence[str] = (),
     select: Selection | None = None,
+    go_on: Collection[str] = (),
     dry_run: bool = False,
     replace: bool = False,
     verify: bool = False,
@@ -54,8 +56,9 @@ def run_recipe(
 
     With `verify` all files of finished stages are compared with their checksums first.
 
-    Without `replace`, a run that would replace finished work that took long (`dry_run.py`), or that would
-    write into the folder of another recipe's run, is refused.
+    Without `replace`, a run that would replace work that took long (`dry_run.py`), or that would write into
+    the folder of another recipe's run, is refused. Trainings in `go_on` go on from their newest checkpoints
+    although what they compute has changed (rate, batch, loss weights).
     """
     console = console or make_console()
     loaded = load_recipe(recipe, overrides)
@@ -65,7 +68,7 @@ def run_recipe(
         count = sum(require_unchanged(folder, again=True) for folder in folders)
         console.print(f"{run}: {count} files have the sha256 that their stages noted", markup=False)
     try:
-        plan = make_plan(loaded, run, select)
+        plan = make_plan(loaded, run, select, go_on)
     except UserError:
         if dry_run:
             say_estimate(loaded, console)  # it needs no data, the plan looks at them
@@ -75,6 +78,8 @@ def run_recipe(
         require_fit((row.stage for row in todo), loaded.hardware)  # before the estimate, which takes seconds
         say_estimate(loaded, console, run, todo)
         console.print(plan_table(loaded, plan))
+        for doubt in doubts(loaded, run, (row.stage for row in todo)):
+            console.print(f"[yellow]{escape(doubt)}[/]", soft_wrap=True)
     replaced = replaced_stages(run, plan)
     refusal = None if replace else explain_replacements(run, loaded.name, replaced)
     if refusal is not None and not dry_run:
@@ -82,8 +87,9 @@ def run_recipe(
     if refusal is not None:
         console.print(f"[yellow]without --replace this is refused. {escape(refusal)}[/]", soft_wrap=True)
     elif replace and replaced:
-        console.print(f"[yellow]replaces finished stages: {', '.join(stage.stage for stage in replaced)}[/]")
-    if started := started_trainings(run, plan):
+        console.print(f"[yellow]replaces stages: {', '.join(stage.stage for stage in replaced)}[/]")
+    named = {stage.stage for stage in replaced}
+    if started := [name for name in started_trainings(run, plan) if name not in named]:
         console.print(f"[yellow]replaces unfinished trainings: {', '.join(started)}[/]")
     if dry_run:
         console.print(f"{len(todo)} of {len(plan)} stages would run in {run}", markup=False)

@@ -1,10 +1,10 @@
 """The plan of a run and the cost of its trainings, before anything runs: tables for people, a record for
 programs (`motionloom run --dry-run`, with `--json`).
 
-Nothing that took long is replaced unless the user asks for it. Guarded are trainings, whatever they took, and
-every other stage that took an hour or more, such as a long conversion **[ours]**. The rest (statistics,
-tokens, figures, pages) is cheap and runs again without asking. `--from` asks for the stages that it
-runs again; `--replace` asks for all.
+Nothing that took long is replaced unless the user asks for it. Guarded are finished trainings, whatever they
+took, unfinished ones after ten minutes, and every other stage that took an hour or more, such as a long
+conversion **[ours]**. The rest (statistics, tokens, figures, pages) is cheap and runs again without asking.
+`--from` asks for the stages that it runs again; `--replace` asks for all.
 """
 
 from __future__ import annotations
@@ -23,12 +23,14 @@ from motionloom.datasets.base.progress import duration
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import preview_of, previews
 from motionloom.pipeline.contract.showing import ModelCard
+from motionloom.pipeline.runs.continuation import newest_step
+from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.plan import PlannedStage, Selection, make_plan, require_fit
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import read_record
 from motionloom.pipeline.store.run_folder import stage_folder
-from motionloom.pipeline.store.training_log import read_flight
+from motionloom.pipeline.store.training_log import read_flight, seconds_trained
 from motionloom.pipeline.store.yaml import read_yaml
 
 
@@ -132,6 +134,7 @@ def plan_record(
     *,
     overrides: Sequence[str] = (),
     select: Selection | None = None,
+    go_on: Collection[str] = (),
 ) -> dict[str, object]:
     """The stages in order, each with what happens to it and why, and what its training takes.
 
@@ -140,7 +143,7 @@ def plan_record(
     """
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
-    plan = make_plan(loaded, run, select)
+    plan = make_plan(loaded, run, select, go_on)
     todo = [row for row in plan if row.action in {"run", "resume"}]
     require_fit((row.stage for row in todo), loaded.hardware)  # before the estimate, which takes seconds
     cards = estimate(loaded, {row.stage.name for row in todo})
@@ -162,8 +165,9 @@ def plan_record(
             }
             for row in plan
         ],
+        "doubts": doubts(loaded, run, (row.stage for row in todo)),
         "replaces": {
-            "finished": [one.stage for one in replaced_stages(run, plan)],
+            "guarded": [one.stage for one in replaced_stages(run, plan)],
             "started": started_trainings(run, plan),
         },
     }
@@ -173,34 +177,45 @@ def plan_record(
 
 LONG_SECONDS = 3600.0
 """A stage that trains nothing is guarded from this time on."""
+TRAINED_SECONDS = 600.0
+"""A training that is not finished is guarded from this time on."""
 
 
 @dataclass(frozen=True)
 class Replaced:
-    """A finished stage that a plan would run again although the user did not name it."""
+    """A guarded stage that a plan would run again although the user did not name it."""
 
     stage: str
     why: str
     trained: bool
     seconds: float | None
-    """Duration from its `timing.json`; None where none was noted."""
+    """From its `timing.json`, None where none was noted; of an unfinished training by its telemetry."""
+    goes_on: str = ""
+    """How it would go on with `--go-on`, in words; "" where it cannot."""
 
     def say(self) -> str:
         work = "training" if self.trained else "work"
         took = f"{work} of unknown time" if self.seconds is None else f"{duration(self.seconds)} of {work}"
-        return f"  {self.stage}: {self.why} ({took})"
+        how = f"; --go-on {self.stage}: {self.goes_on}" if self.goes_on else ""
+        return f"  {self.stage}: {self.why} ({took}){how}"
 
 
 def replaced_stages(run: Path, plan: Sequence[PlannedStage]) -> list[Replaced]:
-    """Finished stages that are guarded and that the plan would replace."""
+    """Stages that are guarded and that the plan would replace."""
     out = []
     for row in plan:
-        folder = stage_folder(run, row.stage.name)
-        if row.action != "run" or row.request is not None or Artifact.find(folder) is None:
+        folder, trained = stage_folder(run, row.stage.name), row.stage.kind.trains
+        if row.action != "run" or row.request is not None:
             continue
-        trained, seconds = row.stage.kind.trains, _seconds(folder)
-        if trained or (seconds or 0.0) >= LONG_SECONDS:
-            out.append(Replaced(row.stage.name, row.reason, trained, seconds))
+        if Artifact.find(folder) is not None:
+            seconds = _seconds(folder)
+            guarded = trained or (seconds or 0.0) >= LONG_SECONDS
+        else:
+            seconds = seconds_trained(folder)
+            guarded = trained and seconds >= TRAINED_SECONDS and newest_step(folder) is not None
+        if guarded:
+            how = "" if row.goes_on is None else row.goes_on.reason
+            out.append(Replaced(row.stage.name, row.reason, trained, seconds, how))
     return out
 
 
@@ -213,7 +228,7 @@ def started_trainings(run: Path, plan: Sequence[PlannedStage]) -> list[str]:
         and row.stage.kind.trains
         and row.request is None
         and Artifact.find(stage_folder(run, row.stage.name)) is None
-        and (stage_folder(run, row.stage.name) / "checkpoints").is_dir()
+        and newest_step(stage_folder(run, row.stage.name)) is not None
     ]
 
 
@@ -227,7 +242,7 @@ def explain_replacements(run: Path, recipe: str, stages: Sequence[Replaced]) -> 
         seconds = [stage.seconds for stage in stages if stage.seconds is not None]
         total = f", {duration(sum(seconds))} of work" if seconds else ""
         joint = "; to go on here would" if other is not None else " this would"
-        lines[0] += f"{joint} replace {len(stages)} finished stage{'s' * (len(stages) > 1)}{total}:"
+        lines[0] += f"{joint} replace {len(stages)} stage{'s' * (len(stages) > 1)}{total}:"
         lines += [stage.say() for stage in stages]
     end = f"-o {_free(run)} keeps both, --replace goes on here: what fits is kept, the rest is made again"
     if other is None:

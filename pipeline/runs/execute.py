@@ -8,6 +8,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 
 from motionloom.datasets.base.files import remove_temporaries, write_text
 from motionloom.datasets.base.lock import file_lock
@@ -16,6 +17,7 @@ from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache, StageContext, StageKind
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, require_fit
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.runs.verify_shards import verify_shards
@@ -49,6 +51,9 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 (run / REQUEST_FILE).unlink(missing_ok=True)
             else:
                 write_json(run / REQUEST_FILE, request.dump())
+            said = doubts(recipe, run, (row.stage for row in todo))
+            for doubt in said:
+                console.print(f"[yellow]{escape(doubt)}[/]", soft_wrap=True)
             for row in plan:
                 if row.action == "skip":
                     row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))
@@ -58,6 +63,9 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
             if leads:
                 place = f"{plan.index(row) + 1}/{len(plan)}"
                 console.print(f"[bold]\\[{place}] {stage.name}[/] ({stage.kind.summary})")
+                for doubt in doubts(recipe, run, [stage]):
+                    if doubt not in said:  # of data that this run has made
+                        console.print(f"    [yellow]{escape(doubt)}[/]", soft_wrap=True)
                 _prepare(folder, row)
             perform(stage.kind, context_of(recipe, run, stage, folder, console, team), team, run)
             if leads:
@@ -135,7 +143,7 @@ def _prepare(folder: Path, row: PlannedStage) -> None:
         remove_tree(folder)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "started.json", row.started.dump())
-    # A training that is made longer is not finished any more.
+    # A training that goes on is not finished any more.
     (folder / "artifact.json").unlink(missing_ok=True)
 
 
@@ -149,7 +157,7 @@ def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[Plann
         seed=recipe.seed_of(stage),
         config=stage.config.dump(),
         code=dict(row.code),
-        lengthened=row.started.lengthened,
+        changed=row.started.changed,
         inputs={role: _input(recipe, run, row, rows, name) for role, name in stage.inputs.items()},
     )
 

@@ -201,6 +201,7 @@ def make_launch_plan(
     for group in groups:
         # What is installed here says nothing of the cluster, so loggers are not asked after.
         there = {"nodes": group.machines.nodes, "devices": group.machines.processes, "loggers": ()}
+        there["accelerator"] = "gpu" if group.machines.gpus else "cpu"
         require_fit(map(recipe.stage, group.stages), recipe.hardware.model_copy(update=there))
     word = _word(recipe.name, 30)
     name = word if word[:1].isalpha() else f"run-{word}"

@@ -5,10 +5,7 @@ files, the fingerprints of its inputs and, of a kind from another package, that 
 finished when its folder holds an `artifact.json` with that fingerprint and every output it lists. Anything
 else runs, and whatever is below it has another fingerprint and runs too.
 
-A training of which only `train.steps` was raised goes on from its last checkpoint: `started.json` holds,
-next to the fingerprint, a digest of all that the fingerprint covers except the number of steps. Where that
-is the same and no learning-rate schedule ends with the training, what has been trained is the beginning of
-what is wanted. A schedule that ends with it is lengthened, which is said, and noted in the artifact.
+A training whose settings have changed may go on from its newest checkpoint (`continuation.py`).
 
 `--from` runs stages again. Until all of them are done the run folder keeps a note of that
 request, and each stage a note that it was begun for it, so the same command after a kill goes on instead of
@@ -19,7 +16,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -28,6 +25,7 @@ from motionloom.datasets.base.register import code_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import Every, Stage, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.runs.continuation import Continuation, Started, continuation, training_facts
 from motionloom.pipeline.runs.inputs import require_elsewhere
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.runs.resolve import Tree
@@ -35,7 +33,6 @@ from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import fingerprint_of
 from motionloom.pipeline.store.run_folder import identity_of, stage_folder
 from motionloom.pipeline.store.yaml import flatten
-from motionloom.pipeline.training.config import TrainedStageConfig
 
 REQUEST_FILE = ".again.json"
 """In the run folder, while stages are run again by request."""
@@ -60,24 +57,6 @@ class Request(Config):
     select: dict[str, str | None]
 
 
-class Started(Config):
-    """`started.json`: what is being made in a stage's folder."""
-
-    fingerprint: str
-    extendable: dict[str, int | str] | None = None
-    """A training's steps, and the digest of everything else."""
-    request: str | None = None
-    """The request for which the stage is run again."""
-    lengthened: tuple[int, ...] = ()
-    """Where learning-rate schedules ended that have been lengthened since."""
-
-    @staticmethod
-    def find(folder: Path) -> Started | None:
-        """The stage that was last started in a folder."""
-        path = folder / "started.json"
-        return Started.load_json(path) if path.is_file() else None
-
-
 @dataclass(frozen=True)
 class PlannedStage:
     """One row of the plan."""
@@ -93,17 +72,29 @@ class PlannedStage:
     """Identities of its inputs from outside when the plan was made."""
     code: Mapping[str, str]
     """sha256 of the code from other packages that it runs, by module, when the plan was made."""
+    goes_on: Continuation | None = None
+    """How a training that is to be replaced could go on, if the user asked for it (`--go-on`)."""
 
     @property
     def fingerprint(self) -> str:
         return self.started.fingerprint
 
 
-def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> list[PlannedStage]:
-    """Decide for every stage, in order, what happens to it."""
+def make_plan(
+    recipe: Recipe, run: Path, select: Selection | None = None, go_on: Collection[str] = ()
+) -> list[PlannedStage]:
+    """Decide for every stage, in order, what happens to it.
+
+    Trainings in `go_on` go on from their newest checkpoints although what they compute has changed.
+    """
     select = select or Selection()
     wanted = selected(recipe, select)
     forced = _descendants(recipe, select.first) & wanted if select.first else set()
+    for name in go_on:
+        if not recipe.stage(name, "--go-on").kind.trains:
+            raise UserError(f"--go-on {name}: this stage trains nothing; name one that does")
+        if name in forced:
+            raise UserError(f"--go-on {name} --from {select.first}: the latter begins it anew; leave one out")
     request, done = _request(run, select, forced) if forced else (None, set())
     rows: dict[str, PlannedStage] = {}
     # In the recipe's order, since a fingerprint needs those of the inputs.
@@ -113,30 +104,32 @@ def make_plan(recipe: Recipe, run: Path, select: Selection | None = None) -> lis
         before, again = Started.find(folder), request if stage.name in forced else None
         started = Started(
             fingerprint=fingerprint_of(facts),
-            extendable=_extendable(stage, facts),
+            training=training_facts(stage, facts),
             request=None if again is None else again.id,
         )
-        lengthened: tuple[int, ...] = ()
         # A request overrules the fingerprints, until this stage is done for it.
         if again is not None and stage.name not in done:
             action, reason = _decide_again(started, before, select)
         else:
             action, reason = _decide(recipe, stage, started, before, folder, rows, forced)
-        if before is not None and action == "resume":
-            lengthened = before.lengthened
-        # More steps of the same training are no other training: its checkpoints are a beginning of it.
-        elif before is not None and action == "run" and again is None:
-            longer = _extension(stage, started, before, folder)
-            if longer is not None:
-                action, (reason, lengthened) = "resume", longer
+        changed = before.changed if before is not None and action == "resume" else ()
+        goes_on: Continuation | str | None = None
+        if before is not None and action == "run" and again is None:
+            goes_on = continuation(stage, started.training, before, folder)
+            if isinstance(goes_on, Continuation) and (stage.name in go_on or not goes_on.knowingly):
+                action, reason, changed = "resume", goes_on.reason, goes_on.changed
+        if stage.name in go_on and action == "run":
+            why = "it has not begun" if goes_on is None else goes_on
+            raise UserError(f"--go-on {stage.name}: {why}")
         # A stage outside the selection is left as it is, outdated or not.
         if stage.name not in wanted and action != "skip":
             action, reason = "leave", "not selected"
-        started = started.model_copy(update={"lengthened": lengthened})
+        started = started.model_copy(update={"changed": changed})
         identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
         rows[stage.name] = PlannedStage(
-            stage, action, reason, started, again, identities, facts.get("code", {})
-        )
+            stage, action, reason, started, again, identities, facts.get("code", {}),
+            goes_on if isinstance(goes_on, Continuation) else None,
+        )  # fmt: skip
     return list(rows.values())
 
 
@@ -180,6 +173,8 @@ def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
         facts["order"] = list(stage.inputs)  # the first of several generators is the default
     if code := code_of(stage.kind.modules(stage.config)):
         facts["code"] = code
+    if stage.kind.trains and getattr(getattr(stage.config, "train", None), "ema", None):
+        facts["ema"] = 2  # with a warm-up
     return facts
 
 
@@ -229,7 +224,9 @@ def _decide(
             return "resume", "started earlier, not finished"
         if artifact is not None:
             return "run", _difference(recipe, artifact, stage, rows)
-        return "run", "never run" if before is None else "settings changed before it finished"
+        if before is None:
+            return "run", "never run"
+        return "run", "settings changed before it finished"
     gone = artifact.missing(folder)
     if gone:
         return "run", f"output {gone} is gone or has another size"
@@ -282,34 +279,3 @@ def _descendants(recipe: Recipe, name: str) -> set[str]:
         if out & set(stage.inputs.values()):
             out.add(stage.name)
     return out
-
-
-def _extendable(stage: Stage, facts: Tree) -> dict[str, int | str] | None:
-    """Steps of a stage that trains and a digest of its other facts, for `started.json`."""
-    if not isinstance(stage.config, TrainedStageConfig):
-        return None
-    fields = dict(facts["config"])
-    fields["train"] = {name: value for name, value in fields["train"].items() if name != "steps"}
-    return {"steps": stage.config.train.steps, "others": fingerprint_of({**facts, "config": fields})}
-
-
-def _extension(
-    stage: Stage, started: Started, before: Started, folder: Path
-) -> tuple[str, tuple[int, ...]] | None:
-    """Why a stage whose fingerprint has changed goes on from its checkpoints, and its lengthened schedules.
-
-    None where more than its steps has changed, or they became fewer, or nothing is there to go on from.
-    """
-    wanted, trained = started.extendable, before.extendable
-    if wanted is None or trained is None or trained["others"] != wanted["others"]:
-        return None
-    old, new = int(trained["steps"]), int(wanted["steps"])
-    if old >= new or not any((folder / "checkpoints").glob("*.ckpt")):
-        return None
-    reason = f"train.steps {old} -> {new}: goes on from its last checkpoint"
-    assert isinstance(stage.config, TrainedStageConfig)
-    schedule = stage.config.schedule_of_length()
-    if schedule is None:
-        return reason, before.lengthened
-    reason += f"; {schedule} is lengthened, which is not the same as {new} steps at once"
-    return reason, (*before.lengthened, old)

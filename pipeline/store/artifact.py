@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from pydantic import Field, field_validator
+from pydantic import Field, JsonValue, field_validator
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import Config, UserError
@@ -64,6 +64,16 @@ class InputStage(Config):
         return f"'{self.stage}'{owner}"
 
 
+class Change(Config):
+    """A setting that changed while a training went on."""
+
+    step: int
+    """The last step with the old value."""
+    key: str
+    old: JsonValue
+    new: JsonValue
+
+
 class Artifact(Config):
     """The record of a finished stage."""
 
@@ -75,8 +85,8 @@ class Artifact(Config):
     config: dict[str, object]
     code: dict[str, str] = Field(default_factory=dict, exclude_if=lambda code: not code)
     """sha256 of the code from other packages than motionloom that made it, by module."""
-    lengthened: tuple[int, ...] = ()
-    """Steps at which learning-rate schedules ended that were lengthened when more steps were asked for."""
+    changed: tuple[Change, ...] = Field((), exclude_if=lambda changed: not changed)
+    """Settings of a training that were others until a step; `config` holds the last ones."""
     step: int | None = Field(None, exclude_if=lambda step: step is None)
     """Of weights that were taken from a training before its end: their step."""
     inputs: dict[str, InputStage]

@@ -104,12 +104,23 @@ class Data:
         filled = {shard.split for shard in shards if shard.samples}
         return [split for split in ("train", "val", "test") if split in filled]
 
+    def clips(self, split: str) -> int:
+        """How many clips a split holds, of all data sets; 0 of a kind that is not ours."""
+        if not self._is_ours:
+            return 0
+        shards = [shard for _, manifest in self._sources() for shard in manifest.shards]
+        return sum(shard.samples for shard in shards if shard.split == split)
+
+    @property
+    def _is_ours(self) -> bool:
+        return any((self.folder / name).exists() for name in (SHARDS, REFERENCE, MIX))
+
     def local_shards(self) -> list[LocalShard]:
         """All shards that lie in folders of this machine; a server's are compared on arrival.
 
         None of a kind that is not ours and keeps its data in another way.
         """
-        if not any((self.folder / name).exists() for name in (SHARDS, REFERENCE, MIX)):
+        if not self._is_ours:
             return []
         return [
             LocalShard(store.root / shard.name, shard)

@@ -6,7 +6,7 @@ The flight logs hold times and are no output.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -53,6 +53,18 @@ def read_training_log(folder: Path) -> list[dict[str, float]]:
     return rows
 
 
+_RISE = 1e3
+"""Times above its start at which a loss has risen for good."""
+
+
+def rise_of_loss(rows: Sequence[Mapping[str, float]]) -> str | None:
+    """A sentence where the loss of a training ends a thousand times above its start; else None."""
+    losses = [row["train/loss"] for row in rows if "train/loss" in row]
+    if not losses or losses[-1] <= _RISE * abs(losses[0]):
+        return None
+    return f"the loss ended at {losses[-1]:.3g}, {losses[-1] / (abs(losses[0]) or 1):,.0f} times its start"
+
+
 def read_rows(path: Path) -> list[dict[str, float]]:
     """Rows of a flight log; none where there is no file. A line that a kill has cut short is left out."""
     if not path.is_file():
@@ -76,3 +88,9 @@ def read_flight(folder: Path) -> dict[int, list[dict[str, float]]]:
         if rank.isdecimal() and (rows := read_rows(path)):
             ranks[int(rank)] = rows
     return ranks
+
+
+def seconds_trained(folder: Path) -> float:
+    """Seconds that a training has taken up to its last row, in all its processes one after the other."""
+    rows = read_rows(folder / FLIGHT / "rank_0.jsonl")
+    return rows[-1].get("elapsed_seconds", 0.0) if rows else 0.0

@@ -97,7 +97,11 @@ def optimizer_state(module: StageModule, optimizer: Optimizer) -> OptimizerState
 
 
 def load_optimizer(module: StageModule, optimizer: Optimizer, state: OptimizerState) -> None:
-    """Load a state as `optimizer_state` returns it."""
+    """Load a state as `optimizer_state` returns it, under the settings that the optimizer has now."""
+    groups = zip(state["param_groups"], optimizer.state_dict()["param_groups"], strict=True)
+    kept = ("params", "lr")  # the rate is that of a step, which sets it
+    own_settings = [{**own, **{key: saved[key] for key in kept}} for saved, own in groups]
+    state = {**state, "param_groups": own_settings}
     if not _is_sharded(module):
         optimizer.load_state_dict(state)
         return

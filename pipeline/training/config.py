@@ -5,7 +5,7 @@ It is apart from `trainer.py` because a recipe is read and planned without Light
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -55,8 +55,8 @@ class TrainConfig(Config):
     compile: bool = False
     """Compile networks and losses with torch.compile, as one graph."""
     ema: float | None = Field(None, ge=0, lt=1)
-    """Decay a step of an average of the weights, such as 0.999; validation and the saved model take the
-    average. null or 0 turns it off."""
+    """Decay a step of an average of the weights, such as 0.999, less at first; validation and the saved model
+    take the average. null or 0 turns it off."""
     checkpoint_activations: bool = Field(False, json_schema_extra=RUNTIME)
     """Keep only the borders of transformer blocks for the backward pass and compute the rest again there:
     less memory, about a third more time, the same figures."""
@@ -101,8 +101,13 @@ class TrainedStageConfig(StageConfig):
     not its place."""
 
     def require_fit(self, hardware: Hardware) -> None:
-        """The global batch must divide over the processes, and FSDP suit the network and the arithmetic."""
+        """The global batch must divide over the processes, and the arithmetic suit the device and FSDP."""
         self.train.local_batch(hardware.world())
+        if self.train.precision == "16-mixed" and hardware.resolved_accelerator() == "cpu":
+            raise UserError(
+                "train.precision 16-mixed is for GPUs, and this trains on a CPU; set train.precision: "
+                "bf16-mixed, or hardware.accelerator: gpu to plan for another machine"
+            )
         require_loggers(hardware.loggers)
         if self.train.strategy == "fsdp":
             self._require_shardable()
@@ -112,7 +117,13 @@ class TrainedStageConfig(StageConfig):
 
         Without one, more steps only add to those of a shorter training.
         """
-        return _schedule_of_length(self)
+        schedules = (f"{key}.schedule {optim.schedule}" for key, optim in optimizers_of(self))
+        return next((one for one in schedules if not one.endswith(" constant")), None)
+
+    def doubts(self) -> list[str]:
+        """What will hardly do what is meant, a sentence each."""
+        found = optimizers_of(self)
+        return [f"{key}.{doubt}" for key, optim in found for doubt in optim.doubts(self.train.steps)]
 
     def _require_shardable(self) -> None:
         if not self.shardable:
@@ -134,12 +145,11 @@ class TrainedStageConfig(StageConfig):
             raise UserError("train.strategy fsdp has no gradient scaler; set train.precision: bf16-mixed")
 
 
-def _schedule_of_length(config: BaseModel, prefix: str = "") -> str | None:
+def optimizers_of(config: BaseModel, prefix: str = "") -> Iterator[tuple[str, OptimConfig]]:
+    """The optimizers in a config by their dotted keys."""
     for name in type(config).model_fields:
         value = getattr(config, name)
-        if isinstance(value, OptimConfig) and value.schedule != "constant":
-            return f"{prefix}{name}.schedule {value.schedule}"
-        schedule = _schedule_of_length(value, f"{prefix}{name}.") if isinstance(value, BaseModel) else None
-        if schedule:
-            return schedule
-    return None
+        if isinstance(value, OptimConfig):
+            yield f"{prefix}{name}", value
+        elif isinstance(value, BaseModel):
+            yield from optimizers_of(value, f"{prefix}{name}.")

@@ -12,7 +12,7 @@ import faulthandler
 import math
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,9 +26,12 @@ from torch import Tensor
 
 from motionloom.datasets.base.files import write_bytes, write_text
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.checksums import state_of
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, StageModule
-from motionloom.pipeline.launch.process import TeamError
+from motionloom.pipeline.contract.stage import CompletedStage
+from motionloom.pipeline.launch.process import JointError, TeamError
+from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.files import open_own
 from motionloom.pipeline.store.training_log import CRASHES
 from motionloom.pipeline.training.loaders import TrainingData
@@ -167,6 +170,48 @@ def flat_tensors(value: object, name: str = "") -> dict[str, Tensor]:
     for key, inner in value.items() if isinstance(value, Mapping) else ():
         out |= flat_tensors(inner, f"{name}.{key}" if name else str(key))
     return out
+
+
+class ShardWatch:
+    """Notices shards that somebody writes while a training reads them; `stages` fed it."""
+
+    def __init__(self, stages: Iterable[CompletedStage]) -> None:
+        data = [stage for stage in stages if stage.gives("data") and not stage.exported]
+        self._states = {
+            shard.path: shard.state()[:2] for stage in data for shard in Data(stage.folder).local_shards()
+        }
+        """Size and time of the last write."""
+        self._checks = 0
+
+    def check(self, device: torch.device) -> None:
+        """All ranks call this at the same steps, and look at a part of the shards each, in turns.
+
+        Raises:
+            JointError: In all ranks, if a shard has changed or is gone.
+        """
+        if not self._states:
+            return
+        self._checks += 1
+        own = self._changed((rank() + self._checks) % world_size(), world_size())
+        number = float(all_ranks([math.inf if own is None else own], device).min())
+        if math.isfinite(number):
+            raise JointError(self._say(int(number)))
+
+    def explain(self, error: Exception) -> Exception:
+        """The error, or where this process finds that a shard has changed the one that says so."""
+        number = self._changed(0, 1)
+        return error if number is None else UserError(self._say(number))
+
+    def _changed(self, first: int, every: int) -> int | None:
+        """The number of a shard that is not as it was, among every so many."""
+        numbered = list(enumerate(self._states.items()))[first::every]
+        return next((number for number, (path, state) in numbered if state_of(path)[:2] != state), None)
+
+    def _say(self, number: int) -> str:
+        return (
+            f"{list(self._states)[number]}: the shard has changed, or is gone, since this training began to "
+            f"read it; put it back, or run again from the stage that made it; its checkpoints are kept"
+        )
 
 
 class StallTimer:

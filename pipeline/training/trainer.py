@@ -23,6 +23,7 @@ from lightning.fabric import Fabric
 from torch import Tensor
 
 from motionloom.datasets.base.files import remove_temporaries
+from motionloom.datasets.base.os_errors import full_place
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.distributed import rank, world_size
@@ -31,7 +32,7 @@ from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModul
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.process import Interrupted, TeamError
 from motionloom.pipeline.launch.team import lead_finds
-from motionloom.pipeline.store.training_log import CRASHES, optional
+from motionloom.pipeline.store.training_log import CRASHES, optional, rise_of_loss
 from motionloom.pipeline.training.checkpointing import (
     BackgroundWriter,
     Checkpoint,
@@ -48,7 +49,7 @@ from motionloom.pipeline.training.checkpointing import (
 )
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
 from motionloom.pipeline.training.execution import Execution, launch, set_threads
-from motionloom.pipeline.training.failures import FailureGuard, StallTimer
+from motionloom.pipeline.training.failures import FailureGuard, ShardWatch, StallTimer
 from motionloom.pipeline.training.loaders import TrainingData, on_device
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
@@ -79,7 +80,7 @@ def fit(
         training.run()
     except OSError as error:
         if error.errno is not None and error.filename is None:
-            error.filename = str(training.folder)
+            error.filename = full_place(error, training.folder)
         raise
     except RuntimeError as error:
         if isinstance(error, dist.DistBackendError) or "by peer" in str(error) or "imed out" in str(error):
@@ -139,6 +140,7 @@ class Training:
         self._saved, self._writing = module.step if resume.checkpoint else -1, False
         self.telemetry = Telemetry(context.folder, module, config.batch_size, console, flops, peak)
         self.failures = FailureGuard(name, context.folder, module, data, console)
+        self.shards = ShardWatch(context.inputs.values())
         self.stall = StallTimer(
             context.folder / CRASHES / f"stalled_rank_{rank()}.txt", hardware.stall_seconds
         )
@@ -162,6 +164,8 @@ class Training:
                 with suppress(UserError, OSError):  # the error says more than one of the writing
                     self._finish_writing()
                 self.log.fail()
+                if isinstance(error, Exception):
+                    raise self.shards.explain(error) from error
                 raise
             finally:
                 self.progress.close()
@@ -169,6 +173,8 @@ class Training:
         summary = self.telemetry.summary()
         if summary:
             self.context.console.print(f"    {self.context.name}: {summary}")
+        if rank() == 0 and (risen := rise_of_loss(self.log.rows)):
+            self.context.console.print(f"[yellow]    {self.context.name}: {risen}[/]", soft_wrap=True)
 
     def _run(self) -> None:
         module, steps = self.module, self.config.steps
@@ -274,7 +280,9 @@ class Training:
         step = self.module.step
         if step == self._saved and not again:
             return
-        self.failures.check(scaled=self.execution.scaler is not None)  # no checkpoint of a lost network
+        # No checkpoint of a lost network, nor of other data than the training began with.
+        self.failures.check(scaled=self.execution.scaler is not None)
+        self.shards.check(self.module.device)
         with self.telemetry.waits.waiting_for("checkpoints"):
             self._finish_writing()  # at most one copy of the state is in memory
             state = self._state()
@@ -315,9 +323,16 @@ class Training:
         module, name = self.module, self.context.name
         # Data and random draws need no state: both are functions of the seed and the step.
         module.step = state["global_step"]
-        load_weights(module, state["state_dict"])
-        for optimizer, one in zip(self.execution.optimizers, state["optimizer_states"], strict=True):
-            load_optimizer(module, optimizer, one)
+        try:
+            load_weights(module, state["state_dict"])
+            for optimizer, one in zip(self.execution.optimizers, state["optimizer_states"], strict=True):
+                load_optimizer(module, optimizer, one)
+        except (RuntimeError, ValueError) as error:  # torch names every tensor that does not fit
+            raise UserError(
+                f"{self.folder / name_of(module.step)}: holds another network than {name} has now "
+                f"({str(error).splitlines()[-1].strip()}); give the settings that it began with, or begin "
+                f"anew with --from {name}"
+            ) from None
         if self.execution.scaler is not None and state["scaler"]:
             self.execution.scaler.load_state_dict(state["scaler"])
         if self.average is not None and state["average"] is not None:

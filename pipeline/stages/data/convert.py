@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from pydantic import ConfigDict
+
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.convert.captions.options import digest_of
 from motionloom.datasets.convert.common.config import ConvertConfig
@@ -21,7 +23,10 @@ from motionloom.pipeline.store.data import SHARDS
 def _stage_config(kind: type[AnyConverter]) -> type[StageConfig]:
     """A class that stands in this module, so that worker processes of a conversion can unpickle it."""
     name, bases = f"{kind.__name__}StageConfig", (kind.config_class, StageConfig)
-    stage_config = type(name, bases, {"__doc__": kind.summary, "__module__": __name__})
+    # Fields have their docstrings from the converter's class; looking for them again takes longest of all.
+    settings = ConfigDict(use_attribute_docstrings=False)
+    space = {"__doc__": kind.summary, "__module__": __name__, "model_config": settings}
+    stage_config = type(name, bases, space)
     globals()[name] = stage_config
     return stage_config
 

@@ -28,6 +28,7 @@ from motionloom.pipeline.store.training_log import (
     read_flight,
     read_rows,
     read_training_log,
+    rise_of_loss,
 )
 from motionloom.pipeline.store.yaml import flatten, setting_text
 
@@ -68,6 +69,8 @@ def draw_curves(page: Page, stages: Sequence[CompletedStage], *, samples: bool =
             ]
             if lines:
                 page.add_plot(lines, f"{stage.name}: {curve.title or curve_label(curve.prefix)}")
+        if risen := rise_of_loss(rows):
+            page.add_text(f"{stage.name}: {risen}.")
         if samples:
             _draw_samples(page, stage)
 

@@ -279,7 +279,7 @@ def test_a_plan(call: Call, tmp_path: Path) -> None:
         ("stats", "run", "never run"),
     ]
     assert plan["stages"][1]["inputs"] == {"data": "data"}
-    assert plan["replaces"] == {"finished": [], "started": []}
+    assert plan["replaces"] == {"guarded": [], "started": []} and plan["doubts"] == []
     assert not (tmp_path / "run").exists()
     refused = call("run", recipe, "--out", tmp_path / "run", "--json")
     assert refused.code == 2 and "give --dry-run too" in refused.err and not refused.out

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import tiny_adversaries
@@ -13,6 +15,7 @@ from rich.console import Console
 from tiny_adversaries import Duel, Vectors
 from toy_stages import register_toys
 
+from motionloom.datasets.schema import UserError
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.runs.dry_run import replaced_stages, started_trainings
@@ -20,6 +23,7 @@ from motionloom.pipeline.runs.execute import execute
 from motionloom.pipeline.runs.plan import make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.training.checkpointing import name_of, read_checkpoint, write_checkpoint
 from motionloom.pipeline.training.config import TrainedStageConfig
 from motionloom.pipeline.training.trainer import fit
 
@@ -29,6 +33,7 @@ class DuelConfig(TrainedStageConfig):
 
     optim: OptimConfig = tiny_adversaries.GENERATOR
     critic: OptimConfig = tiny_adversaries.GENERATOR
+    window: int = 8
 
 
 DIES_AT: list[int] = []
@@ -43,7 +48,9 @@ def run_duel(context: StageContext) -> None:
         context,
         duel,
         config.train,
-        lambda batch, rank, world: Vectors(batch, rank, world, dies_at=dies_at),
+        lambda batch, rank, world: Vectors(
+            batch, rank, world, dies_at=dies_at, parts=config.train.accumulate
+        ),
         lambda: Vectors(4, size=1),
     )
     torch.save(duel.state_dict(), context.folder / "model.pt")
@@ -72,10 +79,10 @@ def recipe(folder: Path, *overrides: str) -> Recipe:
     return load_recipe(path, overrides)
 
 
-def go(folder: Path, *overrides: str) -> tuple[str, str, str]:
+def go(folder: Path, *overrides: str, go_on: Sequence[str] = ()) -> tuple[str, str, str]:
     """Run; what the plan said of the duel, and what was printed."""
     loaded = recipe(folder, *overrides)
-    plan = make_plan(loaded, folder / "run")
+    plan = make_plan(loaded, folder / "run", go_on=go_on)
     row = plan[1]
     if row.action != "run" or row.reason == "never run":
         assert replaced_stages(folder / "run", plan) == started_trainings(folder / "run", plan) == []
@@ -135,6 +142,82 @@ def test_killed_as_it_goes_on(tmp_path: Path, long: dict[str, object]) -> None:
     assert outcome(tmp_path) == long
 
 
+HALF = "duel.train.precision=bf16-mixed"
+
+
+def dies(folder: Path, at: int, *overrides: str, **how: Any) -> None:
+    DIES_AT.append(at)
+    with pytest.raises(ConnectionResetError):
+        go(folder, *overrides, **how)
+
+
+def changes(folder: Path) -> list[tuple[object, ...]]:
+    """What the artifact says of settings that changed."""
+    artifact = Artifact.find(folder / "run/stages/duel")
+    assert artifact is not None
+    return [(one.step, one.key, one.old, one.new) for one in artifact.changed]
+
+
+def test_how_a_step_is_computed_changes_without_being_asked(tmp_path: Path) -> None:
+    """Accumulation over the parts of one batch is the same training; each change is told once."""
+    dies(tmp_path, 8)
+    dies(tmp_path, 8, HALF)  # before another checkpoint, so nothing has been trained like that
+    dies(tmp_path, 9)
+    action, reason, _ = go(tmp_path, HALF, "duel.train.steps=18")
+    assert action == "resume" and "step 6" in reason and "train.precision 32-true -> bf16-mixed" in reason
+    assert changes(tmp_path) == [(6, "train.precision", "32-true", "bf16-mixed")]
+    assert go(tmp_path, HALF, "duel.train.steps=18")[0] == "skip"
+    go(tmp_path, HALF, LONG, "duel.train.accumulate=2")
+    assert changes(tmp_path)[1:] == [(18, "train.accumulate", 1, 2)]
+
+
+KNOWN = ("duel.optim.lr=0.02", "duel.critic.betas=[0.8,0.95]", "duel.train.batch_size=2")
+
+
+def test_what_a_step_computes_changes_when_it_is_asked_for(tmp_path: Path) -> None:
+    """Weights and moments are kept, under the new settings."""
+    dies(tmp_path, 8)
+    row = make_plan(recipe(tmp_path, *KNOWN), tmp_path / "run")[1]
+    assert row.action == "run" and row.goes_on is not None and row.goes_on.step == 6
+    go(tmp_path, *KNOWN, go_on=["duel"])
+    assert changes(tmp_path) == [
+        (6, "critic.betas", [0.9, 0.99], [0.8, 0.95]),
+        (6, "optim.lr", 0.01, 0.02),
+        (6, "train.batch_size", 4, 2),
+    ]
+    folder = tmp_path / "run/stages/duel/checkpoints"
+    states = read_checkpoint(folder / name_of(12))["optimizer_states"]
+    assert states[1]["param_groups"][0]["betas"] == (0.8, 0.95)
+    assert states[0]["state"][0]["step"] == 12 and len(states[0]["state"]) == 4
+    assert go(tmp_path, *KNOWN)[0] == go(tmp_path, *KNOWN, go_on=["duel"])[0] == "skip"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "go_on", "says"),
+    [
+        (["seed=4"], "duel", "seed"),
+        (["duel.window=9"], "duel", "window 8 -> 9"),
+        (["duel.optim.lr=1"], "dual", "'duel'"),
+        (["duel.optim.lr=1"], "data", "trains nothing"),
+        (["duel.optim.lr=1", "duel.train.steps=6"], "duel", r"step 6 .*duel\.train\.steps"),
+    ],
+)
+def test_what_cannot_go_on_says_why(overrides: list[str], go_on: str, says: str, tmp_path: Path) -> None:
+    dies(tmp_path, 8)
+    with pytest.raises(UserError, match=says):
+        make_plan(recipe(tmp_path, *overrides), tmp_path / "run", go_on=[go_on])
+
+
+def test_another_network_in_the_checkpoint_is_named(tmp_path: Path) -> None:
+    dies(tmp_path, 8)
+    path = tmp_path / "run/stages/duel/checkpoints" / name_of(6)
+    content = {**read_checkpoint(path)}
+    content["state_dict"] = {**content["state_dict"], "net.0.weight": torch.zeros(2, 2)}
+    write_checkpoint(content, path)
+    with pytest.raises(UserError, match=r"step=00000006\.ckpt: .*net\.0\.weight"):
+        go(tmp_path)
+
+
 COSINE = "duel.critic.schedule=cosine"
 
 
@@ -147,6 +230,7 @@ def test_what_differs_in_more_or_has_nothing_to_go_on_from_begins_anew(tmp_path:
     for overrides, reason in (
         (["duel.train.steps=6"], "changed: train.steps 12 -> 6"),
         ([LONG, "duel.optim.lr=0.5"], "changed: optim.lr 0.01 -> 0.5 (+1 more)"),
+        (["duel.train.precision=bf16-mixed"], "changed: train.precision 32-true -> bf16-mixed"),
         ([LONG, "seed=4"], "changed: train.steps 12 -> 24"),
     ):
         assert planned(*overrides) == ("run", reason)
@@ -170,7 +254,9 @@ def test_a_schedule_of_that_length_is_lengthened_and_noted(tmp_path: Path) -> No
             with pytest.raises(ConnectionResetError):
                 go(folder, COSINE, LONG)
         action, reason, _ = go(folder, COSINE, LONG)
-        assert action == "resume" and (killed or "critic.schedule cosine is lengthened" in reason)
-    assert outcome(tmp_path) == outcome(once) and outcome(tmp_path)["lengthened"] == [12]
+        assert action == "resume" and (killed or "critic.schedule cosine now ends with step 24" in reason)
+    assert outcome(tmp_path) == outcome(once) and [
+        (one["step"], one["key"], one["old"], one["new"]) for one in outcome(tmp_path)["changed"]
+    ] == [(12, "train.steps", 12, 24)]
     go(tmp_path / "whole", COSINE, LONG)
     assert outcome(tmp_path / "whole") != outcome(once)

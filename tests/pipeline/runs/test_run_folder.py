@@ -18,6 +18,7 @@ from motionloom.pipeline.contract.stage import ALIGNMENT, GENERATOR, FunctionSta
 from motionloom.pipeline.evaluation.retrieval import retrieve
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe
+from motionloom.pipeline.runs.dry_run import plan_record
 from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import write_json
@@ -47,7 +48,7 @@ def work(context: StageContext) -> None:
     write_json(context.folder / "value.json", context.config.add)
     write_text(context.folder / "report.html", "a page")
     if context.config.add < 0:
-        (context.folder / "checkpoints").mkdir()
+        write_text(context.folder / "checkpoints" / "step=00000004.ckpt", "")
         raise KeyboardInterrupt
 
 
@@ -141,7 +142,7 @@ def test_finished_trainings_are_not_replaced_unasked(go: Go, tmp_path: Path) -> 
     with pytest.raises(UserError) as error:
         go("tokenizer.add=2", "evaluate.add=3")
     parts = [
-        (f"{run}: ", "2 finished stages", "10 h 25 min"),
+        (f"{run}: ", "2 stages", "10 h 25 min"),
         ("  tokenizer: ", "add 1 -> 2", "2 h 05 min"),
         ("  gpt: ", "input tokens changed", "8 h 20 min"),
         (f"motionloom run {run}/recipe.yaml -o {run}",),
@@ -169,7 +170,7 @@ def test_what_is_cheap_is_made_anew_without_asking(go: Go, tmp_path: Path) -> No
         go("gpt.add=2", until="gpt")
 
 
-def test_what_is_asked_for_by_name_is_made_anew_and_what_was_begun_is_named(go: Go) -> None:
+def test_what_is_asked_for_by_name_is_made_anew_and_what_was_begun_is_named(go: Go, tmp_path: Path) -> None:
     go()
     assert "3 of 9 " in go("gpt.add=2", first="gpt")
     assert "9 of 9 " in go("tokenizer.add=2", first="data")
@@ -177,7 +178,24 @@ def test_what_is_asked_for_by_name_is_made_anew_and_what_was_begun_is_named(go: 
         go("tokenizer.add=3", first="gpt")
     with pytest.raises(KeyboardInterrupt):
         go("tokenizer.add=2", "gpt.add=-1", replace=True)
+    row = json.dumps({"step": 3, "elapsed_seconds": 599.0})
+    write_text(tmp_path / "run/stages/gpt/flight/rank_0.jsonl", row + "\n")
     assert "replaces unfinished trainings: gpt\n" in go("tokenizer.add=2", "gpt.add=5")
+
+
+def test_ten_minutes_of_a_training_that_is_not_finished_are_guarded(go: Go, tmp_path: Path) -> None:
+    """All its processes together; the first one of a run, so no other stage is in the way."""
+    with pytest.raises(KeyboardInterrupt):
+        go("gpt.add=-1")
+    row = json.dumps({"step": 20, "elapsed_seconds": 601.0})
+    write_text(tmp_path / "run/stages/gpt/flight/rank_0.jsonl", row + "\n")
+    before = files(tmp_path / "run")
+    with pytest.raises(UserError, match=r"(?s)1 stage, 10 min .*gpt: .*--replace"):
+        go("gpt.add=5")
+    plan = plan_record(tmp_path / "recipe.yaml", tmp_path / "run", overrides=["gpt.add=5"])
+    assert plan["replaces"] == {"guarded": ["gpt"], "started": ["gpt"]}
+    assert files(tmp_path / "run") == before
+    assert "3 of 9 " in go("gpt.add=5", replace=True)
 
 
 def test_options_that_contradict_each_other_and_that_do_not(go: Go) -> None:

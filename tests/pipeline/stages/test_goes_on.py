@@ -58,9 +58,10 @@ def test_the_average_is_that_of_the_weights(tmp_path: Path) -> None:
     for steps in range(1, 9):  # the weights after each step: without schedule they begin every training
         weights.append(train(tmp_path / str(steps), steps=steps, module=CONSTANT).net[0].weight.detach())
     expected = weights[0].double()
-    for weight in weights[1:]:
-        expected = 0.9 * expected + 0.1 * weight.double()
-    averaged = train(tmp_path / "averaged", steps=8, ema=0.9, checkpoint_every=8, module=CONSTANT)
+    for count, weight in enumerate(weights[1:], start=1):
+        decay = min(0.4, (1 + count) / (10 + count))
+        expected = decay * expected + (1 - decay) * weight.double()
+    averaged = train(tmp_path / "averaged", steps=8, ema=0.4, checkpoint_every=8, module=CONSTANT)
     torch.testing.assert_close(averaged.net[0].weight.double(), expected, rtol=0, atol=1e-6)
     trained = newest(tmp_path / "averaged")["state_dict"]["net.0.weight"]
     assert torch.equal(trained, weights[-1])
