@@ -82,7 +82,6 @@ def _add_finger(
     finger: str,
     places: dict[str, NDArray[np.float64]],
 ) -> None:
-    assert spec.fingers is not None
     wrist, knuckle = places[f"{side}wrist"], places[f"{side}{finger.lower()}1"]
     points = [places[f"{side}{finger.lower()}{n}"] for n in (1, 2, 3)]
     kept = [f"{side}{finger.lower()}{n}" for n in (1, 2, 3)]
@@ -92,9 +91,9 @@ def _add_finger(
     count = 3 if spec.in_palm and finger == "Thumb" else spec.finger_joints
     points, kept = [*points, tip][:count], [*kept, ""][:count]
     for n, (point, place) in enumerate(zip(points, kept, strict=True), start=1):
-        parent = out.add(spec.fingers(word, finger, n), parent, point, place)
+        parent = out.add(spec.finger(word, finger, n), parent, point, place)
     if spec.hand_end:
-        base = spec.fingers(word, finger, 1).rstrip("0123456789")
+        base = spec.finger(word, finger, 1).rstrip("0123456789")
         out.add(spec.hand_end.format(base), parent, points[-1] + 0.5 * (tip - points[-1]) + 0.001)
 
 

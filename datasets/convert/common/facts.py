@@ -1,8 +1,8 @@
 """Facts known of clips: `--set where="category=dance and seconds<30"` chooses by them.
 
-Conditions are `NAME OPERATOR VALUE` with =, !=, <, <=, > or >=, joined by `and`; a value that holds `and` or
-an operator stands in quotes. Nothing is evaluated. Words are compared without regard to case, = holds for one
-of several values, and a clip of which the name is not known meets no condition.
+Conditions are `NAME OPERATOR VALUE` with =, !=, <, <=, > or >=, joined by `and`; a value that holds an
+operator stands in quotes. Nothing is evaluated. Words are compared without regard to case, = holds for one of
+several values, and a clip of which the name is not known meets no condition.
 """
 
 from __future__ import annotations
@@ -25,11 +25,9 @@ _ORDER: dict[str, Callable[[float, float], bool]] = {
     ">": operator.gt,
     ">=": operator.ge,
 }
-_CONDITION = re.compile(
-    r"""\s*(?P<name>[A-Za-z_][\w.]*)\s*(?P<sign><=|>=|!=|=|<|>)\s*"""
-    r"""(?P<value>"[^"]*"|'[^']*'|(?:(?!\sand(?:\s|$))[^<>=!"'])+)\s*(?P<rest>\band(?:\s|$)|$)""",
-    re.IGNORECASE,
-)
+_AND = re.compile(r"\s+and(?:\s+(?=[A-Za-z_][\w.]*\s*[<>=!])|\s*$)", re.IGNORECASE)
+"""The word between two conditions: `and` within a value is followed by no name with an operator."""
+_CONDITION = re.compile(r"""([A-Za-z_][\w.]*)\s*(<=|>=|!=|=|<|>)\s*("[^"]*"|'[^']*'|[^<>=!"']+)""")
 
 
 @dataclass(frozen=True)
@@ -54,19 +52,16 @@ class Condition:
 @lru_cache(maxsize=64)
 def parse_where(text: str) -> tuple[Condition, ...]:
     """The conditions of an expression; `UserError` that quotes the part that is none."""
-    found: list[Condition] = []
-    at = 0
-    while at < len(text.rstrip()) or (text.strip() and not found):
-        match = _CONDITION.match(text, at)
+    found = []
+    for part in _AND.split(text.strip()) if text.strip() else ():
+        match = _CONDITION.fullmatch(part.strip())
         if match is None:
             raise UserError(
-                f"where: '{text[at:].strip()[:60]}' is no condition; write NAME=VALUE, !=, <, <=, > or >=, "
+                f"where: '{part.strip()[:60]}' is no condition; write NAME=VALUE, !=, <, <=, > or >=, "
                 f'joined by `and`, such as "category=dance and seconds<30"'
             )
-        found.append(Condition(match["name"], match["sign"], match["value"].strip().strip("\"'")))
-        at = match.end()
-        if match["rest"].strip() and at >= len(text.rstrip()):
-            raise UserError(f"where: nothing follows the last `and` of '{text.strip()[:60]}'")
+        name, sign, value = match.groups()
+        found.append(Condition(name, sign, value.strip().strip("\"'")))
     return tuple(found)
 
 
