@@ -25,7 +25,7 @@ class Foreign:
     """Names above the pelvis, on the floor."""
     sides: tuple[str, ...] = ("Left", "Right")
     fingers: str = ""
-    """Name of a finger's joint, of side, finger (`low`: in small letters; `place`: from 1), number and bone."""
+    """Name of a finger's joint: of side, finger (`low`: in small letters, `place`: from 1), number, bone."""
     thumb: str = ""
     """The same for thumbs, where they differ."""
     bones: str = ""
