@@ -1,6 +1,6 @@
 """Speed of what runs often, beside the usual way to do the same: the table "Speed" of docs/results.md.
 
-    python benchmarks/speed.py [--only features smpl audio loader streaming] [--record speed]
+    python benchmarks/speed.py [--only features smpl audio loader batches streaming] [--record speed]
     python benchmarks/speed.py --only bvh --bvh FOLDER
 
 All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
@@ -17,7 +17,8 @@ import sys
 import tempfile
 import warnings
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.audio.features import AudioSettings, audio_features, fitting_octaves
 from motionloom.datasets.convert.common.scan import list_files, read_file
 from motionloom.datasets.loading.batches import WindowBatches
+from motionloom.datasets.loading.condition_batches import ConditionBatches
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.bvh.motion import read_bvh
@@ -36,12 +38,16 @@ from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.datasets.schema import Caption
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
+from motionloom.datasets.text.build import build_with_encoder
+from motionloom.datasets.text.encoder import EncodedText
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import Script, ScriptSegment
+from motionloom.pipeline.store.tokens import TokenBatches, TokenCaptions, TokenStore
 
 COLUMNS = (Column("ours", "ours"), Column("the usual way", "usual"), Column("times faster", "ratio", 1))
 CAPTIONS = ("a person walks forward", "a person waves with the left hand", "a person squats")
@@ -161,18 +167,64 @@ def audio(args: Namespace) -> Record:
     return row(title, f"{taken['ours']:.2f} s", usual, taken["librosa"] / taken["ours"])
 
 
+@dataclass(frozen=True)
 class NoiseClips:
-    """Clip i: 64 to 196 frames of noise in `layout`."""
+    """Clip i: `least` to 196 frames of noise in `layout`, with three captions."""
 
-    def __init__(self, layout: MotionLayout) -> None:
-        self.layout = layout
+    layout: MotionLayout
+    least: int
 
     def __call__(self, i: int) -> Sample:
         rng = np.random.default_rng(i)
-        frames = int(rng.integers(WINDOW, 197))
+        frames = int(rng.integers(self.least, 197))
         motion = rng.standard_normal((frames, self.layout.dim), dtype=np.float32)
         meta = self.layout.clip_meta(str(i), source="noise", split="train", frames=frames, licence="CC0")
-        return Sample(meta, motion)
+        return Sample(meta, motion, [Caption(text=f"{caption} {i}") for caption in CAPTIONS])
+
+
+class NoiseText:
+    """Captions as twelve words of noise, as wide as the sentence encoder of the recipes."""
+
+    name, dim = "noise", 384
+
+    def encode(self, captions: Sequence[str]) -> EncodedText:
+        tokens = np.random.default_rng(0).standard_normal((len(captions), 12, self.dim), dtype=np.float32)
+        return EncodedText(tokens.mean(axis=1), tokens, np.ones(tokens.shape[:2], dtype=bool))
+
+
+def noise(folder: str, layout: MotionLayout, clips: int, least: int) -> tuple[ShardDataset, FeatureStats]:
+    """Clips of noise in shards, and their statistics."""
+    facts = DatasetFacts("noise", layout, "CC0", converter="noise", converter_version=1, options={})
+    items = [("train", i) for i in range(clips)]
+    write_dataset(Path(folder), items, NoiseClips(layout, least), facts, WriteOptions(workers=1))
+    dataset = ShardDataset.open(Path(folder), "train")
+    return dataset, compute(dataset)
+
+
+def batches(args: Namespace) -> Record:
+    """Batches of 256 as the paper trains on them, of 512 whole-body clips of 196 frames."""
+    layout, count, groups = MotionLayout.named("wholebody363"), 512, 49
+    columns, draw = layout.part("bodyhand"), torch.Generator().manual_seed(0)
+    with tempfile.TemporaryDirectory() as folder:
+        dataset, stats = noise(folder, layout, count, 196)
+        texts = [caption.text for i in range(count) for caption in dataset.texts(i)]
+        cache = build_with_encoder(Path(folder, "text"), texts, NoiseText(), progress=False)
+        per_group = {"body": 2, "hand": 1}
+        codes = {k: torch.randint(512, (count * groups * n,), generator=draw) for k, n in per_group.items()}
+        store = TokenStore(codes, np.arange(count + 1) * groups, per_group, np.ones(count, bool))
+        captions = TokenCaptions.of([[(3 * i + k, 0, groups) for k in range(3)] for i in range(count)])
+        latents, alike = torch.zeros(3 * count, 256), torch.zeros(3 * count, NoiseText.dim)
+        pattern, ends = ("body", "body", "hand"), dict.fromkeys(per_group, 512)
+        clips = {"max_frames": 196, "captioned": "body", "columns": columns, "batch_size": BATCH}
+        made = {
+            "tokenizer": WindowBatches(dataset, stats, window=WINDOW, batch_size=BATCH, columns=columns),
+            "TMA": ConditionBatches(dataset, stats, {"text": cache}, **clips),
+            "GPT": TokenBatches(store, captions, latents, alike, pattern, ends, groups, BATCH, 0),
+        }
+        step = itertools.count()
+        taken = cpu_seconds({name: lambda own=own: own[next(step)] for name, own in made.items()}, 20)
+    times = ", ".join(f"{name} {1e3 * seconds:.1f} ms" for name, seconds in taken.items())
+    return row("a training batch of 256 at the paper's size", times)
 
 
 def loader(args: Namespace) -> Record:
@@ -181,11 +233,7 @@ def loader(args: Namespace) -> Record:
 
     layout = MotionLayout.named("h3d263")
     with tempfile.TemporaryDirectory() as folder:
-        facts = DatasetFacts("noise", layout, "CC0", converter="noise", converter_version=1, options={})
-        items = [("train", i) for i in range(2048)]
-        write_dataset(Path(folder), items, NoiseClips(layout), facts, WriteOptions(workers=1))
-        dataset = ShardDataset.open(Path(folder), "train")
-        stats: FeatureStats = compute(dataset)
+        dataset, stats = noise(folder, layout, 2048, WINDOW)
         names = [str(Path(folder) / shard.name) for shard in dataset.manifest.shards]
 
         def ours() -> None:
@@ -252,7 +300,7 @@ def bvh(args: Namespace) -> Record:
     return row(title, f"{motion / taken:.0f} × real time", f"{motion / parsing:.0f} ×, parsing alone")
 
 
-CASES = {case.__name__: case for case in (features, smpl, bvh, audio, loader, streaming)}
+CASES = {case.__name__: case for case in (features, smpl, bvh, audio, loader, batches, streaming)}
 
 
 def main() -> None:

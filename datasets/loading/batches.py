@@ -88,14 +88,11 @@ class WindowBatches(Dataset[MotionBatch]):
         clips, starts, length = self._windows(k)
         per_clip = self.windows_per_clip
         motion = np.empty((len(clips) * per_clip, self.window, self.crops.width), dtype=np.float32)
-        present = self.dataset.present[clips]
         for row, clip in enumerate(clips.tolist()):
-            source = self.dataset.motion(clip)
             for j in range(per_clip):
-                place = motion[row * per_clip + j]
-                self.crops.fill(place, source, int(starts[row, j]), int(length[row]), int(present[row]))
+                self.crops.fill(motion[row * per_clip + j], clip, int(starts[row, j]), int(length[row]))
         return {
             "motion": torch.from_numpy(motion),
             "length": torch.from_numpy(np.repeat(length, per_clip)),
-            "present": torch.from_numpy(self.crops.present[np.repeat(present, per_clip)]),
+            "present": torch.from_numpy(self.crops.present[np.repeat(self.dataset.present[clips], per_clip)]),
         }

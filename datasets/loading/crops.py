@@ -1,9 +1,9 @@
 """Copying pieces of clips into one normalised, zero-padded batch array: the loader's inner loop.
 
 A window is subtracted and scaled while it is in the processor's cache, straight from the mapped tar into its
-place in the batch: no intermediate array, no tensor per sample. When all columns are wanted, a window is one
-run of memory and is treated as one long row (mean and scale repeated per frame), which halves the time of
-broadcasting over rows.
+place in the batch: no intermediate array, no tensor per sample. It is treated as one long row (mean and scale
+repeated per frame), which halves the time of broadcasting over rows. A process that trains on a small data
+set keeps the normalised clips and only copies; loader workers, which are many, read them anew.
 
 Columns of a part that a clip does not hold (hands, face) come out as 0, the mean, whatever the file stores.
 """
@@ -60,6 +60,10 @@ def caption_spans(
     return long or ([max(spans, key=lambda span: span.frames)] if spans else [])
 
 
+KEPT_BYTES = 2**29
+"""Size up to which a data set's normalised columns are kept: 512 whole-body clips of 196 frames are 2**27."""
+
+
 class Cut(NamedTuple):
     """Stretches of clips as one batch."""
 
@@ -96,29 +100,42 @@ class Crops:
         self._scale = 1.0 / stats.std[chosen]
         self._mean_row, self._scale_row = self._mean, self._scale
         self._runs = _runs(chosen)
+        self._keep()
 
-    def fill(
-        self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int, present: int
-    ) -> None:
-        """Normalised frames `start .. start + length` of `clip` into `out` [T >= length, C], then zeros.
+    def _keep(self) -> None:
+        """Keep what is read from here on, where all of it is small enough."""
+        size = 4 * self.width * int(self.dataset.frames.sum())
+        self._kept: dict[int, NDArray[np.float32]] | None = {} if size <= KEPT_BYTES else None
 
-        `present` are the bits of what the clip holds.
-        """
-        target, frames = out[:length], clip[start : start + length]
-        row = target.reshape(-1)  # a view: it is contiguous
-        mean, scale = self._repeated(length)
-        if self.width == clip.shape[1]:
-            np.subtract(frames.reshape(-1), mean, out=row)
+    def __getstate__(self) -> dict[str, object]:
+        return {**vars(self), "_kept": None}
+
+    def fill(self, out: NDArray[np.float32], clip: int, start: int, length: int) -> None:
+        """Normalised frames `start .. start + length` of a clip into `out` [T >= length, C], then zeros."""
+        if self._kept is None:
+            self._read(out[:length], clip, start)
         else:
-            for source, place in self._runs:
-                target[:, place] = frames[:, source]
-            np.subtract(row, mean, out=row)
-        np.multiply(row, scale, out=row)
-        # Whatever the file stores for parts that the clip does not hold, the batch has the mean.
-        for place in self._missing[present]:
-            target[:, place] = 0.0
+            whole = self._kept.get(clip)
+            if whole is None:
+                whole = np.empty((int(self.dataset.frames[clip]), self.width), dtype=np.float32)
+                self._read(whole, clip, 0)
+                self._kept[clip] = whole
+            out[:length] = whole[start : start + length]
         if length < len(out):
             out[length:] = 0.0
+
+    def _read(self, out: NDArray[np.float32], clip: int, start: int) -> None:
+        """Normalised frames of a clip from `start` on, `out` [T, C]."""
+        frames = self.dataset.motion(clip)[start : start + len(out)]
+        for source, place in self._runs:
+            out[:, place] = frames[:, source]
+        row = out.reshape(-1)  # a view: it is contiguous
+        mean, scale = self._repeated(len(out))
+        np.subtract(row, mean, out=row)
+        np.multiply(row, scale, out=row)
+        # Whatever the file stores for parts that the clip does not hold, the batch has the mean.
+        for place in self._missing[self.dataset.present[clip]]:
+            out[:, place] = 0.0
 
     def cut(
         self, clips: NDArray[np.int64], spans: Sequence[CaptionSpan], at: NDArray[np.float64], most: int
@@ -126,11 +143,9 @@ class Crops:
         """The spans of `clips` [B]; one longer than `most` frames is cropped at `at` [B] in [0, 1)."""
         begin, length, closed = places(spans, at, most)
         motion = np.empty((len(clips), padded_length(length), self.width), dtype=np.float32)
-        bits = self.dataset.present[clips]
         for row, clip in enumerate(clips.tolist()):
-            source = self.dataset.motion(clip)
-            self.fill(motion[row], source, int(begin[row]), int(length[row]), int(bits[row]))
-        return Cut(motion, begin, length, closed, self.present[bits])
+            self.fill(motion[row], clip, int(begin[row]), int(length[row]))
+        return Cut(motion, begin, length, closed, self.present[self.dataset.present[clips]])
 
     def _repeated(self, length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Mean and scale of `length` frames as one row; kept for the longest length asked for."""

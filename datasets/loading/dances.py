@@ -36,14 +36,12 @@ class JointCrops(Crops):
         self.width = 3 * danced_joints(dataset.layout)
         self.present = np.ones((4, self.width), dtype=np.bool_)
         self.clips = np.arange(len(dataset))
+        self._keep()
 
-    def fill(
-        self, out: NDArray[np.float32], clip: NDArray[np.float32], start: int, length: int, present: int
-    ) -> None:
-        """Joints of frames `start .. start + length` into `out` [T >= length, 3 N], then zeros."""
-        joints = joints_of_dance(clip[: start + length], self.dataset.layout)[start:]
-        out[:length] = joints.reshape(length, -1)
-        out[length:] = 0.0
+    def _read(self, out: NDArray[np.float32], clip: int, start: int) -> None:
+        """Joints of a clip's frames from `start` on, `out` [T, 3 N]."""
+        joints = joints_of_dance(self.dataset.motion(clip)[: start + len(out)], self.dataset.layout)
+        out[:] = joints[start:].reshape(len(out), -1)
 
 
 class BeatBatch(ConditionBatch):

@@ -229,9 +229,12 @@ class TokenBatches(Dataset[dict[str, Any]]):
         own, chosen, skipped = self.captions, self.captions.starts[items], np.zeros_like(items)
         choices = own.starts[items + 1] - chosen
         if self.training:
-            # Seeded by clip and turn, so that no order of batches and no number of ranks changes a draw.
-            for row, (item, turn) in enumerate(zip(items.tolist(), turns.tolist(), strict=True)):
-                rng = np.random.Generator(np.random.PCG64([self.seed, turn, item]))
+            # Seeded by clip and turn, so that no order of batches and no number of ranks changes a draw: as
+            # `default_rng([seed, turn, item])`, in words of 32 bits, which are read faster.
+            seed = [self.seed >> bit & 0xFFFFFFFF for bit in range(0, max(1, self.seed.bit_length()), 32)]
+            keys = np.column_stack([np.tile(seed, (len(items), 1)), turns, items]).astype(np.uint32)
+            for row, key in enumerate(keys):
+                rng = np.random.Generator(np.random.PCG64(key))
                 chosen[row] += rng.integers(choices[row])
                 more = own.count[chosen[row]] - self.max_groups
                 skipped[row] = rng.integers(more + 1) if more > 0 else 0

@@ -185,7 +185,7 @@ class CrossGptStage(DanceGptStage[CrossGptStageConfig, CrossGptInputs, CrossGpt]
         clips, crops = spread_dances(dataset, config.kept, frames), JointCrops(dataset)
         starts = torch.zeros(len(clips), frames, crops.width)
         for row, clip in enumerate(clips):
-            crops.fill(starts[row].numpy(), dataset.motion(clip), 0, frames, 0)
+            crops.fill(starts[row].numpy(), clip, 0, frames)
         net.kept.copy_(inputs.dance_vq.encode(places(starts))[:, 0])
 
     def batches(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -76,13 +77,15 @@ def test_windows_are_normalised_to_the_byte(
 ) -> None:
     chosen = np.array(columns)
     batches = WindowBatches(train, stats, window=32, batch_size=8, seed=3, columns=chosen)
+    worker = pickle.loads(pickle.dumps(batches))  # which keeps no clips
     for k in range(4):
         clips, starts, lengths = batches._windows(k)
         wanted = np.zeros((8, 32, len(chosen)), dtype=np.float32)
         for row, (clip, start, length) in enumerate(zip(clips, starts[:, 0], lengths, strict=True)):
             part = train.motion(int(clip))[start : start + length, chosen]
             wanted[row, :length] = (part - stats.mean[chosen]) * (1.0 / stats.std[chosen])
-        np.testing.assert_array_equal(batches[k]["motion"].numpy(), wanted)
+        for made in (batches, worker):
+            np.testing.assert_array_equal(made[k]["motion"].numpy(), wanted)
 
 
 @pytest.mark.parametrize("world", [2, 3, 6])

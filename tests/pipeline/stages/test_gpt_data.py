@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import torch.multiprocessing as mp
 
 from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.motion.layout import MotionLayout
@@ -241,9 +242,17 @@ def test_batches_hold_what_one_sequence_after_the_other_gives(
     texts = [[WALKS, SITS, ALL], [SITS], [WALKS, BLINK], [ALL, WALKS], [WALKS]]
     clips, _, net = clips_of(dataset_of(tmp_path, Convert(texts)), config=config)
     for rank in range(2):
-        batches = replace(batches_of(clips, net, most=most), rank=rank, world=2)
+        batches = replace(batches_of(clips, net, most=most), rank=rank, world=2, seed=most**30)
         for k in range(6):
             wanted, batch = sequence_by_sequence(batches, k), batches[k]
             assert batch.keys() == wanted.keys()
             for name, values in wanted.items():
                 assert batch[name].dtype == values.dtype and torch.equal(batch[name], values), (k, name)
+
+
+def test_loader_workers_share_tokens_and_embeddings(tmp_path: Path) -> None:
+    clips, _, net = clips_of(dataset_of(tmp_path, Convert([[ALL], [WALKS]])))
+    batches = batches_of(clips, net)
+    mp.reducer.ForkingPickler.dumps(batches)  # as `spawn` sends them
+    tables = (*batches.store.codes.values(), batches.prior, batches.similarity)
+    assert all(table.is_shared() for table in tables)
