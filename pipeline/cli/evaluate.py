@@ -72,7 +72,7 @@ def _show_table(table: str, runs: list[Path], out: Path | None, *, measuring: ob
 
     if measuring:
         raise UserError(
-            "--clips, --repeats, --at and --device measure anew, and a table shows what was measured; "
+            "--clips, --repeats and --device measure anew (--at too), and a table shows what was measured; "
             "leave them out"
         )
     if table != "list":

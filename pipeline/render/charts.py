@@ -38,15 +38,19 @@ class Line:
 
 
 def log_lines(
-    rows: Sequence[Mapping[str, float]], figure: str, name: str, colour: int | None = None
+    rows: Sequence[Mapping[str, float]],
+    figure: str,
+    name: str,
+    colour: int | None = None,
+    splits: tuple[str, str] = ("train", "val"),
 ) -> list[Line]:
-    """A figure of a training log, the validation's dashed; nothing where it was not logged."""
+    """A figure of a training log, that of the second split dashed; nothing where it was not logged."""
     out = []
-    for split in ("train", "val"):
+    for split in splits:
         points = [(row["step"], row[f"{split}/{figure}"]) for row in rows if f"{split}/{figure}" in row]
         if points:
             steps, values = zip(*points, strict=True)
-            out.append(Line(f"{name} ({split})", steps, values, split == "val", colour))
+            out.append(Line(f"{name} ({split})", steps, values, split == splits[1], colour))
     return out
 
 

@@ -20,10 +20,16 @@ from rich.console import Console
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import CAPTIONER, GENERATOR, CompletedStage, Every, Stage, StageCache
+from motionloom.pipeline.contract.stage import (
+    CAPTIONER,
+    GENERATOR,
+    CompletedStage,
+    Every,
+    Stage,
+    StageCache,
+    StageContext,
+)
 from motionloom.pipeline.launch.console import make_console, say
-from motionloom.pipeline.launch.team import Team
-from motionloom.pipeline.runs.execute import context_of
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import fingerprint_of
@@ -132,10 +138,13 @@ def _write(
     write_text(folder / "recipe.yaml", new.to_yaml(folder))
     for stage in own:
         if not stage.kind.trains and _gives(stage, GENERATOR, CAPTIONER):
-            home = stage_folder(folder, stage.name)
+            home, cache, seed = stage_folder(folder, stage.name), StageCache(), new.seed_of(stage)
             home.mkdir(parents=True)
-            stage.kind.run(context_of(new, folder, stage, home, aside, Team()))
-            _finish(stage, folder, outside, new.seed_of(stage))
+            there = {**outside, **finished_stages(folder)}
+            inputs = {role: there[source] for role, source in stage.inputs.items()}
+            settings = stage.config, home, inputs, seed, new.hardware, aside, cache
+            stage.kind.run(StageContext(stage.name, new.name, *settings))
+            _finish(stage, folder, outside, seed)
     return folder
 
 

@@ -73,7 +73,7 @@ def _open_module(
     net, _ = kind.build(config, inputs, seed)
     module = kind.module(config, net, inputs, seed)
     prepare_module(module, config.train)
-    module.save_hyperparameters(hyper_parameters(kind.name, config, seed, given))
+    module.save_hyperparameters(hyper_parameters(kind.name, config, seed, given, None))
     return module, inputs
 
 

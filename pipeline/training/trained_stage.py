@@ -227,23 +227,15 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
 
 
 def hyper_parameters(
-    kind: str,
-    config: TrainedStageConfig,
-    seed: int,
-    given: Mapping[str, CompletedStage],
-    base: Path | None = None,
+    kind: str, config: TrainedStageConfig, seed: int, given: Mapping[str, CompletedStage], base: Path | None
 ) -> dict[str, object]:
     """Return what rebuilds a stage's module, as plain values; folders of inputs are as seen from `base`."""
     folders = {role: stage.folder.resolve() for role, stage in given.items()}
-    return {
-        "kind": kind,
-        "config": config.dump(),
-        "seed": seed,
-        "inputs": {
-            r: str(place) if base is None else relpath(place, base.resolve()) for r, place in folders.items()
-        },
-        "identities": {role: identity_of(place) for role, place in folders.items()},
+    places = {
+        role: relpath(folder, base.resolve()) if base else str(folder) for role, folder in folders.items()
     }
+    ids = {role: identity_of(stage.folder) for role, stage in given.items()}
+    return {"kind": kind, "config": config.dump(), "seed": seed, "inputs": places, "identities": ids}
 
 
 def _frozen(net: N) -> N:

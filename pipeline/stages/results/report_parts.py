@@ -16,7 +16,7 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import CompletedStage, StageContext, stage_kind
 from motionloom.pipeline.evaluation.cases import Clips
-from motionloom.pipeline.render.charts import Line, curve_label, log_lines
+from motionloom.pipeline.render.charts import curve_label, log_lines
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.store.data import Data
@@ -80,12 +80,7 @@ def _draw_samples(page: Page, stage: CompletedStage) -> None:
     folder = stage.folder / SAMPLES
     rows = read_rows(folder / SAMPLE_FIGURES)
     for name in sorted({key.partition("/")[2] for row in rows for key in row if "/" in key}):
-        lines = []
-        for who in ("drawn", "recorded"):
-            known = [row for row in rows if f"{who}/{name}" in row]
-            steps, values = [row["step"] for row in known], [row[f"{who}/{name}"] for row in known]
-            lines.append(Line(who, steps, values, dashed=who == "recorded"))
-        page.add_plot(lines, f"{stage.name}: {name} of samples")
+        page.add_plot(log_lines(rows, name, "samples", splits=("drawn", "recorded")), f"{stage.name}: {name}")
     motions = []
     for path in sorted(folder.glob(f"step={int(rows[-1]['step']):08d}/*.npz") if rows else ()):
         with NpzFile(path) as stored:
