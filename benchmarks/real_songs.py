@@ -187,7 +187,7 @@ def figures(
 ) -> dict[str, float]:
     """All figures of one dance for each stretch."""
     rng = np.random.default_rng(seed)
-    beats = [motion_beats(resample(dance[:, :BODY_JOINTS], fps, RATE), RATE, "ude") for dance in dances]
+    beats = [motion_beats(resample(dance[:, :BODY_JOINTS], fps, RATE), RATE) for dance in dances]
     out: dict[str, float] = {}
     for name, octave in (("", False), (", any octave", True)):
         own = np.mean([score(part.beats, found, octave) for part, found in zip(parts, beats, strict=True)])

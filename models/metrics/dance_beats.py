@@ -7,7 +7,7 @@ the other, and differ in everything else; `DEFINITIONS` names them:
   the step t -> t + 1 counts for frame t; every local minimum is a beat.
 - `mint` (AI Choreographer) averages over the motion's beats. Speed is the sum over the joints, the step
   t - 1 -> t counts for frame t; a beat is below 10 frames to either side.
-- `ude` and `edge` are `bailando`: UDE's formula and EDGE's paper average over the music's beats.
+- UDE and EDGE measure as `bailando`: their formulas average over the music's beats.
 
 Frames are those of 60 a second; at other rates widths keep their seconds **[ours]**. Music beats come from
 the clip's truth or from a beat tracker, in seconds.
@@ -39,11 +39,8 @@ class BeatDefinition:
     sigma: float = 3.0
 
 
-_BAILANDO = BeatDefinition("music", smoothing=5.0, order=1, late=False)
 DEFINITIONS: dict[str, BeatDefinition] = {
-    "bailando": _BAILANDO,
-    "ude": _BAILANDO,
-    "edge": _BAILANDO,
+    "bailando": BeatDefinition("music", smoothing=5.0, order=1, late=False),
     "mint": BeatDefinition("motion", smoothing=0.0, order=10, late=True),
 }
 

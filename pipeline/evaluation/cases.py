@@ -105,46 +105,21 @@ def write_cases(folder: Path, cases: Sequence[Case], layout: MotionLayout) -> di
     return {"fps": layout.fps, "skeleton": layout.skeleton.name, "cases": described}
 
 
-def read_cases(folder: Path, described: Sequence[Mapping[str, Any]]) -> list[Case]:
-    """The cases that an evaluation kept, by `cases` of its `metrics.json`; none where the file is missing."""
-    path = folder / FILE_NAME
+def shown_cases(folder: Path, details: Mapping[str, Any]) -> list[Clips]:
+    """The motions beside `metrics.json`, as its `details` describe them; none without their file."""
+    path, described = folder / FILE_NAME, details.get("cases", [])
     if not described or not path.is_file():
         return []
+    motions: dict[str, list[ViewerMotion]] = {of: [] for of in _KINDS}
     try:
-        arrays = load_file(path)
-        return [
-            Case(
-                of=str(case["of"]),
-                place=str(case["place"]),
-                id=str(case["id"]),
-                caption=str(case["caption"]),
-                error=float(case["error"]),
-                recorded=arrays[f"{number}.recorded"],
-                made=arrays[f"{number}.made"],
-            )
-            for number, case in enumerate(described)
-        ]
+        arrays, parents = load_file(path), Skeleton.named(details["skeleton"]).parents
+        for number, case in enumerate(described):
+            of = str(case["of"])
+            group = f"{case['place']}: {float(case['error']):.3g} {_KINDS[of][0]}"
+            for label, key in (("recorded", "recorded"), (of, "made")):
+                joints = arrays[f"{number}.{key}"]
+                own, words = parents[: joints.shape[1]], str(case["caption"])
+                motions[of].append(ViewerMotion(joints, details["fps"], own, label, words, group))
     except (SafetensorError, KeyError, OSError) as error:
         raise UserError(f"{path}: does not fit metrics.json beside it ({error}); evaluate again") from None
-
-
-def shown_cases(folder: Path, details: Mapping[str, Any]) -> list[Clips]:
-    """The motions beside `metrics.json`, whose `details` say what they are."""
-    cases, out = read_cases(folder, details.get("cases", [])), []
-    for of, (unit, title, note) in _KINDS.items():
-        motions = [
-            ViewerMotion(
-                joints,
-                details["fps"],
-                Skeleton.named(details["skeleton"]).parents[: joints.shape[1]],
-                name,
-                case.caption,
-                f"{case.place}: {case.error:.3g} {unit}",
-            )
-            for case in cases
-            if case.of == of
-            for name, joints in (("recorded", case.recorded), (of, case.made))
-        ]
-        if motions:
-            out.append(Clips(title, note, motions))
-    return out
+    return [Clips(title, note, motions[of]) for of, (_, title, note) in _KINDS.items() if motions[of]]

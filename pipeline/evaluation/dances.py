@@ -107,6 +107,10 @@ def dance_at(
     if frames < 1:
         return None
     truth = dataset.meta(index).truth
+    if truth is not None and {"bpm", "first_beat"} <= truth.keys():
+        beats = np.asarray(beats_of(dict(truth), sound.seconds), dtype=np.float64)
+    else:
+        beats = track_beats(sound.samples, sound.rate)
     rows = dataset.array(index, "audio.npy")
     clip = DanceClip(
         index,
@@ -116,7 +120,7 @@ def dance_at(
         joints_of(motion[:frames], dataset.layout),
         fps,
         sound,
-        _beats(truth, sound),
+        beats,
         truth,
         None if rows is None or len(rows) != len(motion) else rows,
     )
@@ -219,9 +223,3 @@ def other_songs(clips: Sequence[DanceClip], count: int, seed: int) -> list[list[
         apart = [k for k, other in enumerate(clips) if other.song != clip.song]
         out.append(rng.permutation(apart)[:count].tolist())
     return out
-
-
-def _beats(truth: Mapping[str, Any] | None, sound: Sound) -> NDArray[np.float64]:
-    if truth is not None and {"bpm", "first_beat"} <= truth.keys():
-        return np.asarray(beats_of(dict(truth), sound.seconds), dtype=np.float64)
-    return track_beats(sound.samples, sound.rate)

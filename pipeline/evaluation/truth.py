@@ -89,6 +89,8 @@ def _truth(
 ) -> Truth:
     layout = dataset.layout
     faces = caption_spans(dataset.face_texts(index), layout.fps, int(dataset.frames[index]))
+    # Of several captions of the face, the one that shares most frames with the caption.
+    faces = sorted(faces, key=lambda face: max(face.first, span.first) - min(face.end, span.end))
     body = motion[:, layout.part("bodyhand")]
     present = int(dataset.present[index])
     return Truth(
@@ -97,7 +99,7 @@ def _truth(
         joints=joints_of(body, layout),
         face=face_of(motion, layout) if layout.has("face") and present & FACE else None,
         caption=span.text,
-        face_caption=max(faces, key=lambda face: _overlap(face, span)).text if faces else span.text,
+        face_caption=faces[0].text if faces else span.text,
         truth=truth,
         present=present,
         tokens=span.tokens,
@@ -109,11 +111,6 @@ def _main_caption(dataset: ClipDataset, index: int, frames: int, min_frames: int
     spans = caption_spans(dataset.texts(index), dataset.layout.fps, frames, min_frames)
     whole = [span for span in spans if span.frames == frames]
     return (whole or spans or [CaptionSpan("", 0, frames)])[0]
-
-
-def _overlap(one: CaptionSpan, other: CaptionSpan) -> int:
-    """Frames that both are about."""
-    return min(one.end, other.end) - max(one.first, other.first)
 
 
 def digest_of(truths: Sequence[Truth]) -> str:
@@ -147,14 +144,6 @@ def has_caption(dataset: ClipDataset) -> NDArray[np.bool_]:
     return dataset.has("texts.json")
 
 
-def captioned(dataset: ClipDataset) -> NDArray[np.bool_]:
-    """Clips with a caption, [n]; a `UserError` when there is none."""
-    found = has_caption(dataset)
-    if not found.any():
-        raise UserError(f"{dataset.where}: no clip of split '{dataset.split}' has a caption")
-    return found
-
-
 def spread_any(dataset: ClipDataset, count: int | None) -> list[int]:
     """Numbers of clips spread evenly over a split, at most `count`, captioned or not."""
     order: list[int] = np.random.default_rng(0).permutation(len(dataset)).tolist()
@@ -163,9 +152,11 @@ def spread_any(dataset: ClipDataset, count: int | None) -> list[int]:
 
 def drawn(dataset: ClipDataset, count: int | None) -> list[int]:
     """Numbers of captioned clips drawn at random from a split, at most `count`, as the papers' evaluations
-    draw them: two may have the same caption.
+    draw them: two may have the same caption. `UserError` where there is none.
     """
-    usable = captioned(dataset)
+    usable = has_caption(dataset)
+    if not usable.any():
+        raise UserError(f"{dataset.where}: no clip of split '{dataset.split}' has a caption")
     order = np.random.default_rng(0).permutation(len(dataset))
     out: list[int] = order[usable[order]].tolist()
     return out[:count]

@@ -168,7 +168,11 @@ class MotionModel(
         config = StreamConfig.parse({} if streaming is None else streaming, "streaming")
         segments = segments_of(self.bundle, caption, face=face, sound=sound, seconds=seconds)
         drawn = SamplingConfig.of(sampling)
-        return MotionStream(self.bundle, segments, seed=seed, sampling=drawn, config=config, notice=_warn)
+        # The warning is of the loop that takes the chunks.
+        return MotionStream(
+            self.bundle, segments, seed=seed, sampling=drawn, config=config,
+            notice=lambda note: warnings.warn(str(note), stacklevel=6),
+        )  # fmt: skip
 
     def edit(
         self,
@@ -222,11 +226,6 @@ class MotionModel(
             shutil.copytree(self.folder, save_directory, dirs_exist_ok=True)
         else:
             write_bundle(self.folder, save_directory)
-
-
-def _warn(unknown: Unknown | str) -> None:
-    """Warn of a stream's caption or sound, at the loop that takes the chunks."""
-    warnings.warn(str(unknown), stacklevel=6)
 
 
 def edit_clip(

@@ -175,18 +175,16 @@ class MotionStream(Iterator[MotionChunk]):
         self._left = None if frames is None else frames // unit
         self._number += 1
         self._bounds.append((self._body.groups * unit, segment.prompt))
-        self._look(segment.prompt)
-        self._body.condition(segment.prompt, segment.prompt.text)
-        if self._face is not None:
-            self._face.condition(segment.prompt, segment.prompt.words)
-
-    def _look(self, prompt: Prompt) -> None:
-        """Give notice of words that the model does not know, and of a sound without a beat, each once."""
+        # Each unknown caption and each sound without a beat is told once.
+        prompt = segment.prompt
         for note in () if self._notice is None else self._bundle.notes([prompt], (), self._face_model):
             key = note.caption if isinstance(note, Unknown) else note
             if key not in self._noticed and self._notice is not None:
                 self._noticed.add(key)
                 self._notice(note)
+        self._body.condition(segment.prompt, segment.prompt.text)
+        if self._face is not None:
+            self._face.condition(segment.prompt, segment.prompt.words)
 
     def _check(self, segment: DrivenSegment, number: int) -> int | None:
         require_driven(self._body.generator, [segment.prompt])

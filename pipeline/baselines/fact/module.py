@@ -26,7 +26,9 @@ class FactModule(StageModule):
         features, heard, _ = batch["conditions"]["audio"]
         end = config.clip_frames
         motion = net.columns.read(batch["motion"][:, :end])
-        music = read_music(_length(features, config.music_frames))
+        # Music that ends too early goes on as silence.
+        lacking = max(0, config.music_frames - features.shape[1])
+        music = read_music(functional.pad(features[:, : config.music_frames], (0, 0, 0, lacking)))
         before, after = motion[:, : config.motion_frames], motion[:, config.motion_frames :]
         given = before
         if self.training and config.input_noise:
@@ -39,8 +41,3 @@ class FactModule(StageModule):
             for one in (made, still)
         )
         return {"loss": loss, "still": of_still}
-
-
-def _length(values: Tensor, frames: int) -> Tensor:
-    """Values [B, T, E] as `frames` of them; 0 where there are no more."""
-    return functional.pad(values[:, :frames], (0, 0, 0, max(0, frames - values.shape[1])))

@@ -74,18 +74,14 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
         going = torch.where(word == END, -torch.inf, best)
         scores, kept = going.topk(beam, dim=1)
         # Words only make a sentence less likely, so the search ends once no other can overtake.
-        if all(_finished(found, count, float(left)) for found, left in zip(done, scores[:, 0], strict=True)):
+        pairs = zip(done, scores[:, 0].tolist(), strict=True)
+        if all(len(found) == count and found[-1].log_probability >= left for found, left in pairs):
             break
         origin, word = origin.gather(1, kept), word.gather(1, kept)
         said = torch.cat([said.gather(1, origin[..., None].expand(-1, -1, step)), word[..., None]], dim=2)
         reading = reading.take((rows[:, None] * beam + origin).flatten())
         last = word.flatten()
     return done
-
-
-def _finished(found: list[Hypothesis], count: int, left: float) -> bool:
-    """Whether no unfinished sentence can be among the best: words only make it less likely."""
-    return len(found) == count and found[-1].log_probability >= left
 
 
 _AT_ONCE = 32

@@ -157,7 +157,8 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     # A result that is shorter than the clip takes no notice of what the clip does later.
     own = own[: total - lead]
     features = features[: len(own)]
-    clip_root = _root_path(features, layout, scale)
+    heading, x, z = (one.numpy() for one in torch_way(torch.from_numpy(features).double(), layout))
+    clip_root = RootPath(heading, (z + 1j * x) / scale)
     timed = _TimedTask(task, layout, lead, total)
     # What the clip does not have cannot be kept: fingers and face are made where it has none.
     has = np.array([True] * 4 + [clip.has_hands or not hands] * 2 + [face is not None])
@@ -187,11 +188,14 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     )
 
 
+@dataclass(frozen=True)
 class _TimedTask:
     """The times of a task as frames of the result."""
 
-    def __init__(self, task: EditTask, layout: MotionLayout, lead: int, frames: int) -> None:
-        self.task, self.layout, self.lead, self.frames = task, layout, lead, frames
+    task: EditTask
+    layout: MotionLayout
+    lead: int
+    frames: int
 
     def at(self, what: str, seconds: float) -> int:
         """The frame at a time, which the result must have."""
@@ -288,12 +292,6 @@ def _bone_difference(joints: NDArray[np.float64], skeleton: Skeleton) -> float:
     own = np.linalg.norm(skeleton.with_lengths_of(joints).offsets, axis=-1)[1:BODY_JOINTS]
     usual = np.linalg.norm(skeleton.offsets, axis=-1)[1:BODY_JOINTS]
     return float(np.abs(own - usual).sum() / usual.sum())
-
-
-def _root_path(features: NDArray[np.float32], layout: MotionLayout, scale: float) -> RootPath:
-    """The path of the root in features [T, D], in the clip's size."""
-    heading, x, z = (one.numpy() for one in torch_way(torch.from_numpy(features).double(), layout))
-    return RootPath(heading, (z + 1j * x) / scale)
 
 
 def _known_places(

@@ -122,23 +122,20 @@ class GptGenerator(OfTokens):
         return self.token_frames(streaming)
 
 
+@dataclass(frozen=True)
 class GptFlow:
-    """One motion's tokens, one group at a time.
+    """One motion's tokens, one group at a time."""
 
-    Args:
-        tokens: The network's side.
-        prior: First input of the GPT [1, E] of conditions of one row.
-    """
-
-    def __init__(self, tokens: TokenStream, prior: Callable[[Conditions], Tensor]) -> None:
-        self._tokens, self._prior = tokens, prior
+    tokens: TokenStream
+    prior: Callable[[Conditions], Tensor]
+    """First input of the GPT [1, E] of conditions of one row."""
 
     def condition(self, conditions: Conditions) -> None:
-        self._tokens.condition(self._prior(conditions))
+        self.tokens.condition(self.prior(conditions))
 
     def draw(self, left: int | None) -> Mapping[str, Tensor]:
-        group = self._tokens.draw()
-        return as_codes(group[:, None], self._tokens.gpt.pattern, group.new_ones(1)).codes
+        group = self.tokens.draw()
+        return as_codes(group[:, None], self.tokens.gpt.pattern, group.new_ones(1)).codes
 
 
 def candidate_seeds(seeds: Sequence[int], count: int) -> list[int]:

@@ -20,7 +20,7 @@ from motionloom.pipeline.evaluation.figures import (
     rows_of,
     say_difference,
 )
-from motionloom.pipeline.store.run_state import RunState, StageState, run_state
+from motionloom.pipeline.store.run_state import RunState, run_state
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.store.yaml import flatten
 
@@ -120,15 +120,12 @@ def setting_differences(runs: Sequence[ComparedRun]) -> list[StageDifferences]:
     for name in stage_names(runs):
         stages = [run.state.stage(name) for run in runs]
         missing = tuple(run.label for run, stage in zip(runs, stages, strict=True) if stage is None)
-        settings = [_settings(stage) for stage in stages]
+        settings = [
+            None if s is None else {"kind": s.kind, **flatten({"inputs": s.inputs}), **flatten(s.settings)}
+            for s in stages
+        ]
         out.append(StageDifferences(name, missing, _differences(settings)))
     return [stage for stage in out if stage.missing or stage.differences]
-
-
-def _settings(stage: StageState | None) -> Mapping[str, object] | None:
-    if stage is None:
-        return None
-    return {"kind": stage.kind, **flatten({"inputs": stage.inputs}), **flatten(stage.settings)}
 
 
 def _differences(each: Sequence[Mapping[str, object] | None]) -> dict[str, tuple[object, ...]]:

@@ -44,17 +44,11 @@ def evaluations_of(run: Path, measures: Iterable[Measure]) -> list[Evaluation]:
     if "retrieval" in wanted:
         evaluations += [_retrieval(path, run, stages) for path in sorted(run.glob("retrieval*.json"))]
     if not evaluations:
-        raise UserError(
-            f"{run}: no finished evaluation that this table takes figures of; {_fix(run, wanted)}"
-        )
+        fix = f"finish a stage of kind {' or '.join(wanted)}: motionloom run {run / 'recipe.yaml'} -o {run}"
+        if "retrieval" in wanted:
+            fix = f"make one: motionloom retrieval {run}"
+        raise UserError(f"{run}: no finished evaluation that this table takes figures of; {fix}")
     return evaluations
-
-
-def _fix(run: Path, wanted: Iterable[Measure]) -> str:
-    if "retrieval" in wanted:
-        return f"make one: motionloom retrieval {run}"
-    kinds = " or ".join(wanted)
-    return f"finish a stage of kind {kinds}: motionloom run {run / 'recipe.yaml'} -o {run}"
 
 
 def _staged(run: Path, stage: StageRecord) -> Evaluation:

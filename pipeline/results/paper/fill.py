@@ -61,24 +61,24 @@ class _Filling:
         self.compared = set(self.used)
         rows: list[FilledRow] = []
         for row, ours in zip(self.table.rows, models, strict=True):
-            rows += [self._paper(row), *ours]
+            printed = iter(row.printed())
+            cells = tuple(next(printed) if column.printed else None for column in self.table.columns)
+            rows += [FilledRow("paper", row.method, row.method, cells), *ours]
             if row.recorded:
                 rows += self._references({}, (RECORDED,))
             if row.values:
                 rows += self._references(row.values, _BASELINES)
         if not any(row.values for row in self.table.rows):
             rows += self._references({}, _BASELINES)
-        unlike = [
-            difference
+        unlike = {
+            f"{self.labels[run]} {name}": found
             for (run, name), evaluation in self.used.items()
-            for difference in differences(
-                evaluation, self.labels[run], self.table, self.shown.get((run, name), [])
-            )
-        ]
+            if (found := differences(evaluation, self.table, self.shown.get((run, name), [])))
+        }
         marked = mark_best(rows, self.table.columns)
         remarks = [*self._unlike(), *(f"{', '.join(of)}: {note}" for note, of in self.remarks.items())]
         notes = notes_of(self.table, marked, list(self.settings), remarks, with_runs=bool(self.evaluations))
-        return FilledTable(self.name, self.table, marked, tuple(unlike), notes)
+        return FilledTable(self.name, self.table, marked, unlike, notes)
 
     def _unlike(self) -> list[str]:
         """Sentences on figures of one column that were measured differently from each other."""
@@ -97,11 +97,6 @@ class _Filling:
         place = sum(one.printed for one in self.table.columns[:at])
         cells = [row.printed()[place] for row in self.table.rows]
         return max((cell.decimals for cell in cells if cell is not None), default=3)
-
-    def _paper(self, row: Row) -> FilledRow:
-        printed = iter(row.printed())
-        cells = tuple(next(printed) if column.printed else None for column in self.table.columns)
-        return FilledRow("paper", row.method, row.method, cells)
 
     def _models(self, row: Row) -> list[FilledRow]:
         """Our rows of one of the paper's; one that says so where there are none."""

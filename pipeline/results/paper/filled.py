@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import PurePosixPath
 from typing import Literal, TypeVar
 
@@ -54,16 +54,9 @@ class FilledRow:
         return replace(self, cells=tuple(cells))
 
 
-@dataclass(frozen=True)
-class Difference:
-    """One thing that was measured otherwise than in the paper."""
-
-    run: str
-    evaluation: str
-    what: str
-    ours: str
-    paper: str | None
-    """None where the paper does not say."""
+Difference = tuple[str, str, str | None]
+"""One thing that was measured otherwise than in the paper, our value, and the paper's: None where it does not
+say."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +66,8 @@ class FilledTable:
     name: str
     table: PaperTable
     rows: tuple[FilledRow, ...]
-    differences: tuple[Difference, ...] = ()
+    differences: Mapping[str, Sequence[Difference]] = field(default_factory=dict)
+    """By run and evaluation."""
     notes: tuple[str, ...] = ()
 
     @property
@@ -90,14 +84,14 @@ class FilledTable:
         if alone := [_heading(column, arrow=False) for column in self.table.columns if not column.printed]:
             yield f"{', '.join(alone)}: not in the paper, a figure of ours alone."
         protocol = self.table.measured.dump().values()
-        lines: dict[tuple[str, str], list[str]] = {}
-        for one in self.differences:
-            theirs = "the paper does not say" if one.paper is None else f"paper: {one.paper}"
-            if one.paper is not None and len(one.paper) > _LONG and one.paper in protocol:
-                theirs = "paper: see above"
-            lines.setdefault((one.run, one.evaluation), []).append(f"{one.what} {one.ours} ({theirs})")
-        for (run, evaluation), parts in lines.items():
-            yield f"{run} {evaluation}: {'; '.join(parts)}"
+        for evaluation, differences in self.differences.items():
+            parts = []
+            for what, ours, paper in differences:
+                theirs = "the paper does not say" if paper is None else f"paper: {paper}"
+                if paper is not None and len(paper) > _LONG and paper in protocol:
+                    theirs = "paper: see above"
+                parts.append(f"{what} {ours} ({theirs})")
+            yield f"{evaluation}: {'; '.join(parts)}"
 
     def markdown(self) -> str:
         """A pipe table, the best figures bold, and what is to be known as a list below."""
@@ -242,7 +236,7 @@ _LENGTHS = {"free": "as the generator ends them", "recorded": "the recorded ones
 
 
 def differences(
-    evaluation: Evaluation, run: str, table: PaperTable, used: Sequence[tuple[Column, Figure]]
+    evaluation: Evaluation, table: PaperTable, used: Sequence[tuple[Column, Figure]]
 ) -> list[Difference]:
     """Differences of the shown figures from the paper's protocol, and facts that it does not state."""
     paper = table.measured
@@ -251,7 +245,7 @@ def differences(
     def add(what: str, ours: object, theirs: object) -> None:
         if ours is not None and ours != theirs:
             stated = None if theirs is None else str(theirs)
-            out.setdefault((what, str(ours)), Difference(run, evaluation.name, what, str(ours), stated))
+            out.setdefault((what, str(ours)), (what, str(ours), stated))
 
     data = data_of(evaluation.data)
     if not any(is_named(name.split(" for ")[0], data) for name in paper.data.split(", ")):
@@ -262,7 +256,9 @@ def differences(
         add("clips", facts.get("clips"), paper.clips)
         add("songs", facts.get("songs"), None)
         if "judge" in facts and evaluation.measure == "evaluate":
-            stage = _judge(evaluation, figure)
+            judges = evaluation.file.about.get("judges", {})
+            # The judge's role is a part of the figure's name.
+            stage = next((judges[part]["stage"] for part in figure.name.split(".") if part in judges), None)
             add("judged by", stage and f"stage {stage} of its own run", paper.evaluator)
         add("lengths", _LENGTHS.get(str(facts.get("lengths"))), None)
         if column.candidates is not None:
@@ -271,12 +267,6 @@ def differences(
         add("repeats", _repeats(figure), paper.repeats)
         add("sampling", _sampling(figure), paper.sampling)
     return list(out.values())
-
-
-def _judge(evaluation: Evaluation, figure: Figure) -> str | None:
-    """The stage that a figure is judged by: its role is a part of the figure's name."""
-    judges = evaluation.file.about.get("judges", {})
-    return next((str(judges[part]["stage"]) for part in figure.name.split(".") if part in judges), None)
 
 
 def _repeats(figure: Figure) -> str | None:

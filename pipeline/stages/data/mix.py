@@ -77,7 +77,15 @@ class MixStage(StageKind[MixStageConfig]):
         if not context.config.allow_leaks:
             _refuse_leaks({stage.name: context.stage_cache.get(stage) for stage in sources})
         weights = context.config.weights
-        parts = [_part(context, stage, weights.get(stage.name, 1.0)) for stage in sources]
+        # A stage of another run is named by the way to it, so that runs can be moved together.
+        parts = [
+            MixedStage(
+                stage=stage.folder.name,
+                folder=place_from(context.folder, stage.folder) if stage.outside else None,
+                weight=weights.get(stage.name, 1.0),
+            )
+            for stage in sources
+        ]
         write_json(context.folder / MIX, Mix(parts=parts).model_dump(mode="json", exclude_none=True))
         total = sum(part.weight for part in parts)
         for stage, part in zip(sources, parts, strict=True):
@@ -92,12 +100,6 @@ class MixStage(StageKind[MixStageConfig]):
 
     def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> Data:
         return Data(stage.folder)
-
-
-def _part(context: StageContext, stage: CompletedStage, weight: float) -> MixedStage:
-    """A stage of the mix; one of another run by the way to it, so that runs can be moved together."""
-    folder = place_from(context.folder, stage.folder) if stage.outside else None
-    return MixedStage(stage=stage.folder.name, folder=folder, weight=weight)
 
 
 def _refuse_leaks(sources: Mapping[str, Data]) -> None:

@@ -100,17 +100,14 @@ class _Evaluation(EvaluationUnits):
         if self.performs:
             made = list(context.units.read("generated", len(self.performances)))
             figures += self.by_judges(made) + self.clip_by_clip(made) + self.movement(made)
-        about = self.about(self.bundle) | {"judges": self._judged_by()}
+        stages = {role: context.inputs[role] for role in self.judges}
+        judges = {
+            role: {"stage": stage.name, "kind": stage.kind.name, "sha256": self._weights(role)}
+            for role, stage in stages.items()
+        }
+        about = self.about(self.bundle) | {"judges": judges}
         details = write_cases(context.folder, self.cases, self.dataset.layout)
         return FigureFile("evaluate", tuple(figures), about, details)
-
-    def _judged_by(self) -> dict[str, dict[str, Any]]:
-        """Stage, kind and checksum of each judge."""
-        out = {}
-        for role in self.judges:
-            stage = self.context.inputs[role]
-            out[role] = {"stage": stage.name, "kind": stage.kind.name, "sha256": self._weights(role)}
-        return out
 
     def _weights(self, role: str) -> str:
         return sha256_of(self.context.input(role) / "model.safetensors")
@@ -157,15 +154,12 @@ class _Evaluation(EvaluationUnits):
                     repeats=self.config.repeats,
                     seed=self.context.seed,
                 )
+        tokenizer = self.tokenizer
         self.cases += extreme_cases(
-            "reconstruction", self.shown, [row["mpjpe"] for row in rows], self._reconstructed
-        )
+            "reconstruction", self.shown, [row["mpjpe"] for row in rows],
+            lambda k: joints_of(reconstruct_truth(tokenizer, self.shown[k]), tokenizer.layout),
+        )  # fmt: skip
         return out
-
-    def _reconstructed(self, number: int) -> NDArray[np.float64]:
-        """Joints [T, N, 3] of a clip through the tokenizer."""
-        assert self.tokenizer is not None
-        return joints_of(reconstruct_truth(self.tokenizer, self.shown[number]), self.tokenizer.layout)
 
     def by_judges(self, made: Sequence[Arrays]) -> list[Figure]:
         """Figures by the latents of each judge."""

@@ -139,8 +139,9 @@ class Evaluation:
         slices = even_slices(len(motions), _REFERENCE)
 
         def features(number: int) -> Arrays:
-            some = (_joints(dataset, index) for dataset, index in motions[slices[number]])
-            return dict(all_features(some, self.dataset.layout.fps, feature_fps))
+            layout, some = self.dataset.layout, motions[slices[number]]
+            bodies = (np.asarray(data.motion(k))[:, layout.part("bodyhand")] for data, k in some)
+            return dict(all_features((joints_of(x, layout) for x in bodies), layout.fps, feature_fps))
 
         self.make("reference", "features of all motions", [s.stop - s.start for s in slices], features)
 
@@ -156,11 +157,6 @@ class Evaluation:
             for dataset in (self.train, self.dataset)
             for index in np.flatnonzero(dataset.has(member)).tolist()
         ]
-
-
-def _joints(dataset: ClipDataset, index: int) -> Any:
-    layout = dataset.layout
-    return joints_of(np.asarray(dataset.motion(index))[:, layout.part("bodyhand")], layout)
 
 
 def bundle_driven_by(

@@ -80,7 +80,6 @@ def test_beats_and_alignment_are_the_published_ones(golden: dict[str, np.ndarray
     assert np.isclose(beat_align(joints, other, 60.0), golden["bas_bailando_mintbeats"], rtol=1e-5)
     assert np.isclose(beat_align(joints, other, 60.0, "mint"), golden["bas_mint"], rtol=1e-5)
     assert np.isclose(beat_align(joints, own, 60.0, "mint"), golden["bas_mint_bailandobeats"], rtol=1e-5)
-    assert beat_align(joints, own, 60.0, "ude") == beat_align(joints, own, 60.0, "bailando")
 
 
 @pytest.mark.parametrize("fps", [20.0, 30.0, 60.0])

@@ -12,7 +12,7 @@ import torch
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_sample
-from motionloom.pipeline.evaluation.cases import extreme_cases, extremes, read_cases, shown_cases, write_cases
+from motionloom.pipeline.evaluation.cases import extreme_cases, extremes, shown_cases, write_cases
 from motionloom.pipeline.evaluation.latent_metrics import caption_distances
 from motionloom.pipeline.evaluation.truth import Truth, digest_of
 
@@ -60,19 +60,18 @@ def test_cases_come_back_and_are_drawn(truths: list[Truth], tmp_path: Path) -> N
         for case in extreme_cases(of, truths, found, lambda k: truths[k].joints + 0.01)
     ]
     details = write_cases(tmp_path, cases, LAYOUT)
-    again = read_cases(tmp_path, details["cases"])
-    assert [(c.of, c.place, c.id, c.error) for c in again] == [
+    assert [(c["of"], c["place"], c["id"], c["error"]) for c in details["cases"]] == [
         ("reconstruction", "worst 1", "clip1", 9.0),
         ("reconstruction", "best 1", "clip0", 1.235),
         ("generated", "worst 1", "clip0", 0.5),
         ("generated", "best 1", "clip1", 0.25),
     ]
-    np.testing.assert_allclose(again[1].made, cases[1].made, atol=1e-6)
     kept, made = shown_cases(tmp_path, details)
     assert [m.label for m in made.motions[:2]] == ["recorded", "generated"]
+    np.testing.assert_allclose(kept.motions[3].joints, cases[1].made, atol=1e-6)
     assert [m.group for m in kept.motions[::2]] == ["worst 1: 9 mm", "best 1: 1.24 mm"]
     assert len(kept.motions[0].parents) == LAYOUT.num_joints
     with pytest.raises(UserError, match=r"cases\.safetensors.*metrics\.json"):
-        read_cases(tmp_path, [*details["cases"], *details["cases"]])
+        shown_cases(tmp_path, details | {"cases": [*details["cases"], *details["cases"]]})
     assert write_cases(tmp_path, [], LAYOUT) == {} and list(tmp_path.iterdir()) == []
-    assert read_cases(tmp_path, details["cases"]) == [] == shown_cases(tmp_path, {})
+    assert shown_cases(tmp_path, details) == [] == shown_cases(tmp_path, {})

@@ -126,7 +126,7 @@ def test_figures_tell_the_truth_from_trivial_answers(data: Splits, clips: list[D
     frozen = values(zip(still, clips, strict=True))
     late = [np.concatenate([np.tile(j[:1], (4, 1, 1)), j[:-4]]) for j in real]  # a fifth of a second
     delayed = values(zip(late, clips, strict=True))
-    for name in ("beat_align.bailando", "beat_align.mint", "beat_align.ude", "beat_align.edge"):
+    for name in ("beat_align.bailando", "beat_align.mint"):
         assert true[name] > 0.7 > 0.5 > crossed[name] > frozen[name] == 0.0
         assert delayed[name] < 0.4
     for name in ("genre", "style", "tempo"):

@@ -23,7 +23,7 @@ from motionloom.models.gpt.tokens import as_codes, stream_names
 from motionloom.models.tokenizer.base import Tokenizer, TokenizerConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.single import VqConfig
-from motionloom.pipeline.evaluation.truth import captioned, spread, truth_of
+from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
 from motionloom.pipeline.stages.networks.tokens import encode_split
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore, gpt_clips
 
@@ -160,7 +160,7 @@ def test_truth_is_what_the_caption_is_about(tmp_path: Path) -> None:
         )
         assert truth.face is not None and len(truth.face) == len(truth.joints) == end - first
     assert [t.truth is None for t in truths] == [True, False, False, True], "of whole clips alone"
-    assert captioned(dataset)[where].tolist() == [True, True, False, True]
+    assert has_caption(dataset)[where].tolist() == [True, True, False, True]
     assert set(spread(dataset, 10)) == set(where) - {where[2]}
 
 

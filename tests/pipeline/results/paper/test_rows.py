@@ -90,7 +90,7 @@ def test_answers_are_of_runs_that_have_a_row_and_equal_ones_stand_once(
     table = filled("humantomato/7", without, baselines("a"), baselines("b"))
     references = [row.label for row in table.rows if row.source == "reference"]
     assert len(references) == 2 and all(label.endswith(" (a evaluate)") for label in references)
-    assert {one.run for one in table.differences} == {"a", "b"}
+    assert {label.split(" ")[0] for label in table.differences} == {"a", "b"}
     assert not any("without" in note for note in table.notes)
 
 
@@ -109,7 +109,7 @@ def test_generated_motion_beside_recorded_and_chance(baselines: Make) -> None:
     missing = [(row.method, row.label) for row in table.rows if row.source == "missing"]
     assert ("MLD", "missing in these runs") in missing and ("T2M-GPT", "missing in these runs") in missing
     # What was measured otherwise than in the paper.
-    told = {o.what: (o.ours, o.paper) for o in table.differences if o.evaluation == "evaluate_gpt"}
+    told = {what: (ours, paper) for what, ours, paper in table.differences["bl evaluate_gpt"]}
     assert told["data"] == ("synthetic clips (64)", "Motion-X") and told["clips"] == ("40", None)
     assert told["candidates of TMA-R-Precision (256)"] == ("32", "256") and told["repeats"] == ("2", "5")
     assert told["judged by"][0].startswith("stage tma ") and "split" not in told
@@ -128,7 +128,8 @@ def test_only_what_was_measured_alike_is_ranked(baselines: Make, records: Module
         assert best(table) == {}, "listed and not ranked"
         (fact,) = changed
         assert any(note.startswith("Not all measured alike") and fact in note for note in table.notes)
-        said = [one.ours for one in table.differences if one.what == "sampling"]
+        unlike = (one for found in table.differences.values() for one in found)
+        said = [ours for what, ours, _ in unlike if what == "sampling"]
         assert ("temperature 0.0" in said) == ("sampling.temperature" in changed)
 
 
@@ -178,7 +179,8 @@ def test_columns_of_the_data_that_a_run_has(
     (cells,) = ours(table).values()
     assert [at for at, text in enumerate(cells) if text] == columns
     named = kind != "synth"
-    assert [one.what for one in table.differences] == (["clips"] if named else ["data", "clips"])
+    (unlike,) = table.differences.values()
+    assert [what for what, _, _ in unlike] == (["clips"] if named else ["data", "clips"])
     # Errors of bodies without hands are the body's, whatever the file calls them.
     if not hands:
         assert cells[6] == "60.00"

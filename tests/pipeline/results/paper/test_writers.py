@@ -12,7 +12,7 @@ from rich.console import Console
 
 from motionloom.pipeline.results.paper.compare import paper_table, shipped_tables
 from motionloom.pipeline.results.paper.fill import fill
-from motionloom.pipeline.results.paper.filled import Difference, FilledRow, FilledTable
+from motionloom.pipeline.results.paper.filled import FilledRow, FilledTable
 from motionloom.pipeline.results.paper.schema import PaperTable, Printed
 
 PAPER = PaperTable.parse(
@@ -44,7 +44,7 @@ TABLE = FilledTable(
         FilledRow("ours", "m_1", "[red]r a|b", (number("2.0", True), number("0.1"), None)),
         FilledRow("reference", "", "chance", (None, number("0.5"), None)),
     ),
-    differences=(Difference("r", "e", "data", "S", "D"), Difference("r", "e", "clips", "3", None)),
+    differences={"r e": [("data", "S", "D"), ("clips", "3", None)]},
     notes=("A note [n].",),
 )
 
