@@ -1,206 +1,300 @@
-"""The paper's sizes on a GPU: speed, share of its peak, memory against the estimate, sampling.
+"""One GPU in ten minutes: speed, share of the peak, memory, sampling, equal bytes, all stages of two recipes.
 
     python benchmarks/gpu.py WORK
-    python benchmarks/gpu.py WORK --size tiny --device cpu --steps 20
+    python benchmarks/gpu.py WORK --size tiny --device cpu --minutes 3
 
-About ten minutes on one GPU. It runs one recipe in WORK: synthetic whole-body clips of full length, then
-H2VQ, TMA and the Hierarchical-GPT at the sizes of `humantomato-paper`, each some hundred steps in several
-arithmetics, with the text prior and the alignment loss that training has. Told, and recorded by `--record`:
+All in one process, without network but for a text encoder that is not here. Each row is written to
+WORK/rows.jsonl as it is measured, so a killed run keeps its rows and the same command goes on behind them. A
+row is begun only if the last one of its table would fit into what is left of `--minutes`; what did not fit is
+named at the end. In this order:
 
-- samples a second and the time of a step: medians of the training's own log (`flight/`), its first third left
-  out;
-- the share of the device's peak (MFU): matrix operations of forward and backward pass, counted on a real
-  batch (three times those of the forward pass; the optimizer and all that is elementwise count nothing), over
-  the time of a step and the device's dense peak (`--peak-tflops` for devices not in the table);
-- the share of time in which kernels ran, from a profile of a few steps;
-- what the training waited for; its peak of memory, and what `--dry-run` said it would be;
-- whole-body motions of 196 frames a minute, for several batches.
-
-Where WORK has finished stages it goes on behind them, so a second call only prints.
+- `steps`: a training step without its loader, on a batch as large as training may see: wall time between
+  synchronised points, TFLOP/s and share of the data sheet's peak, peak of memory and what `--dry-run` says;
+- `trainings`: the same stages as a run trains them, by their own telemetry, the first third left out;
+- `sampling`: whole-body motions of 196 frames, the second of two calls;
+- `bytes`: each training once more: are the weights the same;
+- `stages`: every stage of `baselines-tiny` and `baselines-tiny-ude`, 20 steps each;
+- `compiled`: the steps again, compiled as `train.compile: true` does, and as CUDA graphs.
 """
 
 from __future__ import annotations
 
-import gzip
+import copy
 import json
 import statistics
-import subprocess
-import sys
 import time
-from collections.abc import Iterator, Mapping
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
-import yaml
-from bench import Column, Record, arguments, command_line, report
-from torch._subclasses.fake_tensor import FakeTensorMode
-from torch.utils.flop_counter import FlopCounterMode
+from bench import Column, arguments, command_line, report
+from rich.console import Console
 
-from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.datasets.base.files import sha256_of
+from motionloom.models.training.alternating import AlternatingModule
+from motionloom.models.training.stage_module import Batch, StageModule
+from motionloom.pipeline.contract.lookup import previews
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import CompletedStage, StageCache
+from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.runs.dry_run import estimate
-from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.plan import Selection
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.training_log import read_flight
-
-PEAKS = {
-    "H100 PCIe": (756, 51),
-    "H100": (989, 67),
-    "H200": (989, 67),
-    "A100": (312, 19.5),
-    "L40S": (362, 91.6),
-    "L4": (121, 30.3),
-    "RTX 4090": (165, 82.6),
-    "RTX 3090": (71, 35.6),
-}
-"""Dense TFLOP/s by the makers' data sheets: half precision with float32 sums, and float32 without TF32."""
+from motionloom.pipeline.store.yaml import dump_yaml
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.execution import Execution, launch
+from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed", "fp16": "16-mixed"}
-TRAINED = {"tokenizer": "h2vq", "tma": "tma", "gpt": "gpt"}
+STEPPED = {"humantomato": ("tokenizer", "tma", "gpt", "mdm"), "ude": ("utt", "dmd")}
+TRAINED = ("tokenizer", "tma", "gpt")
 FRAMES = 196
+SHORT = {"repeats": 2, "clips": 32, "size": 32, "decodings": 1, "truth_clips": 8, "movement_steps": 5}
+"""What makes evaluations short."""
+FIRST = {"compiled": 60.0}
+"""Seconds that the first row of a table may take, where that is long."""
+Cells = dict[str, str]
 
 
-def recipe(size: str, steps: int, device: str, profile: int) -> dict[str, Any]:
-    """Synthetic clips and every variant of the three trainings, each a stage."""
-    stages: dict[str, Any] = {
-        "data": {
-            "kind": "synth", "clips": 512 if size == "paper" else 48, "fps": 30 if size == "paper" else 20,
-            "min_seconds": 6.5, "max_seconds": 7.0,
-        },
-        "generate": None, "evaluate": None, "report": None, "face_tokenizer": None, "face_tokens": None,
-        "face_gpt": None,
-    }  # fmt: skip
-    train = {"steps": steps, "checkpoint_every": steps, "validate_every": 0}
-    if size == "tiny":
-        train["batch_size"] = 8
-    base = load_recipe(f"humantomato-{size}")
-    for name, kind in TRAINED.items():
-        settings = base.stage(name).config.dump()
-        if name == "gpt":  # L_align is part of every step that is measured
-            settings["loss"]["align_from"] = 0
-        stages[name] = {"train": train | {"precision": "bf16-mixed", "compile": False}}
-        stages[name] |= {"loss": settings["loss"]} if name == "gpt" else {}
-        others = [(short, PRECISIONS[short], False) for short in ("fp32", "fp16")]
-        for short, precision, compiled in [*others, ("bf16-compiled", "bf16-mixed", True)]:
-            own = settings["train"] | train | {"precision": precision, "compile": compiled}
-            stages[f"{name}-{short}"] = settings | {"kind": kind, "train": own}
-    if device == "cpu":  # half precision on a CPU has no scaler
-        stages = {name: stage for name, stage in stages.items() if "fp16" not in name}
-    hardware: dict[str, Any] = {"accelerator": device if device != "cuda" else "gpu", "profile": profile}
-    if device == "cpu":
-        hardware["stall_seconds"] = 0  # a busy CPU may compile for longer than a step may take
-    return {"name": "gpu", "extends": f"humantomato-{size}", "hardware": hardware, "stages": stages}
+class Rows:
+    """Rows in a file, each written as it is measured, while there is time."""
+
+    def __init__(self, path: Path, minutes: float) -> None:
+        self.path, self.end = path, time.monotonic() + 60 * minutes
+        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+        self.rows: list[dict[str, Any]] = [json.loads(line) for line in lines]
+        self.left_out: list[str] = []
+
+    def measure(self, table: str, title: str, cells: Callable[[], Cells]) -> None:
+        """Add a row unless it is there, or would not be done in time; an error is a row too."""
+        of_table = [row for row in self.rows if row["table"] == table]
+        if any(row["title"] == title for row in of_table):
+            return
+        begin = time.monotonic()
+        if begin + (of_table[-1]["seconds"] if of_table else FIRST.get(table, 0.0)) > self.end:
+            self.left_out.append(f"{table}: {title}")
+            return
+        try:
+            found = cells()
+        except Exception as error:  # the next rows may work
+            found = {"error": f"{type(error).__name__}: {str(error)[:300]}"}
+        row = {"table": table, "title": title, "cells": found, "seconds": time.monotonic() - begin}
+        self.rows.append(row)
+        line = json.dumps(row)
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+        print(line, flush=True)  # a pipe keeps back what is not flushed, and a kill loses that
 
 
-def flops(stage: CompletedStage) -> int:
-    """FLOPs of a step: forward and backward pass over the first batch that it trained on."""
-    stage_cache, kind, config = StageCache(), stage.kind, stage.config
-    dry: Any = kind
-    given = dry.inputs.of(stage_cache.given(stage.inputs))
-    facts = dry.facts(config, given)
-    net = dry.network(facts, given)
-    batch = dry.batches(config, net, given, 0, lambda _: None).train(config.train.local_batch(1), 0, 1)[0]
-    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
-        fake = {k: mode.from_tensor(v) if isinstance(v, torch.Tensor) else v for k, v in batch.items()}
-        module = dry.dry_module(config, dry.network(facts, given), given)
-        module.train()
-        with FlopCounterMode(display=False) as counter:
-            module.losses(fake)
-    return 3 * counter.get_total_flops()
+class Step(NamedTuple):
+    """A stage's module and batch for single steps."""
+
+    stage: Stage
+    module: StageModule
+    batch: Batch
+    flops: int
+    estimated: int
+    """Bytes, as a dry run says."""
 
 
-def kernel_share(folder: Path) -> float | None:
-    """Share of the profiled time in which at least one kernel ran; None without a GPU's profile."""
-    path = folder / "flight" / "profile_rank_0.json.gz"
-    if not path.is_file():
-        return None
-    events = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
-    spans = sorted((e["ts"], e["ts"] + e["dur"]) for e in events if e.get("cat") in ("kernel", "gpu_memcpy"))
-    if not spans:
-        return None
-    busy, end = 0.0, spans[0][0]
-    for first, last in spans:
-        busy += max(0.0, last - max(first, end))
-        end = max(end, last)
-    return busy / (end - spans[0][0])
+class Benchmark:
+    """What is measured, at one size on one device."""
 
+    def __init__(self, args: Namespace) -> None:
+        self.args, self.device = args, choose_device(args.device)
+        self.console = Console(file=(args.work / "log.txt").open("a", encoding="utf-8"), width=120)
+        self.run = args.work / "run"
+        accelerator = "cpu" if args.device == "cpu" else "gpu"
+        self.hardware = [f"hardware.accelerator={accelerator}", "hardware.devices=1"]
+        if args.device == "cpu":
+            self.hardware += ["hardware.threads=1", "hardware.stall_seconds=0"]
 
-def peak(device: torch.device, precision: str, given: float | None) -> float | None:
-    """TFLOP/s of the device in an arithmetic."""
-    if given is not None:
-        return given
-    if device.type != "cuda":
-        return None
-    name = torch.cuda.get_device_name(device)
-    found = next((pair for known, pair in PEAKS.items() if known in name), None)
-    return None if found is None else found[1 if precision == "32-true" else 0]
+    def recipe(self, family: str) -> Path:
+        """A recipe of the size on synthetic clips of full length."""
+        paper = self.args.size == "paper"
+        data: dict[str, Any] = {"kind": "synth", "clips": 512 if paper else 48, "fps": 30 if paper else 20}
+        data |= {"min_seconds": 6.5, "max_seconds": 7.0}
+        stages: dict[str, Any] = {"data": data}
+        base = f"baselines-{self.args.size}"
+        if family == "ude":
+            base = f"ude-{self.args.size}"
+            data["dances"] = {"songs": 4}
+            if paper:  # the hub's CLIP may be out of reach
+                encoder = load_recipe("humantomato-tiny").stage("text").config.dump()["encoder"]
+                stages |= {"captioned": None, "dances": None, "text": {"encoder": encoder}}
+        else:
+            train = {"steps": self.args.steps, "checkpoint_every": self.args.steps, "validate_every": 0}
+            train |= {"precision": "bf16-mixed", "compile": False} | ({} if paper else {"batch_size": 8})
+            stages |= {name: {"train": train} for name in TRAINED}
+            stages["gpt"]["loss"] = {"align_from": 0}  # a part of every step that is measured
+        path = Path(self.args.work / f"{family}.yaml")
+        path.write_text(dump_yaml({"name": family, "extends": base, "stages": stages}))
+        return path
 
+    @cached_property
+    def recipes(self) -> dict[str, Recipe]:
+        return {family: load_recipe(self.recipe(family), self.hardware) for family in STEPPED}
 
-def trainings(
-    run: Path, stages: Mapping[str, CompletedStage], device: torch.device, tflops: float | None
-) -> Iterator[Record]:
-    """Rows of the table of trainings."""
-    cards = estimate(load_recipe(run / "recipe.yaml", strict=False))
-    for name, stage in stages.items():
-        if name.split("-")[0] not in TRAINED:
-            continue
-        rows = read_flight(stage.folder)[0]
-        rows = rows[len(rows) // 3 :]
-        middle = {
-            key: statistics.median(row[key] for row in rows) for key in ("step_seconds", "samples_per_second")
-        }
-        waited = {key: statistics.median(row["waited"][key] for row in rows) for key in rows[0]["waited"]}
-        config = stage.config.train
-        top, work = peak(device, config.precision, tflops), flops(stage)
-        used = "" if top is None else f"{work / middle['step_seconds'] / top / 1e12:.1%}"
-        share = kernel_share(stage.folder)
-        most = max((row.get("cuda_peak_mib", 0.0) for row in rows), default=0.0) / 1024
-        said = cards[name].memory_bytes / 2**30
-        cells = {
-            "arithmetic": config.precision + (", compiled" if config.compile else ""),
-            "batch": str(config.batch_size),
-            "samples/s": f"{middle['samples_per_second']:,.0f}",
-            "ms a step": f"{1000 * middle['step_seconds']:.1f}",
-            "TFLOP a step": f"{work / 1e12:.3g}",
-            "of the peak": used,
-            "kernels run": "" if share is None else f"{share:.0%}",
-            "waited for": ", ".join(f"{key} {value:.1%}" for key, value in waited.items()),
-            "peak GiB": f"{most:.3g}" if most else "",
-            "dry run said": f"{said:.3g}" + (f" ({said / most - 1:+.0%})" if most else ""),
-        }
-        yield {"title": name.split("-")[0], "cells": cells}
+    def built(self, family: str, name: str) -> Step:
+        """A stage's network before training, on inputs that are not trained either."""
+        recipe = self.recipes[family]
+        stage = recipe.stage(name)
+        kind, config = stage.kind, stage.config
+        given = previews(stage, {one.name: one for one in recipe.stages})
+        inputs = kind.inputs.of(given)
+        torch.manual_seed(0)
+        net = kind.network(kind.facts(config, inputs), inputs)
+        module = kind.dry_module(config, net, inputs)
+        batch, _ = kind.example(config, net, inputs, config.train.local_batch(1))
+        card = kind.estimate(config, given, recipe.hardware)
+        return Step(stage, module, batch, pass_flops(module, batch), card.memory_bytes)
 
+    def step(self, make: Callable[[], Step], precision: str, how: str) -> Cells:
+        """Steps for about two seconds, behind four that choose kernels or compile."""
+        made = make()
+        train: TrainConfig = made.stage.config.train.model_copy(
+            update={"precision": PRECISIONS[precision], "compile": how == "compiled", "accumulate": 1}
+        )
+        module = copy.deepcopy(made.module).train()
+        if how == "graphs":
+            torch.compiler.reset()
+            name = "losses_of" if isinstance(module, AlternatingModule) else "losses"
+            setattr(module, name, torch.compile(getattr(module, name), mode="reduce-overhead"))
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+            torch.cuda.reset_peak_memory_stats()
+        fabric = launch(self.recipes["humantomato"].hardware, train)
+        execution = Execution(fabric, module, train)
+        batch = fabric.to_device(made.batch)
 
-def sampling(run: Path, device: torch.device, batches: list[int]) -> Iterator[Record]:
-    """Rows of the table of sampling."""
-    bundle = Bundle.open(run, device)
-    seconds = min(FRAMES / bundle.layout.fps, bundle.max_seconds)
-    for batch in batches:
-        captions = ["a person walks forward"] * batch
-        for attempt in range(2):  # the first one chooses kernels
+        def timed(count: int) -> float:
             begin = time.perf_counter()
-            made = bundle.generate(
-                captions, seconds=seconds, seed=attempt, sampling=SamplingConfig(), batch=batch
-            )
+            for _ in range(count):
+                execution.take_step([batch])
+            self.synchronize()
+            return (time.perf_counter() - begin) / count
+
+        first, second = timed(1), timed(3)
+        seconds = timed(max(3, min(100, int(2 / second))))
+        cells = {"ms a step": f"{1000 * seconds:.1f}", "first, s": f"{first:.1f}"}
+        cells |= {"batch": str(train.batch_size), "TFLOP a step": f"{made.flops / 1e12:.3g}"}
+        return cells | self.share(made.flops / seconds, train) | self.memory(made.estimated)
+
+    def share(self, reached: float, train: TrainConfig) -> Cells:
+        """TFLOP/s and the share of the peak, where it is known."""
+        peak = peak_flops(self.device, train.precision)
+        cells = {"TFLOP/s": f"{reached / 1e12:.3g}"}
+        return cells | ({} if peak is None else {"of the peak": f"{reached / peak:.1%}"})
+
+    def memory(self, estimated: int) -> Cells:
+        cells = {"dry run says, GiB": f"{estimated / 2**30:.3g}"}
+        if self.device.type != "cuda":
+            return cells
+        return {"peak GiB": f"{torch.cuda.max_memory_allocated() / 2**30:.3g}"} | cells
+
+    def synchronize(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+
+    def until(self, stage: str, first: str | None = None) -> Path:
+        """Run a stage of the recipe and what it needs, or `first` and what is behind it again."""
+        run_recipe(
+            self.recipe("humantomato"),
+            self.run,
+            overrides=self.hardware,
+            select=Selection(first=first, until=stage),
+            replace=True,
+            console=self.console,
+        )
+        return self.run / "stages" / stage
+
+    def training(self, name: str) -> Cells:
+        """A training with its loader, as its telemetry saw it."""
+        rows = read_flight(self.until(name))[0]
+        rows = rows[len(rows) // 3 :]
+        middle = {key: statistics.median(row[key] for row in rows) for key in rows[0]}
+        cells = {"ms a step": f"{1000 * middle['step_seconds']:.1f}"}
+        cells |= {"samples/s": f"{middle['samples_per_second']:,.0f}"}
+        cells |= {"waits for data": f"{middle['waited/data']:.1%}", "goodput": f"{middle['goodput']:.1%}"}
+        return cells | ({"of the peak": f"{middle['mfu']:.1%}"} if "mfu" in middle else {})
+
+    def again(self, name: str) -> Cells:
+        """Whether a second training gives the bytes of the first."""
+        before = sha256_of(self.until(name) / "model.safetensors")
+        after = sha256_of(self.until(name, first=name) / "model.safetensors")
+        return {"sha256": f"{before[:12]} {after[:12]}", "equal": "yes" if before == after else "no"}
+
+    def sampling(self, batch: int) -> Cells:
+        """Motions for one caption, `batch` at once."""
+        bundle = Bundle.open(self.until("gpt").parents[1], self.device)
+        seconds = min(FRAMES / bundle.layout.fps, bundle.max_seconds)
+        for seed in range(2):  # the first one chooses kernels
+            begin = time.perf_counter()
+            how = {"seconds": seconds, "seed": seed, "batch": batch}
+            made = bundle.generate(["a person walks forward"] * batch, sampling=SamplingConfig(), **how)
+            self.synchronize()
             took = time.perf_counter() - begin
-        cells = {
+        return {
+            "ms": f"{1000 * took:.0f}",
             "frames": str(len(made[0].joints)),
-            "seconds": f"{took:.2f}",
-            "motions a minute": f"{60 * batch / took:,.0f}",
+            "motions/s": f"{batch / took:.1f}",
         }
-        yield {"title": f"{batch} at once", "cells": cells}
+
+    def short(self, name: str) -> tuple[list[str], Callable[[str], Cells]]:
+        """The stages of a recipe, and what runs one of them, made short."""
+        settings = list(self.hardware)
+        recipe = load_recipe(name)
+        for stage in recipe.stages:
+            fields = type(stage.config).model_fields
+            settings += [f"{stage.name}.{key}={value}" for key, value in SHORT.items() if key in fields]
+            if stage.kind.trains:
+                settings += [f"{stage.name}.train.steps=20", f"{stage.name}.train.checkpoint_every=20"]
+        settings += ["data.clips=400"] + ["data.dances.songs=16"] * name.endswith("ude")
+
+        def run(until: str) -> Cells:
+            select = Selection(until=until)
+            out = self.args.work / name
+            run_recipe(name, out, overrides=settings, select=select, replace=True, console=self.console)
+            return {"runs": "yes"}
+
+        return [stage.name for stage in recipe.stages], run
 
 
-def run_all(stages: Mapping[str, Any], where: list[str]) -> list[str]:
-    """Run the stages; of the compiled ones, which depend most on torch's version, those that failed."""
-    trained = {name: stage["train"] for name, stage in stages.items() if stage and "train" in stage}
-    compiled = [name for name, train in trained.items() if train["compile"]]
-    run = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "run", *where, "--until"]
-    subprocess.run([*run, ",".join(name for name in trained if name not in compiled)], check=True)
-    return [name for name in compiled if subprocess.run([*run, name]).returncode]
+def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cells]]]:
+    """Table, title and measurement of each row, in order."""
+    cuda = bench.device.type == "cuda"
+    built: dict[str, Step] = {}
+
+    def kept(family: str, name: str) -> Step:
+        if name not in built:
+            built.clear()  # the large ones do not fit beside each other
+            built[name] = bench.built(family, name)
+        return built[name]
+
+    stepped = [(family, name) for family, names in STEPPED.items() for name in names]
+    for family, name in stepped:
+        for precision in PRECISIONS if cuda else ("fp32", "bf16"):  # a CPU has no loss scaler
+            make = partial(kept, family, name)
+            yield "steps", f"{name} {precision}", partial(bench.step, make, precision, "eager")
+    for name in TRAINED:
+        yield "trainings", name, partial(bench.training, name)
+    for batch in (1, 32, 256):
+        yield "sampling", f"{batch} at once", partial(bench.sampling, batch)
+    for name in ("tokenizer", "gpt"):
+        yield "bytes", name, partial(bench.again, name)
+    for recipe in ("baselines-tiny", "baselines-tiny-ude"):
+        names, run = bench.short(recipe)
+        for name in names:
+            yield "stages", f"{recipe} {name}", partial(run, name)
+    for how in ("compiled", "graphs") if cuda else ("compiled",):
+        for family, name in stepped:
+            make = partial(kept, family, name)
+            yield "compiled", f"{name} bf16 {how}", partial(bench.step, make, "bf16", how)
 
 
 def main() -> None:
@@ -208,31 +302,21 @@ def main() -> None:
     parser.add_argument("work", type=Path)
     parser.add_argument("--size", choices=("paper", "small", "tiny"), default="paper")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    parser.add_argument("--steps", type=int, default=200, help="of each training")
-    parser.add_argument("--profile", type=int, default=10, help="steps of each training that are profiled")
-    parser.add_argument("--peak-tflops", type=float, help="of the device, where the table does not know it")
-    parser.add_argument(
-        "--batches", type=int, nargs="+", default=[1, 32, 256], help="motions sampled at once"
-    )
+    parser.add_argument("--minutes", type=float, default=10.0, help="after which no row is begun")
+    parser.add_argument("--steps", type=int, default=60, help="of each training")
     args = arguments(parser)
-    device = choose_device(args.device)
     args.work.mkdir(parents=True, exist_ok=True)
-    path, run = args.work / "gpu.yaml", args.work / "run"
-    content = recipe(args.size, args.steps, args.device, args.profile)
-    path.write_text(yaml.safe_dump(content, sort_keys=False))
-    failed = run_all(content["stages"], [str(path), "-o", str(run)])
-    stages = finished_stages(run)
-    named = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
-    where = f"{named}, torch {torch.__version__}, `humantomato-{args.size}`, {args.steps} steps each"
-    tables = {
-        "trainings": list(trainings(run, stages, device, args.peak_tflops)),
-        "sampling": list(sampling(run, device, args.batches)),
-    }
-    for name, rows in tables.items():
-        columns = [Column(title, title) for title in rows[0]["cells"]]
-        report(f"{name}: {where}", columns, rows, args.record and f"{args.record}_{name}")
-    if failed:
-        raise SystemExit(f"ended with an error: {', '.join(failed)}")
+    rows, bench = Rows(args.work / "rows.jsonl", args.minutes), Benchmark(args)
+    for table, title, cells in measurements(bench):
+        rows.measure(table, title, cells)
+    named = torch.cuda.get_device_name(bench.device) if bench.device.type == "cuda" else "CPU"
+    for table in dict.fromkeys(row["table"] for row in rows.rows):
+        own = [row for row in rows.rows if row["table"] == table]
+        columns = [Column(name, name) for name in dict.fromkeys(key for row in own for key in row["cells"])]
+        name = args.record and f"{args.record}_{table}"
+        report(f"{table}: {named}, torch {torch.__version__}, sizes {args.size}", columns, own, name)
+    if rows.left_out:
+        print(f"no time was left for {len(rows.left_out)} rows: {'; '.join(rows.left_out)}", flush=True)
 
 
 if __name__ == "__main__":

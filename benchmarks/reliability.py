@@ -1,4 +1,4 @@
-"""Measure what a training survives: kills at random moments, preemption on SLURM, damaged files.
+"""Measure what a training survives: kills at random moments, and preemption on SLURM.
 
     python benchmarks/reliability.py WORK [--parts kills,preemption,...] [--kills 20] [--cells '*-1-0']
 
@@ -24,20 +24,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "tests/helpers"))  # the tests do the same on a smaller scale
 
-import numpy as np  # noqa: E402
-import torch  # noqa: E402
 from bench import arguments, command_line  # noqa: E402
 from kill_matrix import Cell, Seen, read_seen, run_cells  # noqa: E402
 from preempted import launch, preempt, write_recipe  # noqa: E402
-from rich.console import Console  # noqa: E402
 from slurm_cluster import Cluster, why_not  # noqa: E402
-
-from motionloom.datasets.schema import UserError  # noqa: E402
-from motionloom.datasets.shards.checksums import LocalShard  # noqa: E402
-from motionloom.datasets.shards.reader import ShardDataset, load_manifest  # noqa: E402
-from motionloom.pipeline.launch.team import Team  # noqa: E402
-from motionloom.pipeline.runs.verify_shards import compare_shards  # noqa: E402
-from motionloom.pipeline.training.checkpointing import DamagedError, read_checkpoint  # noqa: E402
 
 RECIPES = ROOT / "benchmarks/reliability"
 FAMILIES = {
@@ -51,8 +41,6 @@ FAMILIES = {
 """Stage: (recipe, what it stands for)."""
 
 PREEMPTIONS = 5
-TEARS, FLIPS = 20, 100
-CHECKPOINT_DAMAGE = ("checkpoint, torn", "checkpoint, one bit flipped", "the same, by torch alone")
 
 
 def base_run(recipe: str, work: Path) -> Path:
@@ -157,93 +145,8 @@ def preemption_table(work: Path) -> list[str]:
     return rows
 
 
-def damage(work: Path, args: argparse.Namespace) -> None:
-    """Cut and flip a checkpoint and a shard, and count who notices."""
-    out = work / "damage.json"
-    if out.exists():
-        return
-    run = base_run("humantomato", work / "kills")
-    rng = np.random.default_rng(0)
-    with tempfile.TemporaryDirectory(dir=work) as folder:
-        found = _damaged_checkpoint(run, Path(folder), rng) | _damaged_shard(run, Path(folder), rng)
-    out.write_text(json.dumps(found))
-
-
-def _damaged_checkpoint(run: Path, folder: Path, rng: np.random.Generator) -> dict[str, int]:
-    raw = max((run / "stages/gpt/checkpoints").glob("*.ckpt")).read_bytes()
-    path, found = folder / "step=00000001.ckpt", dict.fromkeys(CHECKPOINT_DAMAGE, 0)
-    for size in np.linspace(0, len(raw) - 1, TEARS).astype(int):
-        path.write_bytes(raw[:size])
-        found[CHECKPOINT_DAMAGE[0]] += _refused(lambda: read_checkpoint(path), DamagedError)
-    for place in rng.integers(len(raw), size=FLIPS):
-        path.write_bytes(_flipped(raw, place, rng))
-        found[CHECKPOINT_DAMAGE[1]] += _refused(lambda: read_checkpoint(path), DamagedError)
-        found[CHECKPOINT_DAMAGE[2]] += _refused(lambda: torch.load(path, weights_only=True), Exception)
-    return found
-
-
-def _damaged_shard(run: Path, folder: Path, rng: np.random.Generator) -> dict[str, int]:
-    for path in (run / "stages/data/shards").iterdir():
-        (folder / path.name).write_bytes(path.read_bytes())
-    shards = [LocalShard(folder / shard.name, shard) for shard in load_manifest(folder).shards]
-    record = folder / "compared.json"
-    path = next(folder.glob("*-train-*.tar"))
-    raw = path.read_bytes()
-    ways: dict[str, Callable[[], object]] = {
-        "shard, one bit flipped: opened with `verify`": lambda: ShardDataset.open(
-            folder, "train", verify=True
-        ),
-        "the same, before a stage reads it (default)": lambda: compare_shards(
-            shards, record, Team(), Console(quiet=True)
-        ),
-        "the same, by the indexed reader alone": lambda: _read(ShardDataset.open(folder, "train")),
-    }
-    found = dict.fromkeys(ways, 0)
-    for place in rng.integers(len(raw), size=FLIPS):
-        path.write_bytes(raw)
-        compare_shards(shards, record, Team(), Console(quiet=True))  # it was sound, and is noted as such
-        path.write_bytes(_flipped(raw, place, rng))
-        for name, way in ways.items():
-            found[name] += _refused(way, UserError)
-    return found
-
-
-def _read(data: ShardDataset) -> None:
-    for clip in range(len(data)):
-        data.motion(clip), data.meta(clip), data.texts(clip)
-
-
-def _flipped(raw: bytes, place: int, rng: np.random.Generator) -> bytes:
-    out = bytearray(raw)
-    out[place] ^= 1 << int(rng.integers(8))
-    return bytes(out)
-
-
-def _refused(read: Callable[[], object], error: type[Exception]) -> bool:
-    try:
-        read()
-    except error:
-        return True
-    return False
-
-
-def damage_table(work: Path) -> list[str]:
-    """How many of the damaged files were noticed, by whom."""
-    if not (work / "damage.json").exists():
-        return ["not run"]
-    found = json.loads((work / "damage.json").read_text())
-    rows = ["| damage | noticed |", "|---|---|"]
-    return rows + [
-        f"| {name} | {n} of {TEARS if name == CHECKPOINT_DAMAGE[0] else FLIPS} |" for name, n in found.items()
-    ]
-
-
 Part = tuple[Callable[[Path, argparse.Namespace], None], Callable[[Path], list[str]]]
-PARTS: dict[str, Part] = {
-    "damage": (damage, damage_table),
-    "preemption": (preemption, preemption_table),
-    "kills": (kills, kills_table),
-}
+PARTS: dict[str, Part] = {"preemption": (preemption, preemption_table), "kills": (kills, kills_table)}
 """Name -> what does it, and what prints it."""
 
 

@@ -1,7 +1,6 @@
 """Speed of what runs often, beside the usual way to do the same: the table "Speed" of docs/results.md.
 
-    python benchmarks/speed.py [--only features smpl audio loader batches streaming] [--record speed]
-    python benchmarks/speed.py --only bvh --bvh FOLDER
+    python benchmarks/speed.py [--only audio loader batches streaming] [--record speed]
 
 All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
 turns. `streaming` makes ten minutes of motion with a model of the package and looks at its memory.
@@ -12,14 +11,11 @@ from __future__ import annotations
 import io
 import itertools
 import os
-import subprocess
-import sys
 import tempfile
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,16 +24,10 @@ from bench import Column, Record, arguments, command_line, cpu_seconds, process_
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features, fitting_octaves
-from motionloom.datasets.convert.common.scan import list_files, read_file
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatches
 from motionloom.datasets.loading.statistics import FeatureStats, compute
-from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
-from motionloom.datasets.motion.bvh.motion import read_bvh
-from motionloom.datasets.motion.canonical import canonicalize
-from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
@@ -57,74 +47,6 @@ WINDOW, BATCH = 64, 256
 def row(title: str, ours: str, usual: str = "", ratio: float | None = None) -> Record:
     """A row of the table; cells are text, since rows have units of their own."""
     return {"title": title, "cells": {"ours": ours, "usual": usual} | ({"ratio": [ratio]} if ratio else {})}
-
-
-def features(args: Namespace) -> Record:
-    """Frames a second from joints to the 133 features of a body: 32 clips of a swaying figure."""
-    layout, rng = MotionLayout.named("body133"), np.random.default_rng(0)
-    seconds = np.arange(196)[:, None, None] / layout.fps
-    phase = rng.uniform(0, 6, size=(32, 1, len(layout.skeleton), 3))
-    sway = 0.05 * np.sin(4.0 * seconds + phase)
-    joints = np.asarray(canonicalize(layout.skeleton.rest_joints + sway + seconds * [0.3, 0.0, 1.0]))
-    taken = cpu_seconds({"ours": lambda: encode(joints, layout)})["ours"]
-    return row("joints to 133 features", f"{joints.shape[0] * joints.shape[1] / taken / 1e6:.2f} M frames/s")
-
-
-def smpl(args: Namespace) -> Record:
-    """300 frames of SMPL-X: forward kinematics on joints, beside a body layer that computes all vertices.
-
-    The body is random, of the published size (10475 vertices, 55 joints). The layer does what public ones do
-    in float32: shape blend, joint regression, pose blend and skinning, all frames in one batch.
-    """
-    skeleton, rng, vertices, joints = Skeleton.named("smplx52"), np.random.default_rng(0), 10475, 55
-    draw = torch.Generator().manual_seed(0)
-    # Jaw and eyes, which the skeleton lacks, are leaves: any parent will do.
-    parents = [*skeleton.parents, *[0] * (joints - len(skeleton))]
-    template, shapes = torch.randn(vertices, 3, generator=draw), torch.randn(vertices, 3, 10, generator=draw)
-    regressor, weights = torch.zeros(joints, vertices), torch.rand(vertices, joints, generator=draw)
-    for joint in range(joints):  # about 30 vertices a joint, as in the published regressors
-        chosen = torch.randint(vertices, (30,), generator=draw)
-        regressor[joint, chosen] = torch.rand(30, generator=draw)
-    regressor /= regressor.sum(dim=1, keepdim=True)
-    weights /= weights.sum(dim=1, keepdim=True)
-    blends = 0.001 * torch.randn(9 * (joints - 1), 3 * vertices, generator=draw)
-
-    @torch.no_grad()
-    def mesh(rotvecs: torch.Tensor, trans: torch.Tensor, betas: torch.Tensor) -> torch.Tensor:
-        frames = len(rotvecs)
-        angle = torch.linalg.norm(rotvecs, dim=-1, keepdim=True)[..., None].clamp_min(1e-8)
-        x, y, z = (rotvecs / angle[..., 0]).unbind(-1)
-        zero = torch.zeros_like(x)
-        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(frames, joints, 3, 3)
-        local = torch.eye(3) + angle.sin() * cross + (1 - angle.cos()) * (cross @ cross)
-        shaped = template + torch.einsum("b,vcb->vc", betas, 0.01 * shapes)
-        rest = regressor @ shaped
-        posed = shaped + ((local[:, 1:] - torch.eye(3)).reshape(frames, -1) @ blends).reshape(frames, -1, 3)
-        step = torch.zeros(frames, joints, 4, 4)
-        step[:, :, :3, :3], step[:, :, :3, 3], step[:, :, 3, 3] = local, rest, 1.0
-        step[:, 1:, :3, 3] -= rest[parents[1:]]
-        chain = [step[:, 0]]
-        for joint in range(1, joints):
-            chain.append(chain[parents[joint]] @ step[:, joint])
-        moves = torch.stack(chain, dim=1)
-        world = moves[:, :, :3, 3] + trans[:, None]
-        moves[:, :, :3, 3] -= torch.einsum("tjik,jk->tji", moves[:, :, :3, :3], rest)
-        skin = (weights @ moves.reshape(frames, joints, 16)).reshape(frames, -1, 4, 4)
-        (skin @ torch.cat([posed, torch.ones(frames, vertices, 1)], dim=2)[..., None])[:, :, :3, 0]
-        return world
-
-    mine = list(range(len(skeleton)))
-    reduced = regressor.double().numpy()[mine]
-    directions = np.tensordot(reduced, 0.01 * shapes.double().numpy(), axes=1)
-    body = BodyModel(skeleton, reduced @ template.double().numpy(), directions, {})
-    rotvecs, trans, betas = rng.normal(size=(300, joints, 3)), rng.normal(size=(300, 3)), rng.normal(size=10)
-    ours = partial(smpl_joints, np.ascontiguousarray(rotvecs[:, mine]), trans, body, betas)
-    theirs = partial(mesh, *(torch.from_numpy(array).float() for array in (rotvecs, trans, betas)))
-    assert np.abs(theirs().numpy()[:, mine] - ours()).max() < 1e-3
-    taken = cpu_seconds({"ours": ours, "mesh": theirs})
-    ratio = taken["mesh"] / taken["ours"]
-    title = "SMPL-X parameters to joints, 300 frames"
-    return row(title, f"{1e3 * taken['ours']:.1f} ms", f"{1e3 * taken['mesh']:.0f} ms, all vertices", ratio)
 
 
 def audio(args: Namespace) -> Record:
@@ -282,36 +204,16 @@ def streaming(args: Namespace) -> Record:
     return row("streaming", f"{speed:.1f} × real time, first frames after {first:.2f} s; {grown}")
 
 
-def bvh(args: Namespace) -> Record:
-    """BVH to shards with one worker, beside parsing alone."""
-    motion, begin = 0.0, process_seconds()
-    folder, names = list_files(args.bvh)
-    for name in names:
-        clip = read_bvh(read_file(folder / name, name), name=name)
-        motion += clip.frames / clip.fps
-    parsing = process_seconds() - begin
-    command = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "data", "convert", "bvh"]
-    with tempfile.TemporaryDirectory() as out:
-        begin = process_seconds()
-        options = ["--licence", "CC0", "--workers", "1"]
-        subprocess.run([*command, str(args.bvh), f"{out}/shards", *options], check=True)
-        taken = process_seconds() - begin
-    title = "BVH to shards"
-    return row(title, f"{motion / taken:.0f} × real time", f"{motion / parsing:.0f} ×, parsing alone")
-
-
-CASES = {case.__name__: case for case in (features, smpl, bvh, audio, loader, batches, streaming)}
+CASES = {case.__name__: case for case in (audio, loader, batches, streaming)}
 
 
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--bvh", type=Path, help="a folder of BVH files; without one `bvh` is left out")
     parser.add_argument("--model", type=Path, default=Path("synthetic"), help="of `streaming`")
     parser.add_argument("--minutes", type=float, default=10.0, help="of `streaming`'s motion")
     args = arguments(parser)
-    chosen = [name for name in args.only if name != "bvh" or args.bvh]
-    report("Speed on one core", COLUMNS, [CASES[name](args) for name in chosen], args.record)
+    report("Speed on one core", COLUMNS, [CASES[name](args) for name in args.only], args.record)
 
 
 if __name__ == "__main__":
