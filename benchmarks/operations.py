@@ -41,12 +41,14 @@ STAGES = {
 }
 KINDS = {
     "casts": ("_to_copy",),
-    "copies": ("copy_", "clone", "_foreach_copy_"),
+    "copies": ("copy_", "clone", "_foreach_copy_", "masked_fill"),
     "concatenations": ("cat", "stack"),
+    "sent": ("lift_fresh",),
     "read back": ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select"),
 }
-"""Operations that move numbers without computing any, and those that a GPU must be waited for."""
-_VIEWS = ("_unsafe_view", "_reshape_alias", "detach", "lift_fresh")
+"""Operations that move numbers without computing any (`masked_fill` copies, then fills), and those that a GPU
+must be waited for: constants sent there, and numbers read back."""
+_VIEWS = ("_unsafe_view", "_reshape_alias", "detach")
 """Views that do not say so."""
 COLUMNS = (
     Column("batch", "batch"),
@@ -70,7 +72,7 @@ class Counted(TorchDispatchMode):
         out = func(*args, **(kwargs or {}))
         name = func.overloadpacket.__name__
         tensors = [x for x in tree_leaves((args, kwargs, out)) if isinstance(x, Tensor)]
-        if func.namespace == "aten" and not func.is_view and name not in _VIEWS:
+        if func.namespace == "aten" and name not in _VIEWS and (name == "lift_fresh" or not func.is_view):
             self.number[name] += 1
             size = sum(x.numel() * x.element_size() for x in tensors)
             self.bytes[name] += size

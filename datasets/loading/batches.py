@@ -7,7 +7,7 @@ their number. `batch_size` is always the *global* one.
 
 from __future__ import annotations
 
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 import torch
@@ -33,6 +33,8 @@ class MotionBatch(TypedDict):
     length: Tensor
     present: Tensor
     """bool [B, C]: columns of parts (hands, face) that the clip holds. The others must not be learnt from."""
+    full: NotRequired[bool]
+    """Every frame and column of *all* batches is real, so nothing has to be masked."""
 
 
 class WindowBatches(Dataset[MotionBatch]):
@@ -70,6 +72,8 @@ class WindowBatches(Dataset[MotionBatch]):
                 f"{dataset.where}: no clip of split '{dataset.split}' holds hands or a face that the chosen "
                 f"part has columns for; choose another `part` or another data set"
             )
+        whole = self.crops.present[np.unique(dataset.present[self.clips])].all()
+        self.full = bool(whole and (dataset.frames[self.clips] >= window).all())
         sources = dataset.sources(self.clips)
         self.plan = BatchPlan(len(self.clips), batch_size // windows_per_clip, seed, sources=sources)
         self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
@@ -95,4 +99,5 @@ class WindowBatches(Dataset[MotionBatch]):
             "motion": torch.from_numpy(motion),
             "length": torch.from_numpy(np.repeat(length, per_clip)),
             "present": torch.from_numpy(self.crops.present[np.repeat(self.dataset.present[clips], per_clip)]),
+            "full": self.full,
         }

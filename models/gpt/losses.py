@@ -8,6 +8,7 @@ the frozen TMA motion encoder, then InfoNCE against the TMA text latents of the 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -100,8 +101,7 @@ def soft_codes(
     valid = torch.arange(count, device=logits.device)[None, :, None, None] < groups[:, None, None, None]
     out = {}
     for name in gpt.names:
-        slots = [i for i, stream in enumerate(gpt.pattern) if stream == name]
-        here = steps[:, :, slots, : gpt.num_codes[name]]
+        here = steps[:, :, _slots(gpt.pattern, name), : gpt.num_codes[name]]
         here = torch.where(valid, here, 0.0).flatten(1, 2)
         if sample:
             out[name] = F.gumbel_softmax(here, tau=temperature)
@@ -109,6 +109,16 @@ def soft_codes(
             soft = (here / temperature).softmax(-1)
             out[name] = F.one_hot(here.argmax(-1), here.shape[-1]).to(soft) + soft - soft.detach()
     return out
+
+
+def _slots(pattern: Sequence[str], name: str) -> slice | list[int]:
+    """Slots of a stream. Evenly spaced, as in all patterns here, they are a slice: a list would be sent to
+    the device in every step, which a GPU is waited for.
+    """
+    slots = [i for i, stream in enumerate(pattern) if stream == name]
+    gap = slots[1] - slots[0] if len(slots) > 1 else 1
+    even = slice(slots[0], slots[-1] + 1, gap)
+    return even if slots == list(range(len(pattern))[even]) else slots
 
 
 def soft_motion(

@@ -114,7 +114,7 @@ def interleave(
     (batch, count), device, body = slots.shape[:2], slots.device, slots.flatten(1)
     if groups is None:
         groups = torch.full((batch,), count, dtype=torch.int64, device=device)
-    kinds = torch.tensor(kind_of_slot(pattern), device=device).repeat(count).expand(batch, -1)
+    kinds = _numbers(kind_of_slot(pattern), device).repeat(count).expand(batch, -1)
     length = groups * len(pattern)
     # Padding lies behind each row's own tokens, not at the end of each stream.
     valid = torch.arange(body.shape[1], device=device)[None] < length[:, None]
@@ -124,13 +124,18 @@ def interleave(
     if closed is None:
         closed = torch.ones_like(groups, dtype=torch.bool)
     order = torch.arange(len(names), device=device)
-    limits = torch.tensor([ends[name] for name in names], device=device)
+    limits = _numbers([ends[name] for name in names], device)
     # One End a stream follows, in the order of their first slots.
     at = length[:, None] + order  # after each row's own tokens
     more = functional.pad(tokens, (0, len(names)), value=PAD), functional.pad(kinds, (0, len(names)))
     tokens = more[0].scatter(1, at, torch.where(closed[:, None], limits, PAD))
     kinds = more[1].scatter(1, at, torch.where(closed[:, None], order, 0))
     return TokenSequence(tokens, kinds, torch.where(closed, length + len(names), length))
+
+
+def _numbers(values: Sequence[int], device: torch.device) -> Tensor:
+    """int64 [n], made on the device: a list would be sent there, which a GPU is waited for."""
+    return torch.stack([torch.full((), value, device=device) for value in values])
 
 
 def as_codes(tokens: Tensor, pattern: Sequence[str], groups: Tensor) -> Codes:

@@ -16,15 +16,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 
-def frame_padding(valid: Tensor | None, frames: int, stride: int) -> Tensor | None:
-    """True where a position of a sequence at 1/stride of the frame rate is padding, [B, frames/stride, 1].
+def real_frames(valid: Tensor | None, frames: int, stride: int) -> Tensor | None:
+    """False where a position of a sequence at 1/stride of the frame rate is padding, [B, frames/stride, 1].
 
     `valid` [B] counts frames and must be a multiple of `stride`; None means that nothing is padded.
     """
     if valid is None:
         return None
     position = torch.arange(0, frames, stride, device=valid.device)
-    return (position >= valid[:, None])[..., None]
+    return (position < valid[:, None])[..., None]
 
 
 class Conv(nn.Conv1d):
@@ -63,9 +63,9 @@ def start_weights(net: nn.Module, slope: float = 0.0) -> None:
                 layer.weight.mul_(0.1)
 
 
-def zero_padded(x: Tensor, padding: Tensor | None) -> Tensor:
-    """x [B, T, C] with zeros where `padding` [B, T, 1]; None = nothing is padded."""
-    return x if padding is None else x.masked_fill(padding, 0.0)
+def zero_padded(x: Tensor, real: Tensor | None) -> Tensor:
+    """x [B, T, C], finite, with zeros where `real` [B, T, 1] is false; None = nothing is padded."""
+    return x if real is None else x * real  # one pass over memory; `masked_fill` takes two
 
 
 class ResidualBlock(nn.Module):
@@ -76,9 +76,9 @@ class ResidualBlock(nn.Module):
         self.spread = Conv(width, width, 3, padding=dilation, dilation=dilation)
         self.mix = Conv(width, width, 1)
 
-    def forward(self, x: Tensor, padding: Tensor | None) -> Tensor:
-        """`padding` [B, T, 1] marks the positions to ignore."""
-        hidden = self.spread(zero_padded(functional.relu(x), padding))
+    def forward(self, x: Tensor, real: Tensor | None) -> Tensor:
+        """`real` [B, T, 1] is false at the positions to ignore."""
+        hidden = self.spread(zero_padded(functional.relu(x), real))
         mixed: Tensor = self.mix(functional.relu(hidden))
         return x + mixed
 
@@ -93,9 +93,9 @@ class ResidualStack(nn.Module):
         self.reach = sum(dilations)
         """Positions to either side that one of its outputs looks at."""
 
-    def forward(self, x: Tensor, padding: Tensor | None) -> Tensor:
+    def forward(self, x: Tensor, real: Tensor | None) -> Tensor:
         for block in self.blocks:
-            x = block(x, padding)
+            x = block(x, real)
         return x
 
 
@@ -116,11 +116,11 @@ class ConvEncoder(nn.Module):
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = frames that are not padding, a multiple of 2^halvings; T is a multiple of it too."""
         frames = x.shape[1]
-        padding = [frame_padding(valid, frames, 2**i) for i in range(len(self.down) + 1)]
-        hidden = functional.relu(self.enter(zero_padded(x, padding[0])))
+        real = [real_frames(valid, frames, 2**i) for i in range(len(self.down) + 1)]
+        hidden = functional.relu(self.enter(zero_padded(x, real[0])))
         for i, (down, stack) in enumerate(zip(self.down, self.stacks, strict=True)):
-            hidden = stack(down(zero_padded(hidden, padding[i])), padding[i + 1])
-        latents: Tensor = self.leave(zero_padded(hidden, padding[-1]))
+            hidden = stack(down(zero_padded(hidden, real[i])), real[i + 1])
+        latents: Tensor = self.leave(zero_padded(hidden, real[-1]))
         return latents
 
 
@@ -147,14 +147,14 @@ class ConvDecoder(nn.Module):
         """`valid` [B] = *frames* (after up-sampling) that are not padding; padded frames come out as zero."""
         doublings = len(self.up)
         frames = z.shape[1] * 2**doublings
-        padding = [frame_padding(valid, frames, 2**i) for i in range(doublings + 1)]
-        hidden = functional.relu(self.enter(zero_padded(z, padding[-1])))
+        real = [real_frames(valid, frames, 2**i) for i in range(doublings + 1)]
+        hidden = functional.relu(self.enter(zero_padded(z, real[-1])))
         for i, (stack, up) in enumerate(zip(self.stacks, self.up, strict=True)):
             level = doublings - i
-            hidden = stack(hidden, padding[level]).repeat_interleave(2, dim=1)
-            hidden = up(zero_padded(hidden, padding[level - 1]))
-        hidden = functional.relu(self.refine(zero_padded(hidden, padding[0])))
-        return zero_padded(self.leave(zero_padded(hidden, padding[0])), padding[0])
+            hidden = stack(hidden, real[level]).repeat_interleave(2, dim=1)
+            hidden = up(zero_padded(hidden, real[level - 1]))
+        hidden = functional.relu(self.refine(zero_padded(hidden, real[0])))
+        return zero_padded(self.leave(zero_padded(hidden, real[0])), real[0])
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""

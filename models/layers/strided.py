@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.layers.conv import Conv, ResidualStack, frame_padding, start_weights, zero_padded
+from motionloom.models.layers.conv import Conv, ResidualStack, real_frames, start_weights, zero_padded
 
 SLOPE = 0.2
 """Slope of the leaky ReLU below zero."""
@@ -37,11 +37,11 @@ class StridedEncoder(nn.Module):
 
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = frames that are not padding; T and `valid` are multiples of 4."""
-        padding = [frame_padding(valid, x.shape[1], 2**i) for i in range(3)]
+        real = [real_frames(valid, x.shape[1], 2**i) for i in range(3)]
         hidden = x
         for i, (down, stack) in enumerate(zip(self.down, self.stacks, strict=True)):
-            hidden = stack(_active(down(zero_padded(hidden, padding[i]))), padding[i + 1])
-        latents: Tensor = self.out(zero_padded(hidden, padding[2]))
+            hidden = stack(_active(down(zero_padded(hidden, real[i]))), real[i + 1])
+        latents: Tensor = self.out(zero_padded(hidden, real[2]))
         return latents
 
 
@@ -62,13 +62,13 @@ class StridedDecoder(nn.Module):
 
     def forward(self, z: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = *frames* that are not padding, a multiple of 4; padded frames come out as zero."""
-        padding = [frame_padding(valid, z.shape[1] * 4, 2**i) for i in range(3)]
+        real = [real_frames(valid, z.shape[1] * 4, 2**i) for i in range(3)]
         hidden = z
         for i, (up, stack) in enumerate(zip(self.up, self.stacks, strict=True)):
             level = 1 - i
-            wide = zero_padded(hidden, padding[level + 1]).repeat_interleave(2, dim=1)
-            hidden = stack(_active(up(wide)), padding[level])
-        return zero_padded(self.out(zero_padded(hidden, padding[0])), padding[0])
+            wide = zero_padded(hidden, real[level + 1]).repeat_interleave(2, dim=1)
+            hidden = stack(_active(up(wide)), real[level])
+        return zero_padded(self.out(zero_padded(hidden, real[0])), real[0])
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""

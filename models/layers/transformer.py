@@ -5,7 +5,8 @@ Notable choices:
   sums, as in torch's own encoder, which TEMOS, TMR and MDM are made of.
 - Attention is always `F.scaled_dot_product_attention`, so fused kernels are used wherever the device has
   them.
-- Masks are boolean and mark what *may* be attended (True = visible), as SDPA wants them.
+- Masks are boolean and mark what *may* be attended (True = visible). A stack turns its masks into the numbers
+  that are added to the products once; SDPA would in every layer.
 - A causal stack needs no padding mask when sequences are padded on the right: real positions never see
   padding.
 - Dropout acts on the residual branches (`dropout`), of "post" also inside the feed-forward as torch's does,
@@ -71,6 +72,15 @@ class StackConfig(Config):
         return self
 
 
+class LayerNorm(nn.LayerNorm):
+    """Computes in the type of its weights under autocast too, as CUDA's autocast has it: a CPU's kernel for
+    mixed types adds up the gradients of the weights in bfloat16, which leaves half of them wrong.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.to(self.weight.dtype))
+
+
 class LayerCache:
     """Keys and values [B, H, size, D/H] of the positions one layer has seen; allocated once, at the first
     append.
@@ -122,10 +132,12 @@ class SelfAttention(nn.Module):
     def forward(
         self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
     ) -> Tensor:
-        """x [B, L, D]; mask bool, broadcastable to [B, H, L, S], or `causal`; with a cache x continues it."""
+        """x [B, L, D]; mask bool or added, broadcastable to [B, H, L, S], or `causal`; with a cache x goes on
+        behind it.
+        """
         batch, length, dim = x.shape
-        qkv = self.qkv(x).view(batch, length, 3, self.heads, dim // self.heads).permute(2, 0, 3, 1, 4)
-        query, key, value = qkv.unbind(0)
+        # Cut along the last dimension: the gradients of the three are put together by one copy, not by two.
+        query, key, value = (self._heads(part) for part in self.qkv(x).chunk(3, dim=-1))
         if cache is not None:
             before = cache.length
             key, value = cache.append(key, value)
@@ -142,24 +154,25 @@ class SelfAttention(nn.Module):
         merged: Tensor = self.out(out.transpose(1, 2).reshape(batch, length, dim))
         return merged
 
+    def _heads(self, x: Tensor) -> Tensor:
+        return x.view(*x.shape[:2], self.heads, -1).transpose(1, 2)
+
 
 class CrossAttention(SelfAttention):
     """Multi-head attention to another sequence of the same width; the weights are laid out as its base's."""
 
     def attend(self, x: Tensor, memory: Tensor, mask: Tensor | None = None) -> Tensor:
-        """x [B, L, D], memory [B, S, D]; mask bool, broadcastable to [B, H, L, S]."""
-        dim = x.shape[2]
-        weight, bias = self.qkv.weight, self.qkv.bias
-        query = self._heads(F.linear(x, weight[:dim], bias[:dim]))
-        pairs = F.linear(memory, weight[dim:], bias[dim:])
+        """x [B, L, D], memory [B, S, D]; mask bool or added, broadcastable to [B, H, L, S]."""
+        sizes = [x.shape[2], 2 * x.shape[2]]
+        parts = (torch.split(whole, sizes) for whole in (self.qkv.weight, self.qkv.bias))
+        of_query, of_pairs = zip(*parts, strict=True)
+        query = self._heads(F.linear(x, *of_query))
+        pairs = F.linear(memory, *of_pairs)
         key, value = (self._heads(half) for half in pairs.chunk(2, dim=-1))
         rate = self.attention_dropout if self.training else 0.0
         out = F.scaled_dot_product_attention(query, key, value, mask, dropout_p=rate)
         merged: Tensor = self.out(out.transpose(1, 2).reshape(x.shape))
         return merged
-
-    def _heads(self, x: Tensor) -> Tensor:
-        return x.view(*x.shape[:2], self.heads, -1).transpose(1, 2)
 
 
 class Block(nn.Module):
@@ -178,12 +191,12 @@ class Block(nn.Module):
     ) -> None:
         super().__init__()
         self.post = norm == "post"
-        self.norm_attention = nn.LayerNorm(dim)
+        self.norm_attention = LayerNorm(dim)
         self.attention = SelfAttention(dim, heads, attention_dropout, qkv_bias)
         if memory:
-            self.norm_memory = nn.LayerNorm(dim)
+            self.norm_memory = LayerNorm(dim)
             self.memory = CrossAttention(dim, heads, attention_dropout)
-        self.norm_ff = nn.LayerNorm(dim)
+        self.norm_ff = LayerNorm(dim)
         self.ff_in = nn.Linear(dim, ff)
         self.ff_out = nn.Linear(ff, dim)
         self.dropout = nn.Dropout(dropout)
@@ -255,7 +268,7 @@ class Transformer(nn.Module):
         self.blocks = nn.ModuleList(
             Block(dim, config.heads, config.ff, drop, inner, norm, memory, qkv_bias) for _ in range(layers)
         )
-        self.norm = nn.LayerNorm(dim) if norm == "pre" and last_norm else nn.Identity()
+        self.norm = LayerNorm(dim) if norm == "pre" and last_norm else nn.Identity()
         self.checkpointed = False
         """Compute the inside of each block again in the backward pass instead of keeping it."""
         std = math.sqrt(2 / (5 * dim))
@@ -278,7 +291,7 @@ class Transformer(nn.Module):
         """x [B, L, D]; mask bool [B, L] of visible positions or [B, L, S], or `causal`; cache to decode;
         memory [B, M, D] and its mask [B, M] or [B, L, M].
         """
-        given, seen = (_to_heads(mask), causal), (memory, _to_heads(memory_mask))
+        given, seen = (_added(mask, x), causal), (memory, _added(memory_mask, x))
 
         def step(index: int, x: Tensor) -> Tensor:
             if cache is None:
@@ -321,7 +334,7 @@ class SkipTransformer(Transformer):
         super().__init__(config, layers, norm="post", **kind)
         dim = config.width[1] if config.width else 0
         self.merge = nn.ModuleList(nn.Linear(2 * dim, dim) for _ in range(layers // 2))
-        self.norm = nn.LayerNorm(dim)
+        self.norm = LayerNorm(dim)
         for parameter in self.parameters():
             if parameter.dim() == 2:
                 nn.init.xavier_uniform_(parameter)
@@ -338,8 +351,13 @@ class SkipTransformer(Transformer):
         return x
 
 
-def _to_heads(mask: Tensor | None) -> Tensor | None:
-    """A mask [B, S] or [B, L, S] as attention takes it."""
+def _added(mask: Tensor | None, x: Tensor) -> Tensor | None:
+    """A mask [B, S] or [B, L, S] as attention adds it, in the type in which it computes on x."""
     if mask is None:
         return None
-    return mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
+    mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
+    device, size = x.device.type, mask.shape[-1]
+    kind = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
+    # Kernels of GPUs read rows that begin at multiples of 8, and copy others in every layer.
+    hidden = F.pad(~mask, (0, -size % 8), value=True)
+    return torch.zeros(hidden.shape, dtype=kind, device=x.device).masked_fill_(hidden, -torch.inf)[..., :size]

@@ -41,8 +41,8 @@ class TmaModule(StageModule):
         # Both latents are decoded and compared with the motion that the encoder saw.
         subsampled, frames = net.subsample(motion, length)
         target, mask = net.coordinates(subsampled, present), length_mask(frames, subsampled.shape[1])
-        from_text = net.decode_coordinates(z_text, length, motion.shape[1])
-        from_motion = net.decode_coordinates(z_motion, length, motion.shape[1])
+        both = net.decode_coordinates(torch.cat([z_text, z_motion]), length.repeat(2), motion.shape[1])
+        from_text, from_motion = both.chunk(2)
         losses = {
             "rec_text": reconstruction_loss(from_text, target, mask, present),
             "rec_motion": reconstruction_loss(from_motion, target, mask, present),

@@ -124,7 +124,7 @@ class H2VQ(BodyHandTokenizer):
         mask = token_mask(valid, z_body.shape[1], 2)
         both = torch.cat([hint, z_body], dim=-1)
         if mask is not None:
-            both = both.masked_fill(~mask[..., None], 0.0)
+            both = both * mask[..., None]
         fused = self.fuse(both)
         body = self.body_quantizer(fused, mask, update=update)
         return Latents(

@@ -40,12 +40,14 @@ def velocity_loss(
 
 def tokenizer_losses(net: Tokenizer, batch: Batch) -> tuple[dict[str, Tensor], TokenizerOutput]:
     """Losses of {"motion" [B, W, dim], "length" [B], "present" bool [B, dim] (optional: all)}, and what they
-    are of; what is weighed how is in the network's own config.
+    are of; what is weighed how is in the network's own config. A batch that is "full" needs no mask.
 
     Entries: loss = recon + velocity_weight * velocity + commitment * commit; recon, commit, velocity if it
     has a weight, and per stream `perplexity_<stream>`, `usage_`, `dead_`, `resets_`, `penalty_`.
     """
     motion, length, present = batch["motion"], batch["length"], batch.get("present")
+    if batch.get("full", False):
+        length = present = None
     config, out = net.config, net(motion, length, present)
     made, target = out.reconstruction, out.input
     recon = reconstruction_loss(made, target, length, config.recon, present)

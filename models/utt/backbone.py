@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from motionloom.models.layers.transformer import KVCache, Transformer, length_mask
+from motionloom.models.layers.transformer import KVCache, LayerNorm, Transformer, length_mask
 
 
 @dataclass
@@ -67,10 +67,10 @@ class PrefixGru(nn.Module):
 
     def __init__(self, layers: int, dim: int, *, dropout: float) -> None:
         super().__init__()
-        self.norms = nn.ModuleList(nn.LayerNorm(dim) for _ in range(layers))
+        self.norms = nn.ModuleList(LayerNorm(dim) for _ in range(layers))
         self.layers = nn.ModuleList(nn.GRU(dim, dim, batch_first=True) for _ in range(layers))
         self.dropout = nn.Dropout(dropout)
-        self.norm = nn.LayerNorm(dim)
+        self.norm = LayerNorm(dim)
 
     def forward(self, prefix: Tensor, mask: Tensor, x: Tensor) -> Tensor:
         return self.extend(x, self.begin(prefix, mask, x.shape[1]))

@@ -14,9 +14,15 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from motionloom.models.condition.mate import Encoded, drop_conditions
-from motionloom.models.discriminator.patch import PatchDiscriminator, discriminator_loss, generator_loss
+from motionloom.models.discriminator.patch import (
+    PatchDiscriminator,
+    Validity,
+    discriminator_loss,
+    generator_loss,
+)
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.tokens import TokenSequence, interleave
 from motionloom.models.layers.frozen import Frozen
@@ -146,7 +152,9 @@ class UttModule(AlternatingModule):
     def _critic(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         critic = self.discriminator
         assert critic is not None
-        glob, length = shared["glob"].detach(), shared["length"]
-        real = batch["motion"][:, : shared["motion"].shape[1]]
-        fake = critic(shared["motion"].detach(), glob, length)
-        return discriminator_loss(critic(real, glob, length), fake)
+        fake, glob, length = shared["motion"].detach(), shared["glob"].detach(), shared["length"]
+        real = batch["motion"][:, : fake.shape[1]]
+        real = functional.pad(real, (0, 0, 0, fake.shape[1] - real.shape[1]))
+        # At once: half as many kernels, and no weight is cast twice.
+        scores = critic(torch.cat([real, fake]), glob.repeat(2, 1), length.repeat(2))
+        return discriminator_loss(*map(Validity, scores.score.chunk(2), scores.mask.chunk(2)))

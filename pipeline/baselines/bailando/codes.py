@@ -157,12 +157,17 @@ class DanceVq(nn.Module):
         joints: N, of which the first 22 are those of `smpl22`.
     """
 
+    lower: Tensor
+    upper: Tensor
+
     def __init__(self, config: DanceVqConfig, joints: int) -> None:
         super().__init__()
         self.config = config
         self.joints = joints
-        self.lower = _LOWER
-        self.upper = [joint for joint in range(joints) if joint not in _LOWER]
+        # On the network's device: lists would be sent there at every use.
+        upper = [joint for joint in range(joints) if joint not in _LOWER]
+        self.register_buffer("lower", torch.tensor(_LOWER), persistent=False)
+        self.register_buffer("upper", torch.tensor(upper), persistent=False)
         self.up = HalfVq(config, len(self.upper), salt=0)
         self.down = HalfVq(config, len(self.lower), salt=1)
         self.root = _decoder(config, 3)

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.network import step_waves
 from motionloom.models.diffusion.schedule import ScheduleConfig
-from motionloom.models.layers.transformer import StackConfig, Transformer
+from motionloom.models.layers.transformer import LayerNorm, StackConfig, Transformer
 
 
 class CaptionConfig(StackConfig):
@@ -77,8 +77,8 @@ class Attend(nn.Module):
         super().__init__()
         dim = config.dim
         self.heads = config.heads
-        self.norm = nn.LayerNorm(dim)
-        self.norm_memory = None if memory_dim is None else nn.LayerNorm(memory_dim)
+        self.norm = LayerNorm(dim)
+        self.norm_memory = None if memory_dim is None else LayerNorm(memory_dim)
         self.query = nn.Linear(dim, dim)
         self.key = nn.Linear(memory_dim or dim, dim)
         self.value = nn.Linear(memory_dim or dim, dim)
@@ -100,7 +100,7 @@ class Stylization(nn.Module):
     def __init__(self, dim: int, style: int, dropout: float) -> None:
         super().__init__()
         self.modulate = nn.Sequential(nn.SiLU(), nn.Linear(style, 2 * dim))
-        self.norm = nn.LayerNorm(dim)
+        self.norm = LayerNorm(dim)
         self.out = nn.Sequential(nn.SiLU(), nn.Dropout(dropout), zeroed(nn.Linear(dim, dim)))
 
     def forward(self, x: Tensor, style: Tensor) -> Tensor:
@@ -151,7 +151,7 @@ class MotionDiffuse(nn.Module):
         self.positions = nn.Parameter(torch.randn(max_frames, dim) * dim**-0.5)
         self.tokens = nn.Linear(text_dim, caption.dim)
         self.reader = Transformer(caption, caption.layers, norm="post")
-        self.reader_norm = nn.LayerNorm(caption.dim)
+        self.reader_norm = LayerNorm(caption.dim)
         self.whole = nn.Linear(caption.dim, 4 * dim)
         self.time = nn.Sequential(nn.Linear(dim, 4 * dim), nn.SiLU(), nn.Linear(4 * dim, 4 * dim))
         self.enter = nn.Linear(motion_dim, dim)

@@ -26,7 +26,7 @@ from torch.nn import functional
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.gpt.tokens import TokenNetwork
-from motionloom.models.layers.transformer import StackConfig, sinusoid
+from motionloom.models.layers.transformer import LayerNorm, StackConfig, sinusoid
 from motionloom.models.metrics.captions import words_of
 from motionloom.models.tokenizer.base import Stream
 from motionloom.models.training.distributed import masked_mean, sum_over_ranks
@@ -101,7 +101,7 @@ class Attention(nn.Module):
         dim = config.dim
         self.heads, self.rate = config.heads, config.attention_dropout
         self.query, self.key, self.value, self.out = (nn.Linear(dim, dim) for _ in range(4))
-        self.dropout, self.norm = nn.Dropout(config.dropout), nn.LayerNorm(dim, eps=EPS)
+        self.dropout, self.norm = nn.Dropout(config.dropout), LayerNorm(dim, eps=EPS)
 
     def read(self, x: Tensor) -> KeysValues:
         """Keys and values of x [B, S, D]."""
@@ -131,7 +131,7 @@ class Feed(nn.Module):
     def __init__(self, config: CaptionerConfig) -> None:
         super().__init__()
         self.enter, self.leave = nn.Linear(config.dim, config.ff), nn.Linear(config.ff, config.dim)
-        self.dropout, self.norm = nn.Dropout(config.dropout), nn.LayerNorm(config.dim, eps=EPS)
+        self.dropout, self.norm = nn.Dropout(config.dropout), LayerNorm(config.dim, eps=EPS)
 
     def forward(self, x: Tensor) -> Tensor:
         out: Tensor = self.norm(x + self.dropout(self.leave(functional.relu(self.enter(x)))))

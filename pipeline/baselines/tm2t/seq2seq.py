@@ -21,6 +21,7 @@ from motionloom.datasets.schema import Config
 from motionloom.models.gpt.sampling import Drawing, decode, requested_groups, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
 from motionloom.models.layers.frozen import evaluating
+from motionloom.models.layers.transformer import LayerNorm
 from motionloom.models.tokenizer.base import Stream
 
 
@@ -85,7 +86,7 @@ class Seq2Seq(TokenNetwork):
         self.begin = nn.Linear(2 * hidden, dim)
         self.query, self.value = nn.Linear(dim, dim), nn.Linear(2 * hidden, dim)
         self.key = nn.Linear(2 * hidden, dim, bias=False)
-        self.fuse = nn.Sequential(nn.Linear(2 * dim, dim), nn.LayerNorm(dim), nn.LeakyReLU(0.2))
+        self.fuse = nn.Sequential(nn.Linear(2 * dim, dim), LayerNorm(dim), nn.LeakyReLU(0.2))
         self.cell = nn.GRUCell(dim, dim)
         self.start = nn.Parameter(torch.randn(dim) * 0.02)
         self.embeddings = self._tables(dim)

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.layers.conv import Conv, frame_padding, start_weights, zero_padded
+from motionloom.models.layers.conv import Conv, real_frames, start_weights, zero_padded
 from motionloom.models.layers.strided import SLOPE
 from motionloom.models.quantize.gradient import GradientQuantizer
 from motionloom.models.tokenizer.base import Recon, Stream, Tokenizer
@@ -56,9 +56,9 @@ class _Block(nn.Module):
         self.spread = Conv(width, width, 3, padding=dilation, dilation=dilation)
         self.mix = Conv(width, width, 3, padding=dilation, dilation=dilation)
 
-    def forward(self, x: Tensor, padding: Tensor | None) -> Tensor:
-        hidden = functional.leaky_relu(self.spread(zero_padded(x, padding)), SLOPE)
-        mixed: Tensor = self.mix(zero_padded(hidden, padding))
+    def forward(self, x: Tensor, real: Tensor | None) -> Tensor:
+        hidden = functional.leaky_relu(self.spread(zero_padded(x, real)), SLOPE)
+        mixed: Tensor = self.mix(zero_padded(hidden, real))
         return x + mixed
 
 
@@ -79,11 +79,11 @@ class Tm2tEncoder(nn.Module):
 
     def forward(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = frames that are not padding; T and `valid` are multiples of 4."""
-        padding = [frame_padding(valid, x.shape[1], 2**i) for i in range(3)]
+        real = [real_frames(valid, x.shape[1], 2**i) for i in range(3)]
         hidden = x[..., self.heard]
         for i, (down, block) in enumerate(zip(self.down, self.blocks, strict=True)):
-            hidden = functional.leaky_relu(down(zero_padded(hidden, padding[i])), SLOPE)
-            hidden = block(hidden, padding[i + 1])
+            hidden = functional.leaky_relu(down(zero_padded(hidden, real[i])), SLOPE)
+            hidden = block(hidden, real[i + 1])
         return hidden
 
 
@@ -103,14 +103,14 @@ class Tm2tDecoder(nn.Module):
 
     def forward(self, z: Tensor, valid: Tensor | None = None) -> Tensor:
         """`valid` [B] = *frames* that are not padding, a multiple of 4; padded frames come out as zero."""
-        padding = [frame_padding(valid, z.shape[1] * 4, 2**i) for i in range(3)]
+        real = [real_frames(valid, z.shape[1] * 4, 2**i) for i in range(3)]
         hidden = z
         for block in self.blocks:
-            hidden = block(hidden, padding[2])
+            hidden = block(hidden, real[2])
         for i, up in enumerate(self.up):
-            wide = zero_padded(hidden, padding[2 - i]).repeat_interleave(2, dim=1)
+            wide = zero_padded(hidden, real[2 - i]).repeat_interleave(2, dim=1)
             hidden = functional.leaky_relu(up(wide), SLOPE)
-        return zero_padded(self.out(zero_padded(hidden, padding[0])), padding[0])
+        return zero_padded(self.out(zero_padded(hidden, real[0])), real[0])
 
     def needs(self, first: int, last: int) -> tuple[int, int]:
         """First and last of the latents that frames `first` to `last` are made of; no others play a role."""
