@@ -253,7 +253,8 @@ class Benchmark:
             fields = type(stage.config).model_fields
             settings += [f"{stage.name}.{key}={value}" for key, value in SHORT.items() if key in fields]
             if stage.kind.trains:
-                settings += [f"{stage.name}.train.steps=20", f"{stage.name}.train.checkpoint_every=20"]
+                train = {"steps": 20, "checkpoint_every": 20, "compile": "false"}
+                settings += [f"{stage.name}.train.{key}={value}" for key, value in train.items()]
         settings += ["data.clips=400"] + ["data.dances.songs=16"] * name.endswith("ude")
 
         def run(until: str) -> Cells:
