@@ -70,25 +70,6 @@ def real_joints(fixture: Path, body: BodyModel) -> np.ndarray:
 # ---- motion
 
 
-def test_real_file_equals_the_golden_joints(shared: Path, fixture: Path) -> None:
-    """The golden joints come from another program with another skeleton.
-
-    Its bones are what its joints say in one frame, turned back; all 150 frames must then agree.
-    """
-    with np.load(shared / "golden/t1_humanml3d_A.npz", allow_pickle=False) as golden:
-        expected = golden["aist__joints"].astype(np.float64)
-    motion = read_aist_motion(fixture / f"motions/{REAL}.pkl")
-    poses = motion.poses.reshape(-1, 24, 3)[::3, :22][:150].astype(np.float64)
-    skeleton = Skeleton.named("smpl22")
-    world, rest = [rodrigues(poses[0, 0])], np.zeros((22, 3))
-    for joint, parent in enumerate(skeleton.parents[1:], start=1):
-        world.append(world[parent] @ rodrigues(poses[0, joint]))
-        rest[joint] = rest[parent] + world[parent].T @ (expected[0, joint] - expected[0, parent])
-    body = BodyModel(skeleton, rest, np.zeros((22, 3, 0)), {})
-    joints = smpl_joints(poses, motion.metres()[::3][:150], body)
-    assert np.abs(joints - expected).max() < 5e-5
-
-
 def test_a_genuine_file_agrees_with_a_slow_forward(shared: Path, tmp_path: Path) -> None:
     """Joints of a whole dance, frame by frame and joint by joint in float64, from the numbers themselves."""
     path = shared / f"data/real/aistpp/{REAL}.pkl"

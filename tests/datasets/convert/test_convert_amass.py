@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import zipfile
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -178,23 +176,6 @@ def test_broken_clips_are_left_out_with_their_reason(
     assert message in reason and str(tmp_path) not in reason
     assert list(amass.features(tmp_path / "out")) == ["A/b/good_poses"]
     assert not (tmp_path / "PWNED_amass").exists()
-
-
-def test_stated_sizes_are_not_believed(amass: ModuleType, tmp_path: Path) -> None:
-    """A header that asks for terabytes, and one that is larger than the limit, cost nothing."""
-    amass.save(tmp_path / "in/A/b/good_poses.npz", **amass.walk(60.0))
-    path = tmp_path / "in/A/b/bomb_poses.npz"
-    text = b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000, 156), }"
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        start = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little")
-        archive.writestr("poses.npy", start + text + bytes(99))
-        for name, values in amass.walk(60.0).items():
-            if name != "poses":
-                buffer = io.BytesIO()
-                np.save(buffer, values)
-                archive.writestr(f"{name}.npy", buffer.getvalue())
-    manifest = amass.make(tmp_path / "in", tmp_path / "out")
-    assert "[10000000000, 156]" in amass.reasons(manifest)["A/b/bomb_poses.npz"]
 
 
 def test_pickled_extras_do_not_matter(amass: ModuleType, tmp_path: Path) -> None:

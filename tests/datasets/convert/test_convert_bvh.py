@@ -116,26 +116,6 @@ def test_a_single_clip_is_converted_like_the_whole(clips: Path, tmp_path: Path) 
     assert seconds is not None and 0 < seconds < 60
 
 
-def test_a_killed_run_resumes_to_the_same_bytes(
-    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    convert(config(copy), tmp_path / "whole", clips_per_shard=2)
-    real, calls = Bvh.encode, []
-
-    def dies(*args: Any) -> Any:
-        calls.append(args)
-        if len(calls) == 5:
-            raise KeyboardInterrupt
-        return real(*args)
-
-    monkeypatch.setattr(Bvh, "encode", dies)
-    with pytest.raises(KeyboardInterrupt):
-        convert(config(copy), tmp_path / "out", clips_per_shard=2)
-    convert(config(copy), tmp_path / "out", clips_per_shard=2)
-    assert len(calls) == 5 + 2  # two shards were kept, only the clips of the other two are made again
-    assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "whole")
-
-
 def test_a_finished_conversion_reads_nothing_again(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

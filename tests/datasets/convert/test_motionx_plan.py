@@ -36,12 +36,6 @@ def test_captions_of_both_grammars(fixture: Path) -> None:
     assert any(HUMANML in note and "0.5 s" in note and "1.7 s" in note for note in notes)
 
 
-def test_segments_are_seconds_at_30_fps(copy: Path) -> None:
-    (copy / TEXTS / f"{HUMANML}.txt").write_text("a person waves#a/DET person/NOUN wave/VERB#0.4#1.5\n")
-    caption = planned(copy)[HUMANML].texts[0]
-    assert (caption.start, caption.end) == (0.4, 1.5)
-
-
 def test_names_and_empty_captions(copy: Path) -> None:
     (copy / TEXTS / f"{WAVE}.txt").write_text("\ufeffDance_Break_Back_Cc_clip_2\r\n\r\n")
     (copy / TEXTS / f"{BOW}.txt").write_text("\n  \n")

@@ -202,23 +202,6 @@ def test_one_item_may_give_many_clips_and_float16(made: ModuleType, tmp_path: Pa
     assert dataset.meta(1).mirror_of == dataset.ids[0] and dataset.meta(1).split == "val"
 
 
-@pytest.mark.parametrize("count", [1, 2, 20])
-def test_parts_in_any_order_and_one_last_run_give_the_same_bytes(
-    made: ModuleType, tmp_path: Path, count: int
-) -> None:
-    convert = made.Convert(drop=(3, 17), bad=(8,))
-    whole = made.write(tmp_path / "whole", convert=convert)
-    out = tmp_path / "out"
-    parts = [made.write(out, convert=convert, part=Part(k, count)) for k in reversed(range(count))]
-    assert sorted(s.name for part in parts for s in part.shards) == sorted(s.name for s in whole.shards)
-    assert sum(len(part.dropped) for part in parts) == 3
-    assert not (out / "manifest.json").exists() and not (out / "index.npz").exists()
-    kept = {path.name: path.stat().st_mtime_ns for path in out.glob("*.tar")}
-    assert made.write(out, convert=convert) == whole
-    assert digests(out) == digests(tmp_path / "whole")
-    assert {name: (out / name).stat().st_mtime_ns for name in kept} == kept
-
-
 def test_parts_of_several_kinds_of_processor_are_noted(
     made: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

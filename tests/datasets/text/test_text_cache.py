@@ -335,16 +335,3 @@ def test_similarity_is_the_named_encoders_and_of_one_encoder_nothing_more_is_sto
         cache = built(tmp_path / str(similarity), "minilm", similarity)
         np.testing.assert_array_equal(cache.similarity(NUMBERED), wanted("minilm", NUMBERED))
         assert not (tmp_path / str(similarity) / "similarity").exists()
-
-
-@pytest.mark.usefixtures("encoders")
-def test_a_changed_encoder_or_caption_set_is_followed(tmp_path: Path) -> None:
-    built(tmp_path, "clip", "minilm", NUMBERED[:10])
-    more = built(tmp_path, "clip", "minilm")
-    np.testing.assert_array_equal(more.similarity(NUMBERED), wanted("minilm", NUMBERED))
-    np.testing.assert_array_equal(
-        built(tmp_path, "clip", "other").similarity(NUMBERED), wanted("other", NUMBERED)
-    )
-    np.testing.assert_array_equal(
-        built(tmp_path, "minilm", "minilm").similarity(NUMBERED), wanted("minilm", NUMBERED)
-    )
