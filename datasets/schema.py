@@ -61,6 +61,14 @@ def read_plain(path: Path, most: int = MOST_JSON_BYTES, name: str = "") -> bytes
     return path.read_bytes()
 
 
+def parse_json(raw: str | bytes, where: str, **how: Any) -> Any:
+    """Return JSON decoded, with `how` as for `json.loads`; `UserError` beginning with `where` otherwise."""
+    try:
+        return json.loads(raw.decode() if isinstance(raw, bytes) else raw, **how)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{where}: not valid JSON ({error or 'too deep'})") from None
+
+
 class Config(BaseModel):
     """Base of every config class and record: unknown keys and wrong types are refused, values are frozen."""
 
@@ -78,12 +86,12 @@ class Config(BaseModel):
     def load_json(cls, path: Path) -> Self:
         """Read one record from a JSON file."""
         try:
-            data = json.loads(read_plain(path).decode("utf-8"))
+            raw = read_plain(path)
         except FileNotFoundError:
             raise UserError(f"{path}: no such file") from None
-        except (ValueError, RecursionError, OSError) as error:
-            raise UserError(f"{path}: not valid JSON ({error})") from None
-        return cls.parse(data, str(path))
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error})") from None
+        return cls.parse(parse_json(raw, str(path)), str(path))
 
     def dump(self) -> dict[str, Any]:
         """Plain JSON types, every default written out."""

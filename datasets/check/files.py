@@ -15,7 +15,6 @@ Nothing is written, run or extracted, whatever a file holds.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -36,7 +35,7 @@ from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.scan import read_file
 from motionloom.datasets.convert.common.splits import read_ids, read_split_files
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
-from motionloom.datasets.schema import SPLITS, Config, UserError
+from motionloom.datasets.schema import SPLITS, Config, UserError, parse_json
 from motionloom.datasets.shards.tar import npy_from_bytes, scan_tar
 from motionloom.datasets.text.clean import usable_caption
 
@@ -139,7 +138,7 @@ def _member_problem(where: str, name: str, raw: bytes, rules: FileRules) -> str:
     """Return the fault of a member of a stranger's shard; empty where there is none."""
     try:
         if name.endswith("json"):
-            json.loads(raw)
+            parse_json(raw, where)
         elif name.endswith("npy"):
             values = npy_from_bytes(raw, where)
             if name == "motion.npy":
@@ -148,8 +147,8 @@ def _member_problem(where: str, name: str, raw: bytes, rules: FileRules) -> str:
                 require_sensible(name, values)
     except UserError as error:
         return str(error)
-    except (ValueError, RecursionError) as error:
-        return f"{where}: {'not valid JSON' if name.endswith('json') else 'unfit'} ({error})"
+    except ValueError as error:
+        return f"{where}: unfit ({error})"
     return ""
 
 

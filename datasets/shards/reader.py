@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import mmap
 import re
 from bisect import bisect_right
@@ -37,6 +36,7 @@ from motionloom.datasets.schema import (
     ShardInfo,
     Split,
     UserError,
+    parse_json,
 )
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.clips import ClipDataset
@@ -69,11 +69,7 @@ def read_manifest(store: Store, digest: str | None = None) -> tuple[Manifest, st
             f"{store.place}: no {MANIFEST_FILE}, so the conversion is unfinished or this is no dataset; "
             f"convert it"
         ) from None
-    try:
-        data = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{where}: not valid JSON ({error})") from None
-    manifest = Manifest.parse(data, where)
+    manifest = Manifest.parse(parse_json(raw, where), where)
     if manifest.schema_version != SCHEMA_VERSION:
         raise UserError(
             f"{where}: schema version {manifest.schema_version}, not {SCHEMA_VERSION}; convert again"

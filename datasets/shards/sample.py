@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, MotionType, Split, UserError
+from motionloom.datasets.schema import Caption, ClipMeta, MotionType, Split, UserError, parse_json
 
 _OURS = ("audio.flac", "audio.npy", "face_texts.json", "meta.json", "motion.npy", "texts.json")
 MEMBERS = list(_OURS)
@@ -119,22 +119,14 @@ def flac_bytes(signal: NDArray[np.float32], rate: int) -> bytes:
     return buffer.getvalue()
 
 
-def _decoded(raw: bytes, where: str) -> object:
-    try:
-        decoded: object = json.loads(raw)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{where}: not valid JSON ({error})") from None
-    return decoded
-
-
 def meta_from_json(raw: bytes, where: str) -> ClipMeta:
     """The metadata of a `meta.json` member; `UserError` naming `where` otherwise."""
-    return ClipMeta.parse(_decoded(raw, where), where)
+    return ClipMeta.parse(parse_json(raw, where), where)
 
 
 def captions_from_json(raw: bytes, where: str) -> list[Caption]:
     """The captions of a `texts.json` member; `UserError` naming `where` otherwise."""
-    data = _decoded(raw, where)
+    data = parse_json(raw, where)
     if not isinstance(data, Sequence) or isinstance(data, str):
         raise UserError(f"{where}: expected a list of captions")
     return [Caption.parse(item, where) for item in data]

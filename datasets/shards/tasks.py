@@ -14,11 +14,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
-from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of, sha256_of_json, write_json
+from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of_json, write_json
 from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import SPLITS, Dropped, MotionType, ShardInfo, Split, UserError
+from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, Written, clip_entries, index_path
 from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
@@ -215,13 +216,10 @@ def finished_shard(task: ShardTask[Any]) -> Result | None:
     path = index_path(task.path)
     try:
         index = ShardIndex.load_json(path)
-    except UserError:
-        return None
-    if index.fingerprint != task.fingerprint or (task.strict and any(index.dropped)):
-        return None
-    if index.shard is not None:
-        if not task.path.exists() or task.path.stat().st_size != index.shard.bytes:
+        if index.fingerprint != task.fingerprint or (task.strict and any(index.dropped)):
             return None
-        if sha256_of(task.path) != index.shard.sha256:
-            return None
+        if index.shard is not None:
+            require_intact(LocalShard(task.path, index.shard))
+    except UserError:  # none, or damaged: made again
+        return None
     return index.shard, index.dropped

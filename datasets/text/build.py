@@ -1,10 +1,8 @@
-"""Making a text cache in parts: each computed once, by any process, and kept if the run is killed.
+"""Making a text cache in parts, by any number of processes.
 
 Captions that are not in the cache yet are divided by the first bits of their keys into parts of about 512.
-`parts/NAME.npz` is one finished part; its name is a digest of the encoder and of the captions in it, so a run
-that is started again finds what is done, and a changed caption set never meets a wrong part. A part is
-encoded on one thread, in an order that depends on its captions alone: the bytes of the finished cache do not
-depend on how many processes made it, or on how often it was interrupted.
+A part is encoded on one thread, in an order that depends on its captions alone: the bytes of the finished
+cache do not depend on how many processes made it.
 
 Parts are ranges of ascending keys, so merging them, with what the cache held before, is one pass that
 streams to disk. The old files stay in place until all new ones are written.
@@ -12,7 +10,6 @@ streams to disk. The old files stay in place until all new ones are written.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -120,18 +117,17 @@ def build_with_encoder(
     if old is not None and not new:
         return old
     place = folder / "parts"
-    place.mkdir(exist_ok=True)
-    for left in (folder, place):
-        remove_temporaries(left)
-    parts = _parts(new, wanted, place, encoder.name)
-    missing = [part for part in parts if not _finished(part, encoder.dim)]
-    workers = min(workers, len(missing) // PARTS_A_WORKER)
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    remove_temporaries(folder)
+    parts = _parts(new, wanted, place)
+    workers = min(workers, len(parts) // PARTS_A_WORKER)
     encode: Callable[[_Part], None] = partial(_encode_part, encoder=encoder)
     if workers > 1:
         encode = partial(_encode_elsewhere, load, spec, encoder.name)
     with Workers(workers) as pool:
-        done = pool.run(encode, missing)
-        for _ in track(done, "encoding captions", total=len(missing), disable=not progress):
+        done = pool.run(encode, parts)
+        for _ in track(done, "encoding captions", total=len(parts), disable=not progress):
             pass
     texts = {**(old.captions_by_key() if old else {}), **wanted}
     _merge(folder, texts, new, parts, old, encoder)
@@ -161,17 +157,16 @@ def _reusable(folder: Path, encoder: TextEncoder) -> TextCache | None:
     return found if (found.encoder, found.dim) == (encoder.name, encoder.dim) else None
 
 
-def _parts(keys: Sequence[bytes], texts: dict[bytes, str], place: Path, encoder: str) -> list[_Part]:
+def _parts(keys: Sequence[bytes], texts: dict[bytes, str], place: Path) -> list[_Part]:
     """Parts of ascending keys, by their first bits: as many bits as make parts of at most PART on average."""
     bits = max(0, (len(keys) - 1) // PART).bit_length()
     groups: dict[int, list[bytes]] = {}
     for key in keys:
         groups.setdefault(int.from_bytes(key[:4], "big") >> (32 - bits), []).append(key)
-    parts = []
-    for _, members in sorted(groups.items()):
-        name = hashlib.sha256(b"".join([encoder.encode(), b"\0", *members])).hexdigest()
-        parts.append(_Part(place / f"{name}.npz", tuple(texts[key] for key in members)))
-    return parts
+    return [
+        _Part(place / f"{number}.npz", tuple(texts[key] for key in members))
+        for number, members in sorted(groups.items())
+    ]
 
 
 def _encode_part(part: _Part, encoder: TextEncoder) -> None:
@@ -188,27 +183,8 @@ def _encode_part(part: _Part, encoder: TextEncoder) -> None:
         sentence[rows] = encoded.sentence
         for i, states, mask in zip(rows, encoded.tokens, encoded.mask, strict=True):
             tokens[i] = states[mask].astype(np.float16)
-    with atomic_file(part.path) as file:
-        np.savez(
-            file,
-            allow_pickle=False,
-            sentence=sentence,
-            lengths=np.array([len(rows) for rows in tokens], dtype=np.int64),
-            tokens=np.concatenate(tokens),
-        )
-
-
-def _finished(part: _Part, dim: int) -> bool:
-    """Whether the part is on disk and whole; the zip's checksums cover every array."""
-    try:
-        sentence, lengths, tokens = (_load(part, name) for name in ("sentence", "lengths", "tokens"))
-    except Exception:  # zipfile and numpy raise many kinds for a damaged file; it is made again
-        return False
-    return (sentence.shape, lengths.shape, tokens.shape) == (
-        (len(part.captions), dim),
-        (len(part.captions),),
-        (int(lengths.sum()), dim),
-    )
+    lengths = np.array([len(rows) for rows in tokens], dtype=np.int64)
+    np.savez(part.path, allow_pickle=False, sentence=sentence, lengths=lengths, tokens=np.concatenate(tokens))
 
 
 def _merge(

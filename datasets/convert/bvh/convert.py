@@ -71,9 +71,8 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         motion = self._motion(clip.read(), clip.label())
         joint_map = self._map_of(motion)
         joints = self._world(motion, joint_map)
-        names = tuple(names[0] if len(names) == 1 else names for names in joint_map.sources)
         up = joint_map.up or self.config.up
-        return SourceJoints(joints, self.config.source_fps or motion.fps, names, up)
+        return SourceJoints(joints, self.config.source_fps or motion.fps, mapped=True, up=up)
 
     def encode(self, label: str, data: bytes) -> NDArray[np.float32]:
         """Features [T', D] of one file; `label` names it in errors."""

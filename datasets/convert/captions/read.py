@@ -20,7 +20,7 @@ from pydantic import AliasChoices, ConfigDict, Field, FiniteFloat
 from motionloom.datasets.convert.captions.humanml_text import parse_caption
 from motionloom.datasets.convert.common.files import check_id, read_text_file
 from motionloom.datasets.convert.common.splits import split_named
-from motionloom.datasets.schema import Caption, Config, Split, UserError
+from motionloom.datasets.schema import Caption, Config, Split, UserError, parse_json
 
 SOURCE = "captions"
 """`source` of captions that state none."""
@@ -209,10 +209,7 @@ def _record(where: str, value: object) -> tuple[str, dict[str, object]]:
 
 
 def _decode(where: str, text: str) -> object:
-    try:
-        return json.loads(text, object_pairs_hook=_without_repeats)
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{where}: not valid JSON ({error or 'too deep'})") from None
+    return parse_json(text, where, object_pairs_hook=_without_repeats)
 
 
 def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:

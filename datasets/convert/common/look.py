@@ -31,9 +31,6 @@ from motionloom.datasets.shards.left_out import drop, grouped
 ADULT_METRES = 1.7
 """Height of an ordinary adult: of two units that make a person of a figure, the nearer one is meant."""
 
-Names = tuple[str | tuple[str, ...], ...]
-"""Name in the file of each joint, or several names; empty where no joint map is used."""
-
 
 @dataclass(frozen=True)
 class Suggestion:
@@ -70,7 +67,7 @@ def stats_of(clips: Iterable[SeenClip]) -> PlausibilityStats:
     return stats
 
 
-def _suggest(clips: list[SeenClip], config: ConvertConfig, names: Names) -> list[Suggestion]:
+def _suggest(clips: list[SeenClip], config: ConvertConfig, mapped: bool) -> list[Suggestion]:
     """Changes that together make people of the clips: axis, unit, sides."""
     out: list[Suggestion] = []
     seen = stats_of(clips)
@@ -85,8 +82,8 @@ def _suggest(clips: list[SeenClip], config: ConvertConfig, names: Names) -> list
         out.append(_suggest_unit(seen.height, config))
     if not out and any(oddity.kind == "left and right" and oddity.is_error for oddity in seen.oddities()):
         why = "the feet point backwards"
-        mapped = Suggestion("joint_map", "exchange the left and the right rows", why)
-        out.append(mapped if names else Suggestion("source", "exchange left and right in the source", why))
+        rows = Suggestion("joint_map", "exchange the left and the right rows", why)
+        out.append(rows if mapped else Suggestion("source", "exchange left and right in the source", why))
     return out
 
 
@@ -137,8 +134,8 @@ class SourceJoints:
     joints: NDArray[np.floating]
     """World positions [T, N, 3] in metres, Y up, after the options for unit and axis."""
     fps: float
-    names: Names = ()
-    """Name in the file of each joint (several: their mean), where a joint map is used."""
+    mapped: bool = False
+    """Whether a joint map was used."""
     up: str = "y"
     """The upward axis of the file."""
 
@@ -229,7 +226,7 @@ def look_at(
     chosen, subsets = _choose(items, subset_of, config.look, label)
     clips: list[SeenClip] = []
     failed: list[tuple[str, Dropped]] = []
-    names: Names = ()
+    mapped = False
     for name, item in chosen:
         try:
             seen = see(item)
@@ -242,13 +239,13 @@ def look_at(
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))
         body = np.asarray(seen.joints[::step, :BODY_JOINTS], dtype=np.float64)
         clips.append(SeenClip(name, body, seen.fps / step, seen.fps, seen.up))
-        names = names or seen.names
+        mapped = mapped or seen.mapped
     unreadable = Counter(name for name, _ in failed)
     found = [
         _subset(name, [clip for clip in clips if clip.subset == name], unreadable[name])
         for name in dict.fromkeys(name for name, _ in chosen)
     ]
-    problems, warnings, suggestions = _judge(clips, config, names)
+    problems, warnings, suggestions = _judge(clips, config, mapped)
     # One reason for every clip is a wrong option or map; several reasons are damaged files.
     groups = grouped([drop for _, drop in failed])
     if failed and not clips and len(groups) == 1:
@@ -300,7 +297,7 @@ def _subset(name: str, clips: list[SeenClip], unreadable: int) -> SubsetLook:
 
 
 def _judge(
-    clips: list[SeenClip], config: ConvertConfig, names: Names
+    clips: list[SeenClip], config: ConvertConfig, mapped: bool
 ) -> tuple[list[str], list[str], list[Suggestion]]:
     oddities = stats_of(clips).oddities()
     problems = [oddity.text for oddity in oddities if oddity.is_error]
@@ -317,4 +314,4 @@ def _judge(
                 for oddity in stats_of(members).oddities()
                 if oddity.is_error and oddity.kind not in known
             ]
-    return problems, warnings, _suggest(clips, config, names) if problems else []
+    return problems, warnings, _suggest(clips, config, mapped) if problems else []

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from motionloom.datasets.convert.common.files import read_text_file
-from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.schema import Caption, UserError, parse_json
 from motionloom.datasets.text.clean import clean_caption
 
 
 def read_json(path: Path, name: str) -> object:
     """The content of a JSON file; `UserError` names it."""
-    try:
-        return json.loads(read_text_file(path, name))
-    except (ValueError, RecursionError) as error:
-        raise UserError(f"{name}: not valid JSON ({error or 'too deep'})") from None
+    return parse_json(read_text_file(path, name), name)
 
 
 def read_json_lines(path: Path, name: str) -> Iterator[tuple[str, dict[str, object]]]:
@@ -25,11 +21,7 @@ def read_json_lines(path: Path, name: str) -> Iterator[tuple[str, dict[str, obje
     for number, line in enumerate(read_text_file(path, name).split("\n"), start=1):
         if line.strip():
             place = f"{name}:{number}"
-            try:
-                record = json.loads(line)
-            except (ValueError, RecursionError) as error:
-                raise UserError(f"{place}: not valid JSON ({error or 'too deep'})") from None
-            yield place, require_record(record, place)
+            yield place, require_record(parse_json(line, place), place)
 
 
 def require_record(value: object, place: str) -> dict[str, object]:

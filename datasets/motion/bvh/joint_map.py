@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import difflib
 import json
+from codecs import BOM_UTF8
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.motion.bvh.motion import END, BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Config, UserError, read_plain
+from motionloom.datasets.schema import Config, UserError, parse_json, read_plain
 
 NamedUnit = Literal["m", "cm", "mm", "inch", "dm", "foot", "inch/0.45"]
 Unit = NamedUnit | Annotated[float, Field(gt=0, lt=1e6)]
@@ -86,11 +87,10 @@ class JointMap:
     def load(path: Path, *, target: str = "smpl22") -> JointMap:
         """Read the rows of skeleton `target` from a map file; every target joint must have one row."""
         try:
-            data = json.loads(read_plain(path, 2**22).decode("utf-8-sig"))
+            raw = read_plain(path, 2**22)
         except OSError as error:
             raise UserError(f"{path}: cannot read the joint map ({error.strerror})") from None
-        except (ValueError, RecursionError) as error:
-            raise UserError(f"{path}: not valid JSON ({error})") from None
+        data = parse_json(raw.removeprefix(BOM_UTF8), str(path))
         if not isinstance(data, dict) or target not in data:
             keys = ", ".join(data) if isinstance(data, dict) else "no keys"
             raise UserError(

@@ -244,35 +244,6 @@ def test_same_bytes_for_any_number_of_workers(
         np.testing.assert_allclose(caches[1].sentence([caption]), alone.sentence, atol=1e-5)
 
 
-def test_a_killed_build_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """SIGKILL between two parts; the second run asks only for what is missing."""
-    script = f"""
-import sys, time
-sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(__file__).parents[2] / "helpers")!r}]
-from pathlib import Path
-import test_text_cache as t
-t.build_module.PART = 16
-class Slow(t.Counting):
-    def encode(self, captions):
-        if len(self.asked) > 40:
-            print(len(self.asked), flush=True)
-            time.sleep(60)
-        return super().encode(captions)
-t.build_with_encoder(Path({str(tmp_path / "a")!r}), t.phrases(100), Slow(), progress=False)
-"""
-    process = subprocess.Popen([sys.executable, "-P", "-c", script], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    done = int(process.stdout.readline())
-    process.kill()
-    process.communicate()
-    rest = Counting()
-    monkeypatch.setattr(build_module, "PART", 16)
-    build_with_encoder(tmp_path / "a", phrases(100), rest, progress=False)
-    build_with_encoder(tmp_path / "b", phrases(100), Counting(), progress=False)
-    assert len(rest.asked) == 100 - done
-    assert digests(tmp_path / "a") == digests(tmp_path / "b")
-
-
 @pytest.mark.slow
 def test_many_captions_are_not_held_in_memory(tmp_path: Path) -> None:
     """40 000 captions of 6 to 12 tokens of 256 numbers are 180 MB; the build adds far less."""
