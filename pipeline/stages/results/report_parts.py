@@ -81,12 +81,12 @@ def _draw_samples(page: Page, stage: CompletedStage) -> None:
     rows = read_rows(folder / SAMPLE_FIGURES)
     for name in sorted({key.partition("/")[2] for row in rows for key in row if "/" in key}):
         page.add_plot(log_lines(rows, name, "samples", splits=("drawn", "recorded")), f"{stage.name}: {name}")
-    motions = []
-    for path in sorted(folder.glob(f"step={int(rows[-1]['step']):08d}/*.npz") if rows else ()):
+    step, motions = int(rows[-1]["step"]) if rows else 0, []
+    for path in sorted(folder.glob(f"step={step:08d}/*.npz")):
         with NpzFile(path) as stored:
             facts, joints = json.loads(str(stored.array("metadata"))), stored.numbers("joints")
         parents = Skeleton.named(facts["skeleton"]).parents
-        motions.append(ViewerMotion(joints, facts["fps"], parents, path.parent.name, facts["caption"]))
+        motions.append(ViewerMotion(joints, facts["fps"], parents, f"step {step:,}", facts["caption"]))
     if motions:
         page.add_viewer(motions, f"{stage.name}: motions for captions or music of held-out clips.")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -15,13 +16,17 @@ from typing import Any
 import pytest
 import torch
 import yaml
+from rich.console import Console
 from safetensors.torch import load_file
 
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.contract.stage import StageCache, StageContext, stage_kind
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.samples import draw_samples
 from motionloom.pipeline.runs.snapshot import run_at
 from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.training import samples
 from motionloom.pipeline.training.checkpointing import readable
 
 MODEL = ("artifact.json", "model.json", "model.safetensors")
@@ -140,7 +145,8 @@ def test_while_it_trains(small_run: Any, start: Callable[..., Any], tmp_path: Pa
     assert (motions / "index.html").is_file() and list(motions.glob("*.npz"))
     done = call("report", run)
     page = (run / "report/report.html").read_text()
-    assert done.code == 0 and "gpt: position.ape_joints" in page and motions.name in page
+    assert done.code == 0 and "gpt: position.ape_joints" in page
+    assert f'"step {json.loads(figures.read_text().splitlines()[-1])["step"]:,}"' in page
 
 
 def test_samples_of_dances(ude_run: Any, tmp_path: Path) -> None:
@@ -148,3 +154,18 @@ def test_samples_of_dances(ude_run: Any, tmp_path: Path) -> None:
     shutil.copytree(ude_run.folder, run)
     out = draw_samples(run, "utt")
     assert out.name == "step=00000012" and list(out.glob("*.npz"))
+
+
+def test_a_drawing_that_fails_is_one_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(samples, "_PROGRAM", "motionloom.no_such_module")
+    console = Console(file=io.StringIO(), width=200)
+    for name in ("gpt", "tma"):
+        folder, kind = tmp_path / "stages" / name, stage_kind(name, "")
+        context = StageContext(name, "", kind.config(), folder, {}, 0, Hardware(), console, StageCache())
+        process = samples.SampleProcess(context, name, 2)
+        for step in range(1, 9):
+            process.saved(step)
+            if process._process is not None:
+                assert name == "gpt" and process._process.wait() == 1
+    assert isinstance(console.file, io.StringIO) and console.file.getvalue().count("log.txt") == 1
+    assert "no_such_module" in (tmp_path / "stages/gpt/samples/log.txt").read_text()
