@@ -233,11 +233,11 @@ class TokenBatches(Dataset[dict[str, Any]]):
             # `default_rng([seed, turn, item])`, in words of 32 bits, which are read faster.
             seed = [self.seed >> bit & 0xFFFFFFFF for bit in range(0, max(1, self.seed.bit_length()), 32)]
             keys = np.column_stack([np.tile(seed, (len(items), 1)), turns, items]).astype(np.uint32)
-            for row, key in enumerate(keys):
-                rng = np.random.Generator(np.random.PCG64(key))
-                chosen[row] += rng.integers(choices[row])
-                more = own.count[chosen[row]] - self.max_groups
-                skipped[row] = rng.integers(more + 1) if more > 0 else 0
+            rngs = [np.random.Generator(np.random.PCG64(key)) for key in keys]
+            chosen += [rng.integers(many) for rng, many in zip(rngs, choices.tolist(), strict=True)]
+            more = own.count[chosen] - self.max_groups
+            for row in np.flatnonzero(more > 0).tolist():
+                skipped[row] = rngs[row].integers(more[row] + 1)
         return chosen, own.first[chosen] + skipped, np.minimum(own.count[chosen], self.max_groups)
 
     def _sequences(

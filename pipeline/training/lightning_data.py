@@ -25,12 +25,16 @@ class StageData(L.LightningDataModule):
     """The batches of a stage's training, each rank's own, and those of its validation.
 
     Step k reads the same global batch as in the pipeline's own loop, on any number of processes; a Trainer
-    that resumes goes on behind the last step. `train.batch_size` is the global batch.
+    that resumes goes on behind the last step. `train.batch_size` is the global batch. Batches are loaded in
+    workers where `hardware.workers` says how many.
     """
 
     def __init__(self, batches: Batches, train: TrainConfig, hardware: Hardware | None = None) -> None:
         super().__init__()
-        self.batches, self.config, self.hardware = batches, train, hardware or Hardware()
+        hardware = hardware or Hardware()
+        if hardware.workers == "auto":  # each would run a script anew that has no `if __name__ == "__main__"`
+            hardware = hardware.model_copy(update={"workers": 0})
+        self.batches, self.config, self.hardware = batches, train, hardware
 
     def setup(self, stage: str) -> None:
         """Compute in as many threads of a CPU as the pipeline's own loop: another number rounds otherwise."""

@@ -15,7 +15,10 @@ import torch
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.lightning_data import StageData
 from motionloom.pipeline.training.loaders import on_device
+from motionloom.pipeline.training.trained_stage import Batches
 
 GIB = 2**30
 
@@ -51,6 +54,14 @@ def test_workers_by_cores_processes_and_shared_memory(
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     monkeypatch.setattr(shutil, "disk_usage", usage)
     assert Hardware.parse(settings, "hardware").workers_for(batches) == wanted
+
+
+@pytest.mark.parametrize(("workers", "wanted"), [("auto", 0), (2, 2)])
+def test_a_script_starts_workers_only_when_told(workers: int | str, wanted: int) -> None:
+    hardware = Hardware.parse({"accelerator": "gpu", "devices": 1, "workers": workers}, "hardware")
+    batches: Any = Batches(lambda *_: [{}] * 1000, None)
+    data = StageData(batches, TrainConfig(), hardware)
+    assert data.hardware.workers_for(1000) == wanted
 
 
 @pytest.mark.parametrize("workers", [-1, "many"])
