@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Literal
 
 import torch
 import torch.distributed as dist
@@ -87,19 +88,13 @@ def _mark() -> torch.cuda.Event:
 
 
 class Telemetry:
-    """Measures the steps of one process; `folder` is the stage's. A step has `flops`, of a known `peak` or 0.
+    """Measures the steps of one process; `folder` is the stage's, `at_peak` as `Utilization` has it.
 
     No error in writing ends the training: the rest of the rows are only shown then.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        module: StageModule,
-        batch_size: int,
-        console: Console,
-        flops: float = 0.0,
-        peak: float | None = None,
+        self, folder: Path, module: StageModule, batch_size: int, console: Console, at_peak: float
     ) -> None:
         self.module, self.batch_size, self.console = module, batch_size, console
         self.waits = WaitTimes(module.device)
@@ -127,7 +122,9 @@ class Telemetry:
             # Rows of later steps, which come again, are dropped.
             write_text(path, "".join(json.dumps(row) + "\n" for row in rows if row["step"] <= module.step))
             self._log = path
-        self._use = Utilization(rows, module.step, flops=flops, peak=peak)
+        self._use = Utilization(rows, module.step, at_peak)
+        self._start_seconds = 0.0
+        """Until the first step was over, which compiles; checkpoints and validations apart."""
 
     def batch(self, batch: Batch) -> None:
         """A batch has been read: count its frames or tokens."""
@@ -147,7 +144,7 @@ class Telemetry:
         self._own.append(seconds - (self.waits.process - self._waited_before))
         if self.module.step == self._first + 1:
             self.waits.read()
-            self._use.start(self.waits.aside)
+            self._start_seconds = time.perf_counter() - self._start - self.waits.aside
 
     def end_row(self) -> dict[str, float]:
         """Write a row; all ranks call this after the same step. What loggers get of it."""
@@ -160,21 +157,23 @@ class Telemetry:
         waited, self._before = self.waits.shares(self._before, wall), dict(self.waits)
         seconds, self._seconds, self._own = self._seconds, [], []
         units, latest = self._read_lengths(), sorted(self._latest)
-        has_first = self.module.step - self._first == len(seconds)
+        first = self.module.step - self._first == len(seconds)
+        mean, use = self._use.row(len(seconds) - first, self.waits.aside + self._start_seconds)
         row: dict[str, float] = {
             "samples_per_second": len(seconds) * self.batch_size / wall,
             "step_seconds": statistics.median(seconds),
             "step_seconds_p95": latest[-(-95 * len(latest) // 100) - 1],
             **{f"waited/{cause}": share for cause, share in waited.items()},
             "rss_mib": _rss_mib(),
-            **self._use.row(len(seconds) - has_first, self.waits.aside),
+            **use,
         }
         if self._unit:
             row[f"{self._unit}_per_second"] = units * world_size() / wall
         if self.module.device.type == "cuda":
             row["cuda_peak_mib"] = torch.cuda.max_memory_allocated(self.module.device) / 2**20
             # Between two rows, where it is waited for: a single step only starts its kernels.
-            row["step_seconds"] = self._use.step_seconds or row["step_seconds"]
+            if len(seconds) > first:
+                row["step_seconds"] = mean
         self._shown = [f"goodput {100 * row['goodput']:.1f} %"]
         if "mfu" in row:
             self._shown.insert(0, f"MFU {100 * row['mfu']:.1f} %")
@@ -264,17 +263,8 @@ class StepProfiler:
         phases = schedule(wait=before - warm, warmup=warm, active=self.steps, repeat=1)
         self._profile = profile(schedule=phases, on_trace_ready=self._write, record_shapes=True)
 
-    def start(self) -> None:
-        self._do("start")
-
-    def step(self) -> None:
-        """A step is over."""
-        self._do("step")
-
-    def stop(self) -> None:
-        self._do("stop")
-
-    def _do(self, name: str) -> None:
+    def do(self, name: Literal["start", "step", "stop"]) -> None:
+        """Start, count a step, or stop."""
         if self._profile is None:
             return
         with optional(f"profile of {self.name}", self.console):
@@ -293,6 +283,8 @@ class StepProfiler:
 
 _REDRAW = 0.1
 """Seconds between two states of the bar, which is drawn no more often."""
+_WIDE = 130
+"""Columns of a terminal that hold the bar with speed and use; on fewer, count and time left would be cut."""
 
 
 class StepProgress:
@@ -320,6 +312,8 @@ class StepProgress:
             if now < self._next:  # reading a loss waits for the GPU
                 return
             self._next = now + _REDRAW
+        if terminal and self.console.width < _WIDE:
+            more = ""
         note = f"loss {float(loss):.4f}  {self.pace.speed(step):.1f} steps/s{more and f'  {more}'}"
         if terminal:
             self._bar.update(self._task, completed=step, note=note)

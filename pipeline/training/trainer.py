@@ -122,10 +122,10 @@ class Training:
         # Validations fall on checkpoints, so that a resumed training makes the same ones.
         checkpoints = -(-config.validate_every // self.every)
         self.validate_every = checkpoints * self.every if data.validation is not None else 0
-        peak, flops = peak_flops(fabric.device, config.precision), 0.0
+        peak, at_peak = peak_flops(fabric.device, config.precision), 0.0
         if peak is not None:
             with optional(f"MFU of {name}", console):
-                flops = float(config.accumulate * pass_flops(module, data.train[0]))
+                at_peak = config.accumulate * pass_flops(module, data.train[0]) / peak
         self.execution = Execution(fabric, module, config)
         self.average = AveragedWeights(module.net, config.ema) if config.ema else None
         title = f"{context.recipe}/{name}"
@@ -138,7 +138,7 @@ class Training:
         sample_every = -(-config.sample_every // self.every) * self.every
         self.samples = SampleProcess(context, str(module.hparams.get("kind")), sample_every)
         self._saved, self._writing = module.step if resume.checkpoint else -1, False
-        self.telemetry = Telemetry(context.folder, module, config.batch_size, console, flops, peak)
+        self.telemetry = Telemetry(context.folder, module, config.batch_size, console, at_peak)
         self.failures = FailureGuard(name, context.folder, module, data, console)
         self.shards = ShardWatch(context.inputs.values())
         self.stall = StallTimer(
@@ -153,7 +153,7 @@ class Training:
         self.progress = StepProgress(
             self.context.name, self.module.step, self.config.steps, self.context.console
         )
-        self.profiler.start()
+        self.profiler.do("start")
         with Signals() as self.signals, self.stall.running():
             self.agreement = Agreement(self.signals, world_size())
             try:
@@ -169,7 +169,7 @@ class Training:
                 raise
             finally:
                 self.progress.close()
-                self.profiler.stop()
+                self.profiler.do("stop")
         summary = self.telemetry.summary()
         if summary:
             self.context.console.print(f"    {self.context.name}: {summary}")
@@ -206,7 +206,7 @@ class Training:
         if self.average is not None:
             self.average.update(self.module.net)
         self.telemetry.end_step()
-        self.profiler.step()
+        self.profiler.do("step")
         if self.failures.due(step):
             self.failures.check(scaled=self.execution.scaler is not None)
         if step % LOG_EVERY == 0:

@@ -67,53 +67,35 @@ class Utilization:
 
     Goodput is the share of the time that went into steps which count, waits for their data included. The rest
     is validations, checkpoints, steps that a kill has undone, and the start of a process with its first step,
-    which compiles and chooses kernels. The time between two processes counts on neither side.
+    which compiles and chooses kernels. The time between two processes counts on neither side. A step would
+    take `at_peak` seconds at the device's peak; 0 where that is not known.
     """
 
     def __init__(
         self,
-        rows: Sequence[Mapping[str, float]] = (),
-        step: int = 0,
-        *,
-        flops: float = 0.0,
-        peak: float | None = None,
+        rows: Sequence[Mapping[str, float]],
+        step: int,
+        at_peak: float,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self.flops, self.peak, self._clock = flops, peak, clock
+        self._at_peak, self._clock = at_peak, clock
         kept = [row for row in rows if row["step"] <= step]
-        self._spent, self._good = _seconds(rows)[0], _seconds(kept)[1]
+        self._spent = rows[-1].get("elapsed_seconds", 0.0) if rows else 0.0
+        self._good = kept[-1].get("elapsed_seconds", 0.0) * kept[-1].get("goodput", 0.0) if kept else 0.0
         self._since, self._aside = clock(), 0.0
-        self.step_seconds = 0.0
-        """Mean of the last row's steps, the first of a process left out."""
 
-    def start(self, aside: float) -> None:
-        """The first step of the process is over: time counts from here."""
-        now = self._clock()
-        self._spent += now - self._since
-        self._since, self._aside = now, aside
+    def row(self, steps: int, aside: float) -> tuple[float, dict[str, float]]:
+        """Mean seconds of `steps` steps, and figures of their row; call it where the device is waited for.
 
-    def row(self, steps: int, aside: float) -> dict[str, float]:
-        """Figures of a row of `steps` steps; call it where the device is waited for in any case.
-
-        `aside` are the seconds that this process has given to validations and checkpoints so far.
+        `aside` are the seconds of this process so far that were not good.
         """
         now = self._clock()
-        spent = now - self._since
-        good = max(0.0, spent - (aside - self._aside))
-        self._since, self._aside = now, aside
-        self._spent += spent
+        good = max(0.0, now - self._since - (aside - self._aside))
+        self._spent += now - self._since
         self._good += good
+        self._since, self._aside = now, aside
+        seconds = max(good, 1e-9) / max(steps, 1)
         figures = {"elapsed_seconds": self._spent, "goodput": self._good / max(self._spent, 1e-9)}
-        self.step_seconds = max(good, 1e-9) / steps if steps else 0.0
-        if self.flops and steps:
-            reached = self.flops / self.step_seconds
-            figures |= {"tflops": reached / 1e12} | ({"mfu": reached / self.peak} if self.peak else {})
-        return figures
-
-
-def _seconds(rows: Sequence[Mapping[str, float]]) -> tuple[float, float]:
-    """Seconds spent up to the last of the rows, and the good ones among them."""
-    if not rows:
-        return 0.0, 0.0
-    spent = rows[-1].get("elapsed_seconds", 0.0)
-    return spent, spent * rows[-1].get("goodput", 0.0)
+        if self._at_peak and steps:
+            figures["mfu"] = self._at_peak / seconds
+        return seconds, figures
