@@ -27,6 +27,7 @@ class EvaluatorModule(AlternatingModule):
     """
 
     net: Evaluator
+    compilable = False
 
     def __init__(
         self,

@@ -52,8 +52,9 @@ class Drawing:
         if self.temperature == 0:
             return best
         scaled = filter_logits(logits.double() / self.temperature, top_k=self.top_k, top_p=self.top_p)
-        mass = scaled.softmax(-1).cumsum(-1)
-        at = torch.searchsorted(mass, uniform[:, None] * mass[:, -1:], right=True)[:, 0]
+        # In whole numbers, which a GPU adds up to the same sums every time.
+        mass = (scaled.softmax(-1) * 2**53).long().cumsum(-1)
+        at = torch.searchsorted(mass, (uniform[:, None] * mass[:, -1:]).long(), right=True)[:, 0]
         # Rounding can push the last number onto the total; there is no token after it.
         return torch.where(at < logits.shape[-1], at, best)
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from motionloom.datasets.motion.features.torch_joints import running_sum
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 from motionloom.datasets.schema import UserError
 
@@ -121,8 +122,8 @@ class Basis(nn.Module):
         bent = at * self.unit + self._bent(torch.zeros_like(self.mean))
         knuckles = bent[..., :1, :]
         bones = torch.cat([knuckles, bent[..., 1:, :] @ _palm(knuckles)], dim=-2)
-        positions = (wrists + bones.cumsum(-2)).flatten(-4) - self.mean[self.fingers[0]]
-        velocities = (self._moving(x)[1] + (moving * self._spread()).cumsum(-2)).flatten(-4)
+        positions = (wrists + running_sum(bones, -2)).flatten(-4) - self.mean[self.fingers[0]]
+        velocities = (self._moving(x)[1] + running_sum(moving * self._spread(), -2)).flatten(-4)
         for columns, values in zip(self.fingers, (positions, velocities), strict=True):
             x = x.index_copy(-1, columns, (values / self.std[columns]).to(x.dtype))
         return x

@@ -126,8 +126,7 @@ class LearntCodebook(nn.Module):
             codebook = self.codebook.to(full.dtype)
             codes = nearest(rows, codebook.detach())
             chosen = functional.embedding(codes, codebook).view_as(full)
-            counts = rows.new_zeros(self.config.num_codes, dtype=torch.float32)
-            counts = counts.index_add_(0, codes, real.float())
+            counts = code_sums(real.float(), codes, self.config.num_codes)
             # Both sides are masked before they meet: a padded NaN would otherwise be in the gradient.
             outside = ~real.view(z.shape[:-1])[..., None]
             latents, near = full.masked_fill(outside, 0.0), chosen.masked_fill(outside, 0.0)
@@ -184,6 +183,15 @@ class LearntCodebook(nn.Module):
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         super()._load_from_state_dict(*args, **kwargs)
         self._is_initialised = bool(self.initialised)
+
+
+def code_sums(values: Tensor, codes: Tensor, num_codes: int) -> Tensor:
+    """Sums of the values [n] or [n, d] of each code, [K] or [K, d]; codes int64 [n]."""
+    if values.device.type == "cpu":
+        return values.new_zeros(num_codes, *values.shape[1:]).index_add_(0, codes, values)
+    # On a GPU that adds in any order. A product with one-hot rows does not, and costs less than sorting.
+    chosen = torch.arange(num_codes, device=codes.device)[:, None] == codes
+    return chosen.to(values.dtype) @ values
 
 
 def usage_metrics(counts: Tensor, *, eps: float = 1e-7) -> dict[str, Tensor]:

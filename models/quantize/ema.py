@@ -23,16 +23,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.quantize.base import LearntCodebook, QuantizerConfig, QuantizerOutput
+from motionloom.models.quantize.base import LearntCodebook, QuantizerConfig, QuantizerOutput, code_sums
 from motionloom.models.training.distributed import is_distributed, sum_over_ranks
-
-
-def cluster_sums(z: Tensor, codes: Tensor, num_codes: int) -> Tensor:
-    """Sum of the vectors of each code, repeatable bit for bit; z [n, d], codes [n] -> [K, d]."""
-    sums = z.new_zeros(num_codes, z.shape[1])
-    if z.is_cuda:  # index_add_ uses atomics there; accumulating index_put_ sorts, hence is deterministic
-        return sums.index_put_((codes,), z, accumulate=True)
-    return sums.index_add_(0, codes, z)
 
 
 class EmaQuantizer(LearntCodebook):
@@ -71,7 +63,7 @@ class EmaQuantizer(LearntCodebook):
     @torch.no_grad()
     def _update(self, rows: Tensor, mask: Tensor, codes: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
         """EMA step and Code Reset from the global batch; returns its counts [K] and the number of resets."""
-        sums = cluster_sums(rows, codes, self.config.num_codes)  # padded rows are zero
+        sums = code_sums(rows, codes, self.config.num_codes)  # padded rows are zero
         fresh = self._draw(rows, mask)
         if is_distributed():
             packed = sum_over_ranks(torch.cat([sums, fresh, counts[:, None]], dim=1))

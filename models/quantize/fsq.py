@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.quantize.base import QuantizerOutput, usage_metrics
+from motionloom.models.quantize.base import QuantizerOutput, code_sums, usage_metrics
 from motionloom.models.training.distributed import sum_over_ranks
 
 _MARGIN = 1e-3
@@ -60,7 +60,7 @@ class FsqQuantizer(nn.Module):
             codes = (digits * self.radix).sum(-1)
             quantized = _linear(self.leave, rounded / half)
             used = torch.ones_like(codes, dtype=torch.float32) if mask is None else mask.float()
-            counts = used.new_zeros(self.num_codes).index_add_(0, codes.flatten(), used.flatten())
+            counts = code_sums(used.flatten(), codes.flatten(), self.num_codes)
             if self.training and update:
                 counts = sum_over_ranks(counts)
         zero = counts.new_zeros(())

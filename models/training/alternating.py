@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.amp import GradScaler
 from torch.optim import Optimizer
 
+from motionloom.models.training.compiled import Compiled
 from motionloom.models.training.distributed import mean_gradients
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.training.stage_module import Batch, StageModule, StepSchedule
@@ -105,9 +106,9 @@ class AlternatingModule(StageModule):
             out |= _named(group, values)
         return out
 
-    def compile_losses(self) -> None:
-        torch.compiler.reset()
-        self.losses_of = torch.compile(self.losses_of, fullgraph=True)  # type: ignore[method-assign]
+    def compile_losses(self, *, graphs: bool = False) -> None:
+        """As the base class; groups share tensors, so that no graph may be replayed over them."""
+        self.losses_of = Compiled(self.losses_of, self.net)  # type: ignore[assignment]
 
     def configure_optimizers(self) -> list[OptimizerLRSchedulerConfig]:
         """Return an optimizer and a schedule for each group; a turn sets its rate from the step's number."""

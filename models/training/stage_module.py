@@ -27,6 +27,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from motionloom.models.layers.frozen import Frozen
+from motionloom.models.training.compiled import Compiled
 from motionloom.models.training.distributed import alone, rank
 from motionloom.models.training.optim import OptimConfig as OptimConfig
 
@@ -69,6 +70,9 @@ class StepSchedule(LambdaLR):
 
 class StageModule(L.LightningModule, ABC):
     """A network, its losses and its optimizer. Subclasses implement `losses(batch)`."""
+
+    compilable = True
+    """Whether `compile_losses` is known to work; torch cannot compile recurrent networks as one graph."""
 
     def __init__(self, net: nn.Module, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
         super().__init__()
@@ -147,14 +151,16 @@ class StageModule(L.LightningModule, ABC):
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Return figures of one batch, scalars []: "loss" is minimised, the others are only logged."""
 
-    def compile_losses(self) -> None:
-        """Compile networks and losses as one graph; seeding and logging stay outside. A break is an error.
+    def compile_losses(self, *, graphs: bool = False) -> None:
+        """Compile networks and losses as one graph; seeding and logging stay outside.
 
-        Graphs of stages that ran before in this process are dropped: the number that one function may have
-        is limited, and all tokenizers share theirs.
+        Where that fails there is one warning, and the rest is computed without, with the same draws.
+
+        Args:
+            graphs: Replay the kernels of each call as a CUDA graph. For one optimizer in one process, which
+                takes each loss before the next is computed.
         """
-        torch.compiler.reset()
-        self.losses = torch.compile(self.losses, fullgraph=True)  # type: ignore[method-assign]
+        self.losses = Compiled(self.losses, self.net, graphs=graphs)  # type: ignore[assignment]
 
     def configure_optimizers(self) -> list[OptimizerLRSchedulerConfig]:
         """Return the optimizer of the trainable parameters with its schedule, as Lightning takes them."""

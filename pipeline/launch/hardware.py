@@ -50,6 +50,9 @@ class Hardware(Config):
     stall_seconds: int = Field(600, ge=0)
     """Seconds without a step, a validation batch or a checkpoint after which a training ends itself and
     leaves the stacks of its threads; 0 = never. Compiling counts, so it must be longer than that takes."""
+    deterministic: bool = True
+    """Whether a training on a GPU takes only kernels that give the same bytes every time. Gradients of
+    convolutions and attention may be quicker without, and two equal trainings then differ."""
     verify_shards: Literal["once", "always", "never"] = "once"
     """Whether shards in folders are compared with their sha256 before a stage reads them: files that have not
     been compared in this run as they are now, all each time a stage starts, or none."""
@@ -72,6 +75,8 @@ class Hardware(Config):
             raise UserError(
                 "hardware.accelerator is gpu and no GPU is here; set it to auto, or give --device cpu"
             )
+        if self.deterministic:  # read when matrices are multiplied for the first time
+            os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         return torch.device("cuda", local_rank() % count)
 
     def resolved_devices(self) -> int:

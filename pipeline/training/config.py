@@ -52,8 +52,9 @@ class TrainConfig(Config):
     """Distribution over processes: each holds the whole network (`ddp`), or a part of the weights, gradients
     and optimizer state (`fsdp`: gpt stages, for networks that do not fit; not with compile or 16-mixed).
     One process holds all; the results are the same."""
-    compile: bool = False
-    """Compile networks and losses with torch.compile, as one graph."""
+    compile: bool | None = None
+    """Compile networks and losses with torch.compile, as one graph; null = on a GPU, where the network is
+    known to allow it. Where it fails a warning says so, and the training goes on without."""
     ema: float | None = Field(None, ge=0, lt=1)
     """Decay a step of an average of the weights, such as 0.999, less at first; validation and the saved model
     take the average. null or 0 turns it off."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, cast
 
 import torch
@@ -40,6 +40,11 @@ SMALL = 10_000_000
 (measured)."""
 
 
+LAUNCHES = 50_000_000
+"""Parameters below which a GPU computes its kernels faster than Python starts them: they are replayed as CUDA
+graphs [on an H100 the tokenizer and TMA wait for Python, the GPT of 228 million does not]."""
+
+
 def set_threads(module: nn.Module, hardware: Hardware) -> None:
     """CPU threads of this process, as the recipe says or the network needs."""
     threads = hardware.threads
@@ -47,6 +52,24 @@ def set_threads(module: nn.Module, hardware: Hardware) -> None:
         threads = int(sum(param.numel() for param in module.parameters()) < SMALL)
     if threads:
         torch.set_num_threads(threads)
+
+
+@contextmanager
+def repeatable(hardware: Hardware) -> Iterator[None]:
+    """Inside, a GPU computes the same bytes every time (`hardware.deterministic`); what cannot is an error.
+
+    A CPU does in any case.
+    """
+    if not hardware.deterministic or hardware.resolved_accelerator() == "cpu":
+        yield
+        return
+    # No tensor is read before it is written: filling new ones would only take time.
+    torch.utils.deterministic.fill_uninitialized_memory = False  # type: ignore[attr-defined]
+    torch.use_deterministic_algorithms(True)
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(False)
 
 
 class MixedPrecision(FabricMixedPrecision):
@@ -117,10 +140,12 @@ class Execution:
 
     def __init__(self, fabric: Fabric, module: StageModule, config: TrainConfig) -> None:
         prepare_module(module, config)
-        if config.compile:
-            module.compile_losses()
         self.fabric, self.module = fabric, module
-        cut = isinstance(fabric.strategy, ModelParallelStrategy)
+        cut, on_gpu = isinstance(fabric.strategy, ModelParallelStrategy), fabric.device.type == "cuda"
+        if config.compile or (config.compile is None and on_gpu and module.compilable and not cut):
+            size = sum(param.numel() for param in module.parameters())
+            graphs = on_gpu and size < LAUNCHES and config.accumulate == fabric.world_size == 1
+            module.compile_losses(graphs=graphs)
         self.model = fabric.setup_module(module, move_to_device=not cut)  # whole, it may not fit there
         module.to(fabric.device)
         self.optimizers = [one["optimizer"] for one in module.configure_optimizers()]

@@ -3,6 +3,7 @@
 - The handler notes the signal and nothing else. Saving inside a handler would see a step half taken, and a
   collective there would wait for ranks that are elsewhere.
 - All ranks agree on the step, by one all-reduce of a number about twice a second.
+- While torch compiles, which can take minutes, the process ends at once if no step would be lost.
 
 SIGTERM is what schedulers, Kubernetes and torchrun send first; SIGUSR1 and SIGUSR2 are the warnings that
 SLURM and submitit are asked to send before a time limit or a preemption. Ctrl-C ends a run at once, and it
@@ -21,6 +22,7 @@ from types import FrameType
 
 import torch
 import torch.distributed as dist
+from torch._guards import CompileContext
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGUSR1", "SIGUSR2") if hasattr(signal, name))
 """Signals at which a training saves and ends."""
@@ -47,6 +49,8 @@ class Signals:
         """The first signal that has come; 0 for none."""
         self.answered = False
         """Whether the training ends because of it."""
+        self.ends_compiling: Callable[[int], BaseException | None] = lambda number: None
+        """What a signal raises while torch compiles; None if something would be lost."""
         self._before: dict[signal.Signals, Handler] = {}
 
     def __enter__(self) -> Signals:
@@ -64,6 +68,10 @@ class Signals:
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.number = self.number or number
+        end = self.ends_compiling(number) if CompileContext.current_compile_id() is not None else None
+        if end is not None:
+            self.answered = True
+            raise end
 
 
 @contextmanager

@@ -48,7 +48,7 @@ from motionloom.pipeline.training.checkpointing import (
     weights_of,
 )
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.training.execution import Execution, launch, set_threads
+from motionloom.pipeline.training.execution import Execution, launch, repeatable, set_threads
 from motionloom.pipeline.training.failures import FailureGuard, ShardWatch, StallTimer
 from motionloom.pipeline.training.loaders import TrainingData, on_device
 from motionloom.pipeline.training.metric_log import MetricLog
@@ -77,7 +77,8 @@ def fit(
         context, module, config, fabric, TrainingData(train, validation, config, hardware), resume
     )
     try:
-        training.run()
+        with repeatable(hardware):
+            training.run()
     except OSError as error:
         if error.errno is not None and error.filename is None:
             error.filename = full_place(error, training.folder)
@@ -85,6 +86,9 @@ def fit(
     except RuntimeError as error:
         if isinstance(error, dist.DistBackendError) or "by peer" in str(error) or "imed out" in str(error):
             raise TeamError(str(error)) from None
+        if "does not have a deterministic implementation" in str(error):
+            what = str(error).partition(",")[0]
+            raise UserError(f"stage {context.name}: {what}; set hardware.deterministic: false") from error
         raise
     if module.net is not net:  # a sharded copy was trained
         make_whole(module.net, net)
@@ -156,6 +160,7 @@ class Training:
         self.profiler.do("start")
         with Signals() as self.signals, self.stall.running():
             self.agreement = Agreement(self.signals, world_size())
+            self.signals.ends_compiling = self._end_compiling
             try:
                 self._run()
             except BaseException as error:
@@ -273,7 +278,15 @@ class Training:
         self._save()
         self._finish_writing()
         self.agreement.barrier()  # nobody leaves before the file is whole
-        raise Interrupted(self.context.name, self.module.step, self.config.steps, signal.Signals(number).name)
+        raise self._interrupted(number)
+
+    def _end_compiling(self, number: int) -> Interrupted | None:
+        """The end by a signal while torch compiles; None where steps since the last save would be lost."""
+        return self._interrupted(number) if self.module.step in (0, self._saved) else None
+
+    def _interrupted(self, number: int) -> Interrupted:
+        name = signal.Signals(number).name
+        return Interrupted(self.context.name, self.module.step, self.config.steps, name)
 
     def _save(self, *, again: bool = False) -> None:
         """Save this step unless it is saved (`again`: in any case); every rank calls it."""

@@ -55,6 +55,18 @@ def present_joints(present: Tensor, layout: MotionLayout) -> Tensor:
     return torch.cat([positions.new_ones(len(present), 1), positions], dim=1)
 
 
+def running_sum(x: Tensor, dim: int) -> Tensor:
+    """Sums along `dim` up to each element; unlike `cumsum`, the same every time on a GPU."""
+    if x.device.type == "cpu":
+        return x.cumsum(dim)
+    size, reach = x.shape[dim], 1
+    while reach < size:  # each sum reaches twice as far back
+        farther = x.narrow(dim, reach, size - reach) + x.narrow(dim, 0, size - reach)
+        x = torch.cat([x.narrow(dim, 0, reach), farther], dim)
+        reach *= 2
+    return x
+
+
 def _turned(x: Tensor, z: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     """Points of the ground turned to the left by `angle`."""
     cos, sin = angle.cos(), angle.sin()
@@ -63,7 +75,7 @@ def _turned(x: Tensor, z: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
 
 def _from_zero(steps: Tensor) -> Tensor:
     """Sum of the steps before each frame, along the last axis."""
-    return torch.cat([torch.zeros_like(steps[..., :1]), steps[..., :-1].cumsum(-1)], dim=-1)
+    return torch.cat([torch.zeros_like(steps[..., :1]), running_sum(steps[..., :-1], -1)], dim=-1)
 
 
 def _posed(motion: Tensor, layout: MotionLayout) -> Tensor:

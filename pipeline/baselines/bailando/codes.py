@@ -18,6 +18,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from motionloom.datasets.motion.features.torch_joints import running_sum
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config
 from motionloom.models.layers.conv import Conv, ConvTranspose, ResidualBlock, start_weights
@@ -211,7 +212,7 @@ class DanceVq(nn.Module):
         joints = made["up"].new_empty(*made["up"].shape[:2], self.joints, 3)
         joints[:, :, self.upper], joints[:, :, self.lower] = made["up"], made["down"]
         steps = self.steps(codes[..., 1])
-        way = torch.cat([torch.zeros_like(steps[:, :1]), steps[:, :-1].cumsum(1)], dim=1)
+        way = torch.cat([torch.zeros_like(steps[:, :1]), running_sum(steps[:, :-1], 1)], dim=1)
         # What the lower half says of its root is an error: it was 0.
         joints[:, :, 0] = 0.0
         return joints + way[:, :, None]

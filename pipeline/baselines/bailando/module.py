@@ -148,6 +148,7 @@ class ActorCriticModule(AlternatingModule):
     """Trains on windows of joints with music and "beats" bool [B, T], frames with a beat of the music."""
 
     net: ActorCritic
+    compilable = False
 
     def __init__(
         self,

@@ -27,6 +27,7 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.clips import MUSIC, clip_batches, spread_dances
 from motionloom.pipeline.stages.networks.tokenizer import require_uses
 from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.networks import device_of
 from motionloom.pipeline.store.weights import ModelFacts, Release, load_facts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
@@ -186,7 +187,8 @@ class CrossGptStage(DanceGptStage[CrossGptStageConfig, CrossGptInputs, CrossGpt]
         starts = torch.zeros(len(clips), frames, crops.width)
         for row, clip in enumerate(clips):
             crops.fill(starts[row].numpy(), clip, 0, frames)
-        net.kept.copy_(inputs.dance_vq.encode(places(starts))[:, 0])
+        vq = inputs.dance_vq
+        net.kept.copy_(vq.encode(places(starts).to(device_of(vq)))[:, 0])
 
     def batches(
         self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs, seed: int, log: Log

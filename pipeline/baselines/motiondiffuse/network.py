@@ -167,7 +167,7 @@ class MotionDiffuse(nn.Module):
         states = self.reader_norm(self.reader(self.tokens(text.features.to(self.tokens.weight)), text.mask))
         place = torch.arange(states.shape[1], device=states.device)
         last = place.masked_fill(~text.mask, 0).amax(1)
-        return Words(states, text.mask, self.whole(states[torch.arange(len(last)), last]))
+        return Words(states, text.mask, self.whole(states[torch.arange(len(last), device=last.device), last]))
 
     def denoise(self, noisy: Tensor, step: Tensor, words: Words, mask: Tensor) -> Tensor:
         """The noise in noisy [B, T, D] (or as the schedule predicts) at step int64 [B]; zero where `mask`

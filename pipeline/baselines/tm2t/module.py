@@ -83,6 +83,7 @@ class Seq2SeqModule(StageModule):
     """Trains a `Seq2Seq`; the captioner is only looked through."""
 
     net: Seq2Seq
+    compilable = False
 
     def __init__(
         self,

@@ -33,7 +33,6 @@ from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import CAPTIONER, GENERATOR, CompletedStage, Inputs, register
-from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.tokens import Tokens, token_batches, token_example
 from motionloom.pipeline.store.data import Data, DataPreview, captions_of
 from motionloom.pipeline.store.networks import TrainedTokenizer, require_streams, stream_facts
@@ -142,14 +141,6 @@ class Seq2SeqStageConfig(TrainedStageConfig):
     train: TrainConfig = TrainConfig(steps=100_000, batch_size=64)
     min_frames: int = Field(16, ge=1)
     """Captions about fewer frames are left out where the clip has a longer one."""
-
-    def require_fit(self, hardware: Hardware) -> None:
-        """Its GRUs are no part of a graph."""
-        super().require_fit(hardware)
-        if self.train.compile:
-            raise UserError(
-                "train.compile: torch cannot compile recurrent networks as one graph; set it to false"
-            )
 
 
 class Seq2SeqInputs(Inputs):

@@ -49,10 +49,6 @@ class EvaluatorStageConfig(CaptionStageConfig):
                 f"movement_steps {self.movement_steps} leave none of train.steps {self.train.steps} for the "
                 f"pairs; lower movement_steps"
             )
-        if self.train.compile:
-            raise ValueError(
-                "train.compile: torch cannot compile recurrent networks as one graph; set it to false"
-            )
         if self.train.batch_size // self.train.accumulate < 2:
             raise ValueError("a batch of one clip has no mismatching pair; raise train.batch_size")
         return self

@@ -139,7 +139,9 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     ) -> StageModule:
         if config.lora is not None:
             add_lora(net, config.lora)
-        return super().module(config, net, inputs, seed)
+        module = super().module(config, net, inputs, seed)
+        module.compilable = config.lora is None and not config.aligned_on_samples
+        return module
 
     def module_settings(
         self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs

@@ -38,7 +38,7 @@ def test_the_second_device_is_strict(second: ModuleType) -> None:
     with second.second_device() as device:
         far = torch.ones(3).to(device)
         assert far.device == (far + far).device == device and (far + 1).cpu().tolist() == [2, 2, 2]
-        with pytest.raises(RuntimeError, match="expected all tensors on maia:0"):
+        with pytest.raises(RuntimeError, match="expected all tensors on second_device:0"):
             far + torch.ones(3)
         with pytest.raises(RuntimeError):
             far.numpy()

@@ -123,7 +123,6 @@ def test_other_layouts_and_words_are_refused(run: Path) -> None:
     ("settings", "sentence"),
     [
         ({"movement_steps": 10, "train": {"steps": 10}}, "movement_steps 10 leave none of train.steps 10"),
-        ({"train": {"compile": True}}, "train.compile: torch cannot compile recurrent networks"),
         ({"train": {"batch_size": 1}}, "a batch of one clip has no mismatching pair"),
         ({"max_frames": 50}, "key 'max_frames' = 50"),
     ],
