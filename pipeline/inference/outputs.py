@@ -58,8 +58,6 @@ def write_motions(
     require_folder(folder)
     options = figure or FigureOptions()
     scores = [score_of(motion) for motion in motions] if scores is None else scores
-    if len(scores) != len(motions):
-        raise UserError(f"{len(scores)} scores for {len(motions)} motions; give one for each")
     writers = [(name, writer) for name, writer in WRITERS.items() if name in formats]
     for name, writer in writers:
         if writer.needs_face and any(motion.face is None for motion in motions):

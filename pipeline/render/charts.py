@@ -59,8 +59,6 @@ def line_chart(lines: Sequence[Line], *, x_label: str = "step", y_label: str = "
     curves = []
     for line in lines:
         x, y = np.asarray(line.x, np.float64).ravel(), np.asarray(line.y, np.float64).ravel()
-        if len(x) != len(y):
-            raise ValueError(f"line '{line.name}': {len(x)} x values but {len(y)} y values")
         good = np.isfinite(x) & np.isfinite(y)
         curves.append((x[good], y[good]))
     filled = [(x, y) for x, y in curves if len(x)]

@@ -50,10 +50,6 @@ def write_mp4(
         raise UserError(f"{path}: films need imageio-ffmpeg; pip install 'motionloom[film]'") from None
     width, height = (side + side % 2 for side in size)
     exact = np.asarray(joints, np.float64)
-    if exact.ndim != 3 or exact.shape[1:] != (len(skeleton), 3) or not len(exact):
-        raise UserError(
-            f"joints must be [T, {len(skeleton)}, 3] for {skeleton.name}, got {list(exact.shape)}"
-        )
     if not np.isfinite(exact).all():
         raise UserError("joints hold NaN or infinity; nothing sensible can be filmed")
     actor = Actor.of(exact, skeleton, figure, face_controls)

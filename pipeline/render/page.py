@@ -15,7 +15,6 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.charts import COLOURS, Line, histogram, line_chart
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
@@ -98,9 +97,6 @@ class Page:
 
         A `pinned` first column stays in sight while the others are scrolled.
         """
-        for row in rows:
-            if len(row) != len(columns):
-                raise UserError(f"table '{caption}': a row has {len(row)} cells for {len(columns)} columns")
         numeric = [
             any(_is_number(row[k]) for row in rows)
             and all(_is_number(row[k]) or row[k] is None for row in rows)

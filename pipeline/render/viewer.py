@@ -30,7 +30,7 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.render.body.face import CONTROLS, FACE_CONTROLS, FACE_NEUTRAL
+from motionloom.pipeline.render.body.face import CONTROLS, FACE_NEUTRAL
 from motionloom.pipeline.render.body.mesh import (
     Posing,
     asset,
@@ -96,15 +96,15 @@ def viewer_page(motions: Sequence[ViewerMotion], title: str, note: str = "") -> 
 
 def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = "") -> dict[str, object]:
     """Everything the viewer's script needs, as plain JSON types; arrays are base64."""
-    if not motions:
-        raise UserError("a viewer needs at least one motion")
     skeletons: list[dict[str, object]] = []
     clips: list[dict[str, object]] = []
     scores: list[dict[str, object]] = []
     chosen: list[int | None] = []
     for number, motion in enumerate(motions):
-        where = f"motion {number} ('{motion.label or motion.caption}')"
-        joints = _checked(motion, where)
+        joints = np.asarray(motion.joints, np.float64)
+        if not np.isfinite(joints).all():
+            named = f"motion {number} ('{motion.label or motion.caption}')"
+            raise UserError(f"{named}: joints hold NaN or infinity; run the data doctor on its source")
         human = human_skeleton(motion.parents)
         skeleton = _skeleton(motion.parents, human, joints)
         if skeleton not in skeletons:  # motions of one skeleton share it
@@ -130,7 +130,7 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
                 "pose": None if human is None else pose_data(posing_of(joints, human, motion.figure)),
             }
         )
-        score = score_data(motion.beats, motion.segments, len(joints) / motion.fps, where)
+        score = score_data(motion.beats, motion.segments, len(joints) / motion.fps)
         if any(score.values()) and score not in scores:
             scores.append(score)
         chosen.append(scores.index(score) if any(score.values()) else None)
@@ -289,22 +289,3 @@ def fill(template: str, **parts: str) -> str:
 def resource(name: str) -> str:
     """Text of a file of the folder `web`."""
     return (resources.files("motionloom.pipeline.render") / "web" / name).read_text(encoding="utf-8")
-
-
-def _checked(motion: ViewerMotion, where: str) -> NDArray[np.float64]:
-    joints = np.asarray(motion.joints, np.float64)
-    if joints.ndim != 3 or joints.shape[2] != 3 or not len(joints):
-        raise UserError(f"{where}: joints must be [T, N, 3] with T > 0, got {list(joints.shape)}")
-    if len(motion.parents) != joints.shape[1]:
-        raise UserError(f"{where}: {joints.shape[1]} joints but {len(motion.parents)} parents")
-    if not np.isfinite(joints).all():
-        raise UserError(f"{where}: joints hold NaN or infinity; run the data doctor on its source")
-    if not motion.fps > 0:
-        raise UserError(f"{where}: fps must be above 0, got {motion.fps}")
-    if motion.face_controls is not None:
-        face = np.asarray(motion.face_controls)
-        if face.shape != (len(joints), len(FACE_CONTROLS)) or not np.isfinite(face).all():
-            raise UserError(
-                f"{where}: face_controls must be finite [T={len(joints)}, 5], got {list(face.shape)}"
-            )
-    return joints

@@ -81,6 +81,8 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     trainer: str
     """The `StageModule` that trains the network, as "package.module:Class"; it is imported where a training
     begins, since Lightning takes seconds."""
+    trainer_keys: tuple[str, ...] = ()
+    """Settings of the config that the trainer takes as they are."""
     trains = True
 
     def roles(self) -> tuple[Role | Every, ...]:
@@ -102,7 +104,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
 
     def module_settings(self, config: C, net: N, inputs: I) -> dict[str, object]:
         """Return what the trainer takes besides the network, its optimizer, a seed and the steps."""
-        return {}
+        return {key: getattr(config, key) for key in self.trainer_keys}
 
     @abstractmethod
     def batches(self, config: C, net: N, inputs: I, seed: int, log: Log) -> Batches:

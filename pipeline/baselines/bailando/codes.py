@@ -128,13 +128,9 @@ class HalfVq(nn.Module):
         start_weights(self.encoder)
         _start_decoder(self.decoder)
 
-    def latents(self, x: Tensor) -> Tensor:
-        out: Tensor = self.encoder(x)
-        return out
-
     def forward(self, x: Tensor) -> HalfOutput:
         """Training updates the codebook."""
-        out = self.quantizer(self.latents(x))
+        out = self.quantizer(self.encoder(x))
         made = decoded(self.decoder, out.quantized)
         return HalfOutput(x, made, out.penalty, out.codes, out.metrics)
 
@@ -196,7 +192,7 @@ class DanceVq(nn.Module):
         """Codes int64 [B, L, 2] of both halves; never updates a codebook."""
         return torch.stack(
             [
-                self.halves[name].quantizer(self.halves[name].latents(x), update=False).codes
+                self.halves[name].quantizer(self.halves[name].encoder(x), update=False).codes
                 for name, x in self.poses(joints).items()
             ],
             dim=-1,

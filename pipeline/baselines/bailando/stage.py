@@ -69,6 +69,7 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
     name = "dance_vq"
     summary = "Bailando: codes of upper and lower body"
     trainer = "motionloom.pipeline.baselines.bailando.module:DanceVqModule"
+    trainer_keys = ("root_optim", "root_start")
     config = DanceVqStageConfig
     inputs = DanceVqInputs
     curves = tuple(Curve(name) for name in ("codes_recon_up", "codes_recon_down", "root_loss"))
@@ -94,11 +95,6 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
     def release(self, net: DanceVq) -> Release:
         """Bailando's, with the decoder of the root."""
         return release_of_codes(net)
-
-    def module_settings(
-        self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs
-    ) -> dict[str, object]:
-        return {"root_optim": config.root_optim, "root_start": config.root_start}
 
     def batches(
         self, config: DanceVqStageConfig, net: DanceVq, inputs: DanceVqInputs, seed: int, log: Log

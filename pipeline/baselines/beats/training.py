@@ -7,7 +7,7 @@ under noise and fading, with parts of the spectrum or of the time missing; some 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 import torch
@@ -36,19 +36,10 @@ class BeatsModule(StageModule):
         return {"loss": beat + downbeat, "beat": beat, "downbeat": downbeat}
 
 
-class SongBatch(TypedDict):
-    """Stretches of songs."""
-
-    levels: Tensor
-    """[B, T, 64]"""
-    targets: Tensor
-    """[B, T, 2] of beats and downbeats, 0..1."""
-    length: Tensor
-    """[B], all T; a module counts the rows of a validation batch by it."""
-
-
-class SongBatches(Dataset[SongBatch]):
-    """Item k is one rank's rows of global batch k."""
+class SongBatches(Dataset[dict[str, Tensor]]):
+    """Item k is one rank's rows of global batch k: "levels" [B, T, 64], "targets" [B, T, 2] of beats and
+    downbeats, 0..1, and "length" [B], all T, by which a module counts the rows of a validation batch.
+    """
 
     def __init__(
         self,
@@ -71,7 +62,7 @@ class SongBatches(Dataset[SongBatch]):
     def __len__(self) -> int:
         return self.plan.batches_per_epoch  # of validation; training asks for as many as it has steps
 
-    def __getitem__(self, k: int) -> SongBatch:
+    def __getitem__(self, k: int) -> dict[str, Tensor]:
         turns, items = self.plan.local(k, *self.at)
         cut = [
             self._stretch(self.songs[item], np.random.default_rng([self.seed, turn, item, 271]))

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.features.torch_joints import present_joints, torch_joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.network import step_waves
 from motionloom.models.diffusion.schedule import ScheduleConfig
 from motionloom.models.layers.transformer import SkipTransformer, StackConfig, length_mask
@@ -75,11 +75,6 @@ class Positions(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x [B, L, C]."""
-        if x.shape[1] > len(self.table):
-            raise UserError(
-                f"a sequence of {x.shape[1]} is longer than the {len(self.table)} positions of this network; "
-                "give shorter motion, or train with larger net.positions"
-            )
         return x + self.table[: x.shape[1], 0].to(x.dtype)
 
 

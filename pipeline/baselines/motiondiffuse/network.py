@@ -174,8 +174,6 @@ class MotionDiffuse(nn.Module):
         bool [B, T] is False.
         """
         frames = noisy.shape[1]
-        if frames > self.max_frames:
-            raise ValueError(f"positions of {self.max_frames} frames were learnt, {frames} were asked for")
         waves = step_waves(step, self.config.dim).roll(self.config.dim // 2, dims=1)  # cosines first
         style = self.time(waves.to(noisy.dtype)) + words.whole
         x = self.enter(noisy) + self.positions[:frames]

@@ -24,7 +24,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import Config
 from motionloom.models.gpt.tokens import TokenNetwork
 from motionloom.models.layers.transformer import LayerNorm, StackConfig, sinusoid
 from motionloom.models.metrics.captions import words_of
@@ -237,11 +237,6 @@ class Captioner(TokenNetwork):
     def encode(self, embedded: Tensor, visible: Tensor) -> tuple[Tensor, Tensor]:
         """Embedded tokens [B, L, D] and their Start, encoded [B, S, D]; which may be seen, bool [B, S]."""
         x = torch.cat([self.start.to(embedded.dtype).expand(len(embedded), 1, -1), embedded], dim=1)
-        if x.shape[1] > self.config.block_size:
-            raise UserError(
-                f"{x.shape[1] - 1} tokens and a Start do not fit net.block_size {self.config.block_size}; "
-                "raise it"
-            )
         mask = functional.pad(visible, (1, 0), value=True)
         x = self._enter(x)
         for layer in self.encoder:

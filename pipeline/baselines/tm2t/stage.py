@@ -74,6 +74,7 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
     name = "captioner"
     summary = "motion tokens to words"
     trainer = "motionloom.pipeline.baselines.tm2t.module:CaptionerModule"
+    trainer_keys = ("loss",)
     config = CaptionerStageConfig
     offers = frozenset({CAPTIONER})
     inputs = CaptionerInputs
@@ -97,11 +98,6 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
         if len(net.names) > 1:
             return None
         return Release(captioner_names(net), unread=("trg_word_prj.weight", "*.positional_encoding"))
-
-    def module_settings(
-        self, config: CaptionerStageConfig, net: Captioner, inputs: CaptionerInputs
-    ) -> dict[str, object]:
-        return {"loss": config.loss}
 
     def batches(
         self, config: CaptionerStageConfig, net: Captioner, inputs: CaptionerInputs, seed: int, log: Log

@@ -25,11 +25,7 @@ from motionloom.models.tokenizer.single import MqConfig, OneCodebook
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.tm2t.network import CriticConfig
 from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.stages.networks.tokenizer import (
-    TokenizerInputs,
-    TokenizerStage,
-    TokenizerStageConfig,
-)
+from motionloom.pipeline.stages.networks.tokenizer import TokenizerStage, TokenizerStageConfig
 from motionloom.pipeline.store.weights import Release
 from motionloom.pipeline.training.config import TrainConfig
 
@@ -167,6 +163,7 @@ class Tm2tStage(TokenizerStage):
     """A tokenizer and its critic, which take turns."""
 
     trainer = "motionloom.pipeline.baselines.tm2t.module:AdversarialTokenizerModule"
+    trainer_keys = ("critic",)
     curves = tuple(
         Curve(name)
         for name in ("tokenizer_recon", "tokenizer_adversarial", "tokenizer_perplexity", "critic_accuracy")
@@ -176,9 +173,3 @@ class Tm2tStage(TokenizerStage):
         """TM2T's, without the critic."""
         assert isinstance(net, Tm2tQuantizer)
         return Release(tm2t_names(net))
-
-    def module_settings(
-        self, config: TokenizerStageConfig, net: Tokenizer, inputs: TokenizerInputs
-    ) -> dict[str, object]:
-        assert isinstance(config, Tm2tStageConfig)
-        return {"critic": config.critic}

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
@@ -53,11 +52,7 @@ class TokenTimeline:
         z = draw_z(seeds, utt.config.z_dim).to(device) if self.inject_z and utt.config.z_dim else None
         for number, stretch in enumerate(stretches):
             conditions = self.normalised(stretch.conditions)
-            if stretch.frames is None:
-                if len(stretches) > 1:
-                    raise UserError(
-                        "a stretch without a length stands alone; give the length of each in seconds"
-                    )
+            if stretch.frames is None:  # it stands alone
                 return self.window(conditions, made, z, None, window_seeds(seeds, 0, 0), sampling)
             wanted = torch.tensor([-(-n // GROUP_FRAMES) for n in stretch.frames], device=device)
             made = self._stretch(conditions, made, z, wanted, seeds, number, sampling)

@@ -170,8 +170,6 @@ def bounded_least_squares(gram: Floats, wanted: Floats) -> Floats:
 
 def write_arkit_csv(path: Path, weights: NDArray[np.floating], fps: float) -> None:
     """One row a frame: time in seconds and the 52 weights, named in the first row."""
-    if weights.ndim != 2 or weights.shape[1] != len(ARKIT):
-        raise UserError(f"{path}: ARKit weights must be [T, {len(ARKIT)}], not {list(weights.shape)}")
     rows = [
         ",".join([f"{frame / fps:.6f}", *(f"{value:.5f}" for value in row)])
         for frame, row in enumerate(weights.tolist())

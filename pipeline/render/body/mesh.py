@@ -239,10 +239,6 @@ def single_bones(skeleton: Skeleton) -> tuple[NDArray[np.int64], NDArray[np.int6
 def posing_of(joints: NDArray[np.floating], skeleton: Skeleton, figure: RigidMotion | None = None) -> Posing:
     """The body's pose at joints [T, N, 3] in metres; `figure` has their rotations, where they are known."""
     if figure is not None:
-        if figure.joints.shape != joints.shape:
-            raise UserError(
-                f"a figure of {list(figure.joints.shape)} joints for a motion of {list(joints.shape)}"
-            )
         own, local, root = figure.skeleton, figure.rotations, figure.root
     else:
         own = skeleton.with_lengths_of(np.asarray(joints, np.float64))

@@ -60,6 +60,7 @@ class EvaluatorStage(CaptionStage[EvaluatorStageConfig, CaptionInputs, Evaluator
     name = "evaluator"
     summary = "text-motion evaluator"
     trainer = "motionloom.models.evaluator.module:EvaluatorModule"
+    trainer_keys = ("loss", "movement_optim", "movement_steps")
     config = EvaluatorStageConfig
     inputs = CaptionInputs
     curves = (
@@ -82,12 +83,6 @@ class EvaluatorStage(CaptionStage[EvaluatorStageConfig, CaptionInputs, Evaluator
         config = EvaluatorConfig.parse(facts.config, facts.where)
         frames = facts.fact("max_frames", int)
         return Evaluator(config, facts.layout.layout(), facts.fact("text_dim", int), frames)
-
-    def module_settings(
-        self, config: EvaluatorStageConfig, net: Evaluator, inputs: CaptionInputs
-    ) -> dict[str, object]:
-        movement = {"movement_optim": config.movement_optim, "movement_steps": config.movement_steps}
-        return {"loss": config.loss, **movement}
 
     def loaded(self, net: Evaluator, facts: ModelFacts, inputs: CaptionInputs) -> LoadedEvaluator:
         layout: MotionLayout = facts.layout.layout()

@@ -124,9 +124,6 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
             columns, stats = part_columns(inputs.data.layout, config.part), inputs.stats
             net.basis.learn(stats.mean[columns], stats.std[columns])
 
-    def module_settings(self, config: TmaStageConfig, net: Tma, inputs: TmaInputs) -> dict[str, object]:
-        return {"loss": config.loss}
-
     def loaded(self, net: Tma, facts: ModelFacts, inputs: TmaInputs) -> LoadedTma:
         frames, part = facts.fact("max_frames", int), part_of(facts)
         return LoadedTma(net, facts.layout.layout(), frames, part, inputs)

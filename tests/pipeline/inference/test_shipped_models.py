@@ -169,18 +169,6 @@ def test_the_nearest_name_is_named(here: Path) -> None:
     assert no_such_folder(Path("models/a")).endswith("and none is in models")
 
 
-@pytest.mark.parametrize("name", ["runs/humantomato-tony", "./runs/x", "zzz", Path("zzz/yyy")])
-def test_a_model_that_is_no_folder_is_answered_without_the_hub(
-    name: str | Path, here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def asked(*arguments: object, **options: object) -> object:
-        raise AssertionError("the hub was asked")
-
-    monkeypatch.setattr("huggingface_hub.snapshot_download", asked)
-    with pytest.raises(UserError, match="no such folder"):
-        MotionModel.from_pretrained(name)
-
-
 def test_a_hub_that_cannot_be_reached_is_not_asked(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert hub_is_away()
     with pytest.raises(UserError, match=r"nobody/none: no such folder, .* cannot be reached from here"):

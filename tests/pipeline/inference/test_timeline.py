@@ -89,12 +89,6 @@ def test_free_length_is_a_plain_generate_and_stands_alone(
     made = timeline.tokens([Stretch(text(4), None)], SEEDS, SamplingConfig())
     plain = generate(net.utt, net.mate(text(4)), max_groups=WINDOW, how=Drawing(top_p=0.95), seed=SEEDS)
     assert all(codes_of(made, row) == codes_of(plain, row) for row in range(4))
-    for stretches in (
-        [Stretch(text(4), None), Stretch(text(4), [8] * 4)],
-        [Stretch(text(4), [8] * 4), Stretch(text(4), None)],
-    ):
-        with pytest.raises(UserError, match="stands alone; give the length of each"):
-            timeline.tokens(stretches, SEEDS, SamplingConfig())
 
 
 def test_music_for_a_model_without_is_refused(net: ConditionedUtt) -> None:

@@ -207,22 +207,6 @@ def test_models_of_one_modality_refuse_the_other(
     assert call(*words, "--audio", folder / "slow.wav").code == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--audio", "nothing.wav"), "nothing.wav: no such sound file"),
-        (("--audio", "slow.wav", "--seconds", "9"), "9 s were asked for and the music lasts 5.0 s"),
-        (("a", "b", "--audio", "slow.wav"), "2 captions but 1 sounds"),
-        (("nothing.yaml",), "nothing.yaml"),
-    ],
-)
-def test_mistakes_of_the_call(
-    words: tuple[str, ...], said: str, ude_run: Any, folder: Path, call: Call, monkeypatch: Any
-) -> None:
-    monkeypatch.chdir(folder)
-    assert said in refused(call("generate", ude_run.folder, *words, "-o", "no"))
-
-
 LONG = """
 import resource, sys
 from pathlib import Path

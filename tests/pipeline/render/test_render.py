@@ -128,24 +128,11 @@ def test_untrusted_text_cannot_leave_its_place(tmp_path: Path, data_of: Any, wal
     assert "</script" not in viewer_script()
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"joints": np.full((3, 52, 3), np.nan)}, "NaN"),
-        ({"joints": np.zeros((3, 51, 3))}, "51 joints but 52 parents"),
-        ({"joints": np.zeros((0, 52, 3))}, r"\[T, N, 3\]"),
-        ({"fps": 0}, "fps"),
-        ({"face_controls": np.zeros((2, 5))}, "face_controls"),
-    ],
-)
-def test_viewer_refuses_what_it_cannot_draw(tmp_path: Path, change: dict, words: str) -> None:
-    still = {"joints": np.zeros((3, 52, 3)), "fps": 20.0, "parents": SMPLX.parents, "label": "mine"}
-    with pytest.raises(UserError, match=words) as caught:
-        write_viewer(tmp_path / "v.html", [ViewerMotion(**{**still, **change})], "t")
-    assert "mine" in str(caught.value)
+def test_viewer_refuses_what_it_cannot_draw(tmp_path: Path) -> None:
+    broken = ViewerMotion(np.full((3, 52, 3), np.nan), 20.0, SMPLX.parents, "mine")
+    with pytest.raises(UserError, match=r"mine.*NaN"):
+        write_viewer(tmp_path / "v.html", [broken], "t")
     assert not (tmp_path / "v.html").exists()
-    with pytest.raises(UserError, match="at least one"):
-        write_viewer(tmp_path / "v.html", [], "t")
 
 
 # ---- raster, pictures and film
@@ -262,11 +249,6 @@ def test_page_is_whole_and_escapes(tmp_path: Path, walk: Walk) -> None:
     assert "mountViewer" not in plain and len(plain) < 16_000
 
 
-def test_page_refuses_uneven_rows() -> None:
-    with pytest.raises(UserError, match="1 cells for 2 columns"):
-        Page("t").add_table(["a", "b"], [["x"]], "numbers")
-
-
 # Charts and marked cells as HTML: right numbers, readable names, nothing unescaped.
 
 MARKUP = '<b onclick="x">&'
@@ -334,5 +316,3 @@ def test_charts_without_data_say_so() -> None:
     assert "no data" in line_chart([]) and "no data" in line_chart([Line("a", [1], [np.nan])])
     assert "no data" in histogram({}, (0, 1))
     assert histogram({"uses": [0] * 20 + [3]}, (0, 21)).count('class="dead"') == 20
-    with pytest.raises(ValueError, match="line 'a'"):
-        line_chart([Line("a", [1, 2], [1])])

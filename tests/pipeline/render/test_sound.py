@@ -19,7 +19,6 @@ import soundfile
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import score_of, write_motions
@@ -75,26 +74,9 @@ def test_one_sound_is_carried_once_and_as_long_as_its_longest_motion(song: Make)
 def test_score_keeps_what_lies_within_the_motion() -> None:
     beats = [1.0, -0.2, 0.5, 2.0, 2.5, 0.5]
     segments = [(0, 1.2, "walks"), Segment(1.2, 9.0, "song", "music"), (2.0, 3.0, "too late")]
-    made = score_data(beats, segments, 2.0, "m")
+    made = score_data(beats, segments, 2.0)
     assert made["beats"] == [0.5, 1.0, 2.0]
     assert made["segments"] == [(0.0, 1.2, "walks", "text"), (1.2, 2.0, "song", "music")]
-
-
-@pytest.mark.parametrize(
-    ("beats", "segments", "words"),
-    [
-        ([np.nan], [], "finite seconds"),
-        ([[1.0]], [], "finite seconds"),
-        ([], [(1.0, 1.0, "x")], "'x' must start at 0 s or later and end after it starts"),
-        ([], [(-1.0, 1.0, "x")], "start at 0 s"),
-        ([], [(0.0, np.inf, "x")], "end after"),
-        ([], [(0.0, 1.0, "x", "dance")], "kind 'dance'; known: text, music"),
-    ],
-)
-def test_scores_that_mean_nothing_are_refused(beats: list, segments: list, words: str) -> None:
-    with pytest.raises(UserError, match=words) as caught:
-        score_data(beats, segments, 2.0, "motion 3 ('mine')")
-    assert "motion 3 ('mine')" in str(caught.value)
 
 
 def test_page_data_names_sounds_and_scores_by_number(
@@ -165,8 +147,6 @@ def test_generated_motions_pass_their_scores_to_film_and_page(
     assert np.abs(heard).max() > 0.1
     with pytest.raises(subprocess.CalledProcessError):
         heard_in(tmp_path / "out" / "01-b.mp4")  # has no sound
-    with pytest.raises(UserError, match="1 scores for 2 motions"):
-        write_motions(tmp_path / "no", motions, ["html"], title="t", seed=0, scores=scores[:1])
 
 
 @pytest.mark.slow

@@ -101,10 +101,6 @@ def test_a_release_is_read_and_refused_where_it_differs(tmp_path: Path) -> None:
 def test_positions_start_between_zero_and_one_and_end() -> None:
     table = Positions(MotionVaeConfig(positions=64)).table
     assert table.shape == (64, 1, 256) and 0 <= table.min() < 0.01 and 0.99 < table.max() <= 1
-    with pytest.raises(UserError, match=r"net\.positions"):
-        MotionVae(MotionVaeConfig(**SMALL, positions=8), 5).encode(
-            torch.zeros(1, 7, 5), torch.ones(1, 7, dtype=torch.bool)
-        )
 
 
 @pytest.mark.usefixtures("float64")
@@ -214,12 +210,6 @@ def test_sampling_is_ddim_under_guidance_and_each_motion_its_own() -> None:
         x = after**0.5 * clean + (1 - after) ** 0.5 * noise
     # Errors of single precision grow by the guidance and 1 / sqrt(kept) = 11 at the first step.
     torch.testing.assert_close(alone.double(), x, rtol=1e-3, atol=1e-3)
-
-
-def test_guidance_needs_a_training_with_hidden_texts() -> None:
-    net = LatentDenoiser(LatentDiffusionConfig(**SMALL, condition_dropout=0.0), 1, 5)
-    with pytest.raises(UserError, match="condition_dropout"):
-        sample_latents(net, torch.zeros(1, 5), seeds=[0], guidance=2.0)
 
 
 @pytest.mark.parametrize(("steps", "first"), [(50, 981), (1000, 999)])

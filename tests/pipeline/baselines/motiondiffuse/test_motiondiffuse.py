@@ -85,8 +85,6 @@ def test_padding_of_frames_and_captions_plays_no_part() -> None:
     assert (found[1, 5:] == 0).all()
     other = net(x[1:, :5], step[1:], words([2]), mask[1:, :5])
     assert (other - found[1:, :5]).abs().max() > 1e-3, "another caption, another answer"
-    with pytest.raises(ValueError, match=r"20 frames .*21"):
-        net(torch.randn(1, 21, 5), step[:1], words([2]), torch.ones(1, 21) > 0)
 
 
 def test_the_loss_is_a_mean_over_frames() -> None:

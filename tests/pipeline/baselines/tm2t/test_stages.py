@@ -198,23 +198,6 @@ def test_an_uncaptioned_folder_becomes_a_data_set(
     assert found == {"captioner"}
 
 
-@pytest.mark.parametrize(
-    ("name", "says"),
-    [
-        ("nothing.bvh", "nothing.bvh: no such file or folder"),
-        ("short.npz", "short.npz: 2 frames are no motion"),
-        ("figure.obj", "figure.obj"),
-    ],
-)
-def test_what_cannot_be_captioned_is_said_in_one_sentence(
-    name: str, says: str, finished: Path, tmp_path: Path, call: Callable[..., Any]
-) -> None:
-    np.savez(tmp_path / "short.npz", joints=np.zeros((2, 22, 3)), metadata=json.dumps({"fps": 30}))
-    (tmp_path / "figure.obj").write_text("v 0 0 0")
-    done = call("caption", finished, tmp_path / name)
-    assert done.code == 2 and says in done.err and len(done.err.strip().splitlines()) == 1
-
-
 def test_an_export_that_only_captions(trained: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
     for stage in ("gpt", "face_gpt", "face_vae", "face_diffusion", "generate", "evaluate", "report"):
         shutil.rmtree(trained / "stages" / stage)
