@@ -9,7 +9,6 @@ What is neither kept nor constrained is free: the model makes it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Self
@@ -141,29 +140,22 @@ class EditTask(Config):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        _in_order("path", [point.at for point in self.path])
         for one, two in pairwise(self.path):
+            if two.at <= one.at:
+                raise ValueError(f"path: {two.at:g} s comes after {one.at:g} s; give them in order of time")
             speed = math.hypot(two.x - one.x, two.z - one.z) / (two.at - one.at)
             if speed > MAX_SPEED:
                 raise ValueError(
                     f"path: {speed:.0f} m/s between {one.at:g} s and {two.at:g} s; nobody runs faster than "
                     f"{MAX_SPEED:g} m/s, give the points more time"
                 )
-        _in_order("words", [words.start for words in self.words])
         for first, second in pairwise(self.words):
             if second.start < first.end:
-                raise ValueError(f"words: two stretches overlap at {second.start:g} s")
-        places = [(pin.at, pin.joint) for pin in self.pins]
-        for place in places:
-            if places.count(place) > 1:
-                raise ValueError(f"pins: {place[1]} is pinned twice at {place[0]:g} s")
+                raise ValueError(
+                    f"words: a stretch from {second.start:g} s follows one to {first.end:g} s; give them in "
+                    f"order of time, without overlap"
+                )
         return self
-
-
-def _in_order(name: str, times: Sequence[float]) -> None:
-    for one, two in pairwise(times):
-        if two <= one:
-            raise ValueError(f"{name}: {two:g} s comes after {one:g} s; give them in order of time")
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -15,12 +15,10 @@ from torch import Tensor
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import PRESENT_ALL, UserError
-from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tma.network import Tma
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
-from motionloom.models.utt.network import ConditionedUtt
 from motionloom.pipeline.store.weights import ModelFacts
 
 CPU = torch.device("cpu")
@@ -169,29 +167,18 @@ class LoadedGpt:
     prior: str
 
 
-@dataclass(frozen=True)
-class LoadedDmd:
-    """A trained decoder."""
+N = TypeVar("N", bound=torch.nn.Module)
 
-    net: Dmd
+
+@dataclass(frozen=True)
+class LoadedWindowed(Generic[N]):
+    """A trained network over windows of motion, such as UDE's token model and its decoder."""
+
+    net: N
     window: int
-    given: Mapping[str, Any]
-    """The stage's loaded inputs; "tokenizer" is read."""
-
-
-@dataclass(frozen=True)
-class LoadedUtt:
-    """A trained token model."""
-
-    net: ConditionedUtt
-    max_frames: int
     """Frames of a training window."""
     given: Mapping[str, Any]
-    """The stage's loaded inputs: "tokenizer", and "text" and "audio" as its modalities are."""
-
-    @property
-    def modalities(self) -> frozenset[str]:
-        return frozenset(self.net.mate.widths)
+    """The stage's loaded inputs: "tokenizer", and of a token model "text" and "audio" by its modalities."""
 
 
 def stream_facts(tokenizer: Tokenizer) -> dict[str, object]:

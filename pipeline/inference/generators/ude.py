@@ -15,11 +15,13 @@ from pydantic import Field
 from torch import Tensor
 
 from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.diffusion.dmd_streaming import DmdStream
 from motionloom.models.diffusion.sampling import decode_motions
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
+from motionloom.models.utt.network import ConditionedUtt
 from motionloom.pipeline.contract.generation import (
     Capabilities,
     Decoding,
@@ -32,7 +34,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.contract.stage import StageConfig
 from motionloom.pipeline.inference.generators.base import OfTokens
 from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
-from motionloom.pipeline.store.networks import LoadedDmd, LoadedUtt
+from motionloom.pipeline.store.networks import LoadedWindowed
 
 
 class UdeConfig(StageConfig):
@@ -56,8 +58,8 @@ class UdeConfig(StageConfig):
 class UdeGenerator(OfTokens):
     """Motion of text, music or both, of any length."""
 
-    utt: LoadedUtt
-    dmd: LoadedDmd | None
+    utt: LoadedWindowed[ConditionedUtt]
+    dmd: LoadedWindowed[Dmd] | None
     config: UdeConfig
     method = "ude"
 
@@ -67,7 +69,7 @@ class UdeGenerator(OfTokens):
 
     @property
     def modalities(self) -> frozenset[str]:
-        return self.utt.modalities
+        return frozenset(self.utt.net.mate.widths)
 
     @property
     def settings(self) -> frozenset[str]:
@@ -86,7 +88,7 @@ class UdeGenerator(OfTokens):
     def timeline(self) -> TokenTimeline:
         return TokenTimeline(
             self.utt.net,
-            window_groups=self.utt.max_frames // GROUP_FRAMES,
+            window_groups=self.utt.window // GROUP_FRAMES,
             context=self.config.context_frames // GROUP_FRAMES,
             prepared=self.prepared,
             inject_z=self.config.inject_z,

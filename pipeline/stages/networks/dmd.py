@@ -12,7 +12,7 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import register
 from motionloom.pipeline.stages.networks.clips import motion_example
 from motionloom.pipeline.stages.networks.tokenizer import WindowInputs, WindowStageConfig, window_batches
-from motionloom.pipeline.store.networks import LoadedDmd, TrainedTokenizer, require_streams, stream_facts
+from motionloom.pipeline.store.networks import LoadedWindowed, TrainedTokenizer, require_streams, stream_facts
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
@@ -75,8 +75,8 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
     def example(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, batch: int) -> Example:
         return Example(motion_example(batch, config.window, net.motion_dim))
 
-    def loaded(self, net: Dmd, facts: ModelFacts, inputs: DmdInputs) -> LoadedDmd:
-        return LoadedDmd(net, facts.fact("window", int), inputs)
+    def loaded(self, net: Dmd, facts: ModelFacts, inputs: DmdInputs) -> LoadedWindowed[Dmd]:
+        return LoadedWindowed(net, facts.fact("window", int), inputs)
 
 
 register(DmdStage())

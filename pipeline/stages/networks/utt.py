@@ -20,7 +20,7 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Every, Inputs, Role, Stage, register
 from motionloom.pipeline.stages.networks.clips import clip_batches, motion_example
 from motionloom.pipeline.store.data import Data
-from motionloom.pipeline.store.networks import LoadedUtt, TrainedTokenizer, require_streams, stream_facts
+from motionloom.pipeline.store.networks import LoadedWindowed, TrainedTokenizer, require_streams, stream_facts
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
@@ -156,8 +156,10 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
         )
         return Example(example, f"{parts} + {len(net.utt.names)} End for {config.max_frames} frames")
 
-    def loaded(self, net: ConditionedUtt, facts: ModelFacts, inputs: UttInputs) -> LoadedUtt:
-        return LoadedUtt(net, facts.fact("max_frames", int), inputs)
+    def loaded(
+        self, net: ConditionedUtt, facts: ModelFacts, inputs: UttInputs
+    ) -> LoadedWindowed[ConditionedUtt]:
+        return LoadedWindowed(net, facts.fact("max_frames", int), inputs)
 
     def exported(self, config: UttStageConfig) -> tuple[str, ...]:
         return ("tokenizer", *config.modalities)

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.camera import FIELD_OF_VIEW, Camera, fit_distance
-from motionloom.pipeline.render.charts import Line, curve_label, histogram, line_chart
+from motionloom.pipeline.render.charts import Line, histogram, line_chart
 from motionloom.pipeline.render.film import write_mp4
 from motionloom.pipeline.render.page import Cell, Page
 from motionloom.pipeline.render.scene import LAMP, SKY, SOLE, Actor, Ground, cover, draw_figure
@@ -252,18 +252,6 @@ def test_page_is_whole_and_escapes(tmp_path: Path, walk: Walk) -> None:
 # Charts and marked cells as HTML: right numbers, readable names, nothing unescaped.
 
 MARKUP = '<b onclick="x">&'
-
-
-def test_figures_of_a_log_have_names_for_people() -> None:
-    for key, words in {
-        "tokens_ce": "tokens cross-entropy",
-        "tokens_accuracy_left_hand": "tokens accuracy: left hand",
-        "dead_code": "dead codes",
-        "resets_level12": "reset codes: level 12",
-        "rec_motion": "reconstructed motion",
-        "my_own_figure": "my own figure",
-    }.items():
-        assert curve_label(key) == words
 
 
 def test_cells_and_folds_of_a_page() -> None:

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import soundfile
+
+from tests.pipeline.serve.test_server import tone
 
 pytestmark = pytest.mark.browser
 
 DRAWN = "window.__viewer && window.__viewer.draws > 0"
 SIZES = {"desktop": (1200, 800), "phone": (390, 780)}
-
-
-def tone(seconds: float) -> bytes:
-    song = io.BytesIO()
-    wave = 0.4 * np.sin(2 * np.pi * 220 * np.arange(round(seconds * 16_000)) / 16_000)
-    soundfile.write(song, wave.astype(np.float32), 16_000, format="WAV")
-    return song.getvalue()
 
 
 def status(page: Any) -> str:
