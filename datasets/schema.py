@@ -72,7 +72,7 @@ def parse_json(raw: str | bytes, where: str, **how: Any) -> Any:
 class Config(BaseModel):
     """Base of every config class and record: unknown keys and wrong types are refused, values are frozen."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, defer_build=True)
 
     @classmethod
     def parse(cls, data: Any, where: str) -> Self:

@@ -18,6 +18,9 @@ os.environ["NUMBA_CACHE_DIR"] = str(
     / os.environ.get("PYTEST_XDIST_WORKER", "one")
 )
 
+# What a dry run remembers is no matter of a test, nor of whoever starts the tests.
+os.environ["XDG_CACHE_HOME"] = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "home")
+
 # As many test processes as cores leave no core for a second thread: threads that wait for one that does not
 # run take several times as long as one thread alone. It works because
 # torch is not imported yet.

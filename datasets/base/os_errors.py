@@ -42,7 +42,7 @@ _NUMPY_SHORT = re.compile(r"\d+ requested and \d+ written")
 SHARED_MEMORY = "/dev/shm"
 _SHARED_FULL = (
     f"shared memory ({SHARED_MEMORY}), where loader workers put batches, is full; give the container "
-    f"more (docker run --shm-size 8g), or set hardware.workers: 0; {_AGAIN}"
+    f"more of it, or set hardware.workers: 0; {_AGAIN}"
 )
 _OF_SHARED_MEMORY = ("shared memory", "unable to write to file </torch", "unable to resize file </torch")
 """In torch's messages, those about loader workers that died of it included."""

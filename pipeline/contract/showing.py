@@ -54,7 +54,10 @@ class ModelCard:
     parameters: int
     codebook: int
     """Values of codebooks that learn by averages and have no gradient."""
+    batch: int
+    """Items of a step."""
     local_batch: int
+    """Those that a process takes at once."""
     memory_bytes: int
     note: str
     """Its tokens, in words."""

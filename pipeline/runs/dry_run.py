@@ -9,18 +9,24 @@ conversion **[ours]**. The rest (statistics, tokens, figures, pages) is cheap an
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from itertools import count
 from pathlib import Path
 from statistics import median
 
+import torch
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from motionloom import models, pipeline
+from motionloom.datasets.base.files import write_json
 from motionloom.datasets.base.progress import duration
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.lookup import preview_of, previews
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.continuation import newest_step
@@ -28,7 +34,7 @@ from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.plan import PlannedStage, Selection, make_plan, require_fit
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact
-from motionloom.pipeline.store.files import read_record
+from motionloom.pipeline.store.files import fingerprint_of, read_record
 from motionloom.pipeline.store.run_folder import stage_folder
 from motionloom.pipeline.store.training_log import read_flight, seconds_trained
 from motionloom.pipeline.store.yaml import read_yaml
@@ -48,22 +54,73 @@ def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
     return table
 
 
-def estimate(recipe: Recipe, names: Collection[str] | None = None) -> dict[str, ModelCard]:
+class Sizes(Config):
+    """`sizes.json` in the user's cache: estimates, which take seconds, by all that they depend on."""
+
+    cards: dict[str, ModelCard]
+
+    @staticmethod
+    def place() -> Path:
+        cache = os.environ.get("XDG_CACHE_HOME")
+        return (Path(cache) if cache else Path.home() / ".cache") / "motionloom" / "sizes.json"
+
+    @staticmethod
+    def read() -> Sizes:
+        """The stored sizes; none where none can be read."""
+        try:
+            return Sizes.load_json(Sizes.place())
+        except (UserError, OSError):
+            return Sizes(cards={})
+
+    def write(self, cards: Mapping[str, ModelCard]) -> None:
+        """Store the sizes with new ones, the newest `_MOST` of all."""
+        newest = dict([*self.cards.items(), *cards.items()][-_MOST:])
+        with suppress(OSError):  # a home that may only be read
+            write_json(Sizes.place(), Sizes(cards=newest).dump())
+
+
+_MOST = 500
+
+
+def estimate(
+    recipe: Recipe, names: Collection[str] | None = None, plan: Sequence[PlannedStage] = ()
+) -> dict[str, ModelCard]:
     """A card for each stage that trains, of `names` or of all; `UserError` when the layout of the data is not
-    known.
+    known. Those of a `plan` are remembered from the last time.
     """
     stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
+    known, keys, new = Sizes.read(), {row.stage.name: _key(recipe, row) for row in plan}, {}
     cards = {}
     for stage in recipe.stages:
-        if names is not None and stage.name not in names:
+        if not stage.kind.trains or (names is not None and stage.name not in names):
             continue
-        try:
-            card = stage.kind.estimate(stage.config, previews(stage, stages), recipe.hardware)
-        except UserError as error:
-            raise UserError(f"stage {stage.name}: {error}") from None
+        key = keys.get(stage.name, "")
+        card = known.cards.get(key)
+        if card is None:
+            try:
+                card = stage.kind.estimate(stage.config, previews(stage, stages), recipe.hardware)
+            except UserError as error:
+                raise UserError(f"stage {stage.name}: {error}") from None
+            if card is not None and key:
+                new[key] = card
         if card is not None:
             cards[stage.name] = card
+    if new:
+        known.write(new)
     return cards
+
+
+def _key(recipe: Recipe, row: PlannedStage) -> str:
+    """Digest of all that a stage's sizes depend on: fingerprint, settings that are none of it, code."""
+    train = row.stage.config.dump().get("train")
+    return fingerprint_of([row.fingerprint, train, recipe.hardware.world(), torch.__version__, _code()])
+
+
+@cache
+def _code() -> list[int]:
+    """Number of our files that sizes may depend on, and the time of their last change."""
+    files = [path for package in (models, pipeline) for path in Path(package.__path__[0]).rglob("*.py")]
+    return [len(files), max(path.stat().st_mtime_ns for path in files)]
 
 
 def training_times(run: Path, rows: Sequence[PlannedStage]) -> dict[str, float]:
@@ -90,7 +147,8 @@ def estimate_table(cards: Mapping[str, ModelCard], times: Mapping[str, float]) -
             parameters += f" + {_count(card.codebook)} codebook"
         took = f"about {duration(times[name])}" if name in times else "not known here"
         memory, disk = _size(card.memory_bytes), _size(card.checkpoint_bytes)
-        cells = str(card.local_batch), f"{card.steps:,}", took, memory, disk, card.note
+        once = f" ({card.local_batch} at once)" if card.local_batch < card.batch else ""
+        cells = f"{card.batch}{once}", f"{card.steps:,}", took, memory, disk, card.note
         table.add_row(name, parameters, *cells)
     return table
 
@@ -117,9 +175,10 @@ def say_estimate(
         try:
             preview_of(stage, {**stages, **recipe.outside})
         except UserError as error:
-            console.print(str(error), markup=False)
+            if todo is not None:  # else the plan has said it
+                console.print(str(error), markup=False)
             return
-    cards = estimate(recipe, {stage.name for stage in named})
+    cards = estimate(recipe, {stage.name for stage in named}, todo or ())
     times = {} if run is None or todo is None else training_times(run, todo)
     console.print(estimate_table(cards, times))
     total = sum(times.values())
@@ -146,7 +205,7 @@ def plan_record(
     plan = make_plan(loaded, run, select, go_on)
     todo = [row for row in plan if row.action in {"run", "resume"}]
     require_fit((row.stage for row in todo), loaded.hardware)  # before the estimate, which takes seconds
-    cards = estimate(loaded, {row.stage.name for row in todo})
+    cards = estimate(loaded, {row.stage.name for row in todo}, todo)
     times = training_times(run, todo)
     return {
         "recipe": loaded.name,

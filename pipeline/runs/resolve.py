@@ -33,11 +33,12 @@ from pydantic import ValidationError
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError, explain, nearest
+from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import CompletedStage, Every, StageConfig, stage_kinds
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, is_place
 from motionloom.pipeline.store.weights import load_facts
 from motionloom.pipeline.store.yaml import load_yaml, merge, read_yaml
-from motionloom.pipeline.training.config import TrainedStageConfig
+from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 
 Tree = dict[str, Any]
 """Plain data of a recipe: what YAML and JSON know."""
@@ -179,7 +180,7 @@ def _override(data: Tree, text: str) -> Tree:
     new, stages = load_yaml(value, f"--set {text}"), data.get("stages") or {}
     if parts[0] not in _TOP:
         if parts[0] not in stages:
-            hint = nearest(parts[0], [*stages, *_TOP], list(stages))
+            hint = _place_of(parts, stages) or nearest(parts[0], [*stages, *_TOP], list(stages))
             raise UserError(f"--set {text}: no stage '{parts[0]}'{hint}")
         parts = ["stages", *parts]
     if parts[0] == "stages" and len(parts) == 2 and new is None:
@@ -190,6 +191,18 @@ def _override(data: Tree, text: str) -> Tree:
     if parts[0] == "stages" and len(parts) > 2:
         out["stages"][parts[1]] = _placed(out["stages"][parts[1]], None)
     return out
+
+
+def _place_of(parts: Sequence[str], stages: Mapping[str, Any]) -> str:
+    """A hint for a setting of trainings that was named without its stage; "" where it is none."""
+    trained = [
+        name for name, entry in stages.items() if isinstance(entry, dict) and TRAINED in _defaults_of(entry)
+    ]
+    for group, config in (("optim", OptimConfig), ("train", TrainConfig)):
+        own = parts[1:] if parts[0] == group else parts
+        if trained and len(own) == 1 and own[0] in config.model_fields:
+            return f"; did you mean '{trained[-1]}.{group}.{own[0]}'?"
+    return ""
 
 
 def _put(data: object, parts: Sequence[str], value: object) -> Any:

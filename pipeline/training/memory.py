@@ -53,6 +53,7 @@ def model_card(
     return ModelCard(
         parameters=parameters,
         codebook=sum(book.codebook.numel() for book in books),
+        batch=train.batch_size,
         local_batch=batch,
         memory_bytes=trained * _BYTES_A_PARAMETER // holders + buffers + kept,
         note=note,

@@ -23,6 +23,8 @@ class ToyConfig(TrainedStageConfig):
     """Sizes, and what goes wrong with which batch."""
 
     width: int = 8
+    dropout: float = 0.2
+    """Drawn by each process for itself: without it they train as one."""
     fails_at: int | None = None
     """Number of the batch."""
     failure: Literal["nan", "error"] = "nan"
@@ -33,9 +35,9 @@ class ToyConfig(TrainedStageConfig):
 class ToyNet(nn.Module):
     """Two layer groups."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, dropout: float) -> None:
         super().__init__()
-        self.encoder = nn.Sequential(nn.Linear(DIM, width), nn.Tanh(), nn.Dropout(0.2))
+        self.encoder = nn.Sequential(nn.Linear(DIM, width), nn.Tanh(), nn.Dropout(dropout))
         self.decoder = nn.Linear(width, DIM)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -85,11 +87,13 @@ class ToyTraining(TrainedStage):
     def facts(self, config: Any, given: Inputs) -> ModelFacts:
         """Its width."""
         layout = LayoutFacts(name="body133", fps=20.0, family="exact")
-        return ModelFacts(kind="toy", config={"width": config.width}, layout=layout)
+        return ModelFacts(
+            kind="toy", config={"width": config.width, "dropout": config.dropout}, layout=layout
+        )
 
     def network(self, facts: ModelFacts, given: Inputs) -> nn.Module:
         """Untrained."""
-        return ToyNet(facts.config["width"])
+        return ToyNet(facts.config["width"], facts.config["dropout"])
 
     def module(self, config: Any, net: nn.Module, given: Inputs, seed: int) -> StageModule:
         """With its loss."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import io
 import os
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from rich.console import Console
 from safetensors.numpy import save_file
 
 from motionloom.datasets.base.files import atomic_path, write_text
-from motionloom.datasets.base.os_errors import of_the_machine, sentence_of
+from motionloom.datasets.base.os_errors import SHARED_MEMORY, full_place, of_the_machine, sentence_of
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.base.progress import Meter, Pace, duration
 
@@ -44,6 +46,25 @@ def test_each_refusal_has_words_and_names_the_file(number: int, words: str) -> N
     assert "\n" not in sentence and "Errno" not in sentence
     nameless = sentence_of(OSError(number, os.strerror(number)))
     assert nameless is not None and words in nameless and not nameless.startswith("None")
+
+
+def test_full_shared_memory_is_called_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In torch's words, which are those of 2.13; and where an error names no file, by what is full."""
+    for words in (
+        "unable to write to file </torch_7_1_0>: No space left on device (28)",
+        "DataLoader worker (pid 7) is killed by signal: Bus error. It is possible that dataloader's workers "
+        "are out of shared memory. Please try to raise your shared memory limit.",
+    ):
+        assert "hardware.workers" in str(sentence_of(RuntimeError(words)))
+    error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    for free, place in (({SHARED_MEMORY: 2**14}, SHARED_MEMORY), ({str(tmp_path): 0}, str(tmp_path))):
+        usage = {SHARED_MEMORY: 2**30, str(tmp_path): 2**30} | free
+        monkeypatch.setattr(
+            shutil, "disk_usage", lambda at, usage=usage: SimpleNamespace(free=usage[str(at)])
+        )
+        assert full_place(error, tmp_path) == place
+        error.filename = place
+        assert ("hardware.workers" in str(sentence_of(error))) == (place == SHARED_MEMORY)
 
 
 def test_what_numpy_torch_and_safetensors_make_of_a_disk(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import re
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -18,10 +19,14 @@ from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.tokenizer.single import VqConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.showing import ModelCard
-from motionloom.pipeline.runs.dry_run import estimate, estimate_table, plan_record
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.dry_run import Sizes, estimate, estimate_table, plan_record
+from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.slurm import launch_recipe
+from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.training.memory import _saved_bytes
+from motionloom.pipeline.training.trained_stage import TrainedStage
 
 PAPER = """
 name: paper-sizes
@@ -107,6 +112,50 @@ def test_time_is_known_from_the_run_itself(tmp_path: Path) -> None:
             launch_recipe(
                 path, out=tmp_path / "run", gpus_per_node=0, options=words, dry_run=True, console=quiet
             )
+
+
+def test_what_will_hardly_do_what_is_meant_is_said(tmp_path: Path) -> None:
+    """Clips are known once there are some: of 10, 6 are for training."""
+    path, run = tmp_path / "small.yaml", tmp_path / "run"
+    path.write_text(SMALL)
+    sets = ["tokenizer.optim.warmup_steps=8", "tokenizer.train.batch_size=16"]
+    (doubt,) = plan_record(path, run, overrides=sets)["doubts"]  # type: ignore[misc]
+    assert doubt.startswith("tokenizer: optim.warmup_steps 8 ") and " 7 steps" in doubt
+    run_recipe(path, run, select=Selection(until="data"), console=Console(quiet=True))
+    clips = Data(run / "stages/data").clips("train")
+    said = Console(record=True, width=300)
+    run_recipe(path, run, overrides=sets, dry_run=True, console=said)
+    text = said.export_text()
+    assert doubt in text and f"data has {clips} training clips and a batch 16" in text and clips < 16
+    said = Console(record=True, width=300)
+    run_recipe(path, tmp_path / "whole", overrides=sets, console=said)
+    text = said.export_text()
+    assert [text.count(words) for words in (doubt, f"{clips} training clips")] == [1, 1]
+    with pytest.raises(UserError, match=r"stage tokenizer: train\.precision 16-mixed"):
+        plan_record(path, run, overrides=["tokenizer.train.precision=16-mixed"])
+
+
+def test_sizes_are_remembered_until_something_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    path, asked = tmp_path / "small.yaml", list[int]()
+    path.write_text(SMALL)
+    measure = TrainedStage.estimate
+
+    def counted(self: Any, config: Any, *rest: Any) -> ModelCard:
+        asked.append(config.train.batch_size)
+        return measure(self, config, *rest)
+
+    monkeypatch.setattr(TrainedStage, "estimate", counted)
+    for sets in ([], [], ["tokenizer.train.batch_size=4"], ["tokenizer.train.keep_every=2"], []):
+        plan = plan_record(path, tmp_path / "run", overrides=sets)
+        (card,) = [row["training"] for row in plan["stages"] if row["training"]]  # type: ignore[attr-defined]
+        assert card.batch == (4 if "batch" in str(sets) else 8)
+    assert asked == [8, 4, 8]
+    Sizes.place().write_text("{")
+    plan_record(path, tmp_path / "run")
+    assert asked == [8, 4, 8, 8]
 
 
 def test_saved_bytes_of_a_known_network() -> None:

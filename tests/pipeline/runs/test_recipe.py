@@ -94,6 +94,8 @@ stages:
         ("gpt.net.heads=7", "with --set: stages.gpt: .*dim 160 must be a multiple of heads 7"),
         ("tma.net.heads=3", "latent 128 must be a multiple of heads 3"),
         ("tokenizer.inputs.data=null", "stage 'tokenizer' needs a stage 'None'"),
+        ("lr=1", r"did you mean '\w+\.optim\.lr'"),
+        ("train.steps=3", r"did you mean '\w+\.train\.steps'"),
         ("sead=3", "no stage 'sead'; did you mean 'seed'"),
         ("stats=null", r"needs a stage 'stats' \(role 'stats'\)"),
         ("face_tokenizr=null", "--set face_tokenizr=null: no stage .*; did you mean 'face_tokenizer'"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import torch
@@ -13,8 +13,14 @@ from rich.console import Console
 from safetensors.torch import load_file
 from toy_training import ToyBatches, ToyConfig, toy_recipe
 
+from motionloom.datasets.schema import ShardInfo, UserError
+from motionloom.datasets.shards.checksums import LocalShard
 from motionloom.models.training.stage_module import StepFigures
+from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.continuation import newest_step
+from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.training_log import rise_of_loss
 from motionloom.pipeline.training.failures import Failure, NotFiniteError, first_failure
 
 FAILS = 13
@@ -49,6 +55,40 @@ def test_an_error_in_a_step_leaves_its_traceback(call: Callable[..., Any], recip
     folder = run / "stages/toy/crash/step_00000003"
     assert done.code == 1 and "ArithmeticError" in done.err and str(folder) in done.out
     assert "in losses" in (folder / "error.txt").read_text() and (folder / "batch.safetensors").is_file()
+
+
+def test_a_shard_that_changes_ends_the_training_before_its_next_checkpoint(
+    recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is named, also where reading it has failed."""
+    shards = [recipe.parent / name for name in ("one.tar", "two.tar")]
+    info = ShardInfo(name="a.tar", split="train", samples=1, frames=1, bytes=1, sha256="0" * 64)
+    monkeypatch.setattr(Data, "local_shards", lambda _: [LocalShard(path, info) for path in shards])
+    kind = SimpleNamespace(gives=lambda _: {"data"})
+    data = CompletedStage("data", cast(Any, kind), None, recipe.parent, {})
+    monkeypatch.setattr("motionloom.pipeline.runs.execute.stage_inputs", lambda *_: {"data": data})
+    read = ToyBatches.__getitem__
+
+    def touched(self: ToyBatches, k: int) -> dict[str, torch.Tensor]:
+        if k == FAILS:
+            shards[1].write_text("longer")
+        return read(self, k)
+
+    monkeypatch.setattr(ToyBatches, "__getitem__", touched)
+    never = "hardware.verify_shards=never"  # these are none
+    for sets in ([never], [never, f"toy.fails_at={FAILS}", "toy.failure=error"]):
+        for path in shards:
+            path.write_text("a")
+        run = recipe.parent / f"touched{len(sets)}"
+        with pytest.raises(UserError, match=str(shards[1])):
+            run_recipe(recipe, run, overrides=sets, console=Console(quiet=True))
+        assert newest_step(run / "stages/toy") == 10
+
+
+def test_a_loss_that_rises_a_thousand_times_is_said() -> None:
+    rows = [{"step": 10.0 * k, "train/loss": loss} for k, loss in enumerate((2.0, 1.0, 2100.0))]
+    assert "1,050 times" in str(rise_of_loss([*rows, {"step": 20.0, "val/loss": 1.0}]))
+    assert rise_of_loss(rows[:2]) is None and rise_of_loss([]) is None
 
 
 def figures(step: int, **values: float) -> StepFigures:
