@@ -162,7 +162,7 @@ def _take(
 ) -> Stage:
     """Write a training's checkpoint as a finished stage of the run `folder`; returns its stage there."""
     from motionloom.models.training.averaging import AveragedWeights
-    from motionloom.pipeline.training.lightning_data import describe
+    from motionloom.pipeline.training.trained_stage import describe
 
     source, home = stage_folder(run, name), stage_folder(folder, name)
     path, content = _read(source / "checkpoints", step)

@@ -10,15 +10,13 @@ import lightning as L
 from torch.utils.data import DataLoader
 
 from motionloom.datasets.loading.steps import Steps
-from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import Batch, StageModule
-from motionloom.pipeline.contract.lookup import outside_stage
-from motionloom.pipeline.contract.stage import CompletedStage, Inputs, StageCache, stage_kind
+from motionloom.pipeline.contract.stage import CompletedStage, Inputs, StageCache
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.execution import prepare_module, set_threads
 from motionloom.pipeline.training.loaders import every_batch, loader
-from motionloom.pipeline.training.trained_stage import Batches, TrainedStage, hyper_parameters
+from motionloom.pipeline.training.trained_stage import Batches, TrainedStage, describe, hyper_parameters
 
 
 class StageData(L.LightningDataModule):
@@ -84,27 +82,3 @@ def _open_module(
 def rebuild(content: object, path: object, inputs: Mapping[str, str | Path]) -> StageModule:
     """Return the module that a checkpoint's hyper-parameters describe, with its first weights."""
     return _open_module(*describe(content, path, inputs))[0]
-
-
-def describe(
-    content: object, path: object, inputs: Mapping[str, str | Path]
-) -> tuple[TrainedStage[Any, Any, Any], Any, dict[str, CompletedStage], int]:
-    """Return kind, config, inputs and seed of a checkpoint's training; `inputs` overrule its folders."""
-    hyper = content.get("hyper_parameters") if isinstance(content, dict) else None
-    if not isinstance(hyper, dict) or not {"kind", "config", "seed", "inputs"} <= hyper.keys():
-        raise UserError(f"{path}: no hyper-parameters of a stage; build the module and give net= and optim=")
-    kind = stage_kind(str(hyper["kind"]), str(path))
-    if not isinstance(kind, TrainedStage):
-        raise UserError(f"{path}: stages of kind {kind.name} train no network")
-    config = kind.config.parse(dict(hyper["config"]), f"{path}: config")
-    # Of a run's own checkpoint, RUN/stages/NAME/checkpoints/FILE, folders are given as seen from the stage.
-    stage = Path(str(path)).absolute().parent.parent
-    given: dict[str, CompletedStage] = {}
-    for role, place in {**hyper["inputs"], **inputs}.items():
-        found = outside_stage(stage / str(place))
-        if found is None:
-            raise UserError(
-                f'{path}: input {place} is no finished stage; give inputs={{"{role}": its folder}}'
-            )
-        given[role] = found
-    return kind, config, given, int(hyper["seed"])

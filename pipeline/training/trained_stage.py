@@ -21,6 +21,7 @@ from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank
 from motionloom.models.training.lora import trained_share
+from motionloom.pipeline.contract.lookup import outside_stage
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.contract.stage import (
     SHOWING,
@@ -30,6 +31,7 @@ from motionloom.pipeline.contract.stage import (
     Role,
     StageContext,
     StageKind,
+    stage_kind,
 )
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.files import copy_files
@@ -238,6 +240,30 @@ def hyper_parameters(
     }
     ids = {role: identity_of(stage.folder) for role, stage in given.items()}
     return {"kind": kind, "config": config.dump(), "seed": seed, "inputs": places, "identities": ids}
+
+
+def describe(
+    content: object, path: object, inputs: Mapping[str, str | Path]
+) -> tuple[TrainedStage[Any, Any, Any], Any, dict[str, CompletedStage], int]:
+    """Return kind, config, inputs and seed of a checkpoint's training; `inputs` overrule its folders."""
+    hyper = content.get("hyper_parameters") if isinstance(content, dict) else None
+    if not isinstance(hyper, dict) or not {"kind", "config", "seed", "inputs"} <= hyper.keys():
+        raise UserError(f"{path}: no hyper-parameters of a stage; build the module and give net= and optim=")
+    kind = stage_kind(str(hyper["kind"]), str(path))
+    if not isinstance(kind, TrainedStage):
+        raise UserError(f"{path}: stages of kind {kind.name} train no network")
+    config = kind.config.parse(dict(hyper["config"]), f"{path}: config")
+    # Of a run's own checkpoint, RUN/stages/NAME/checkpoints/FILE, folders are given as seen from the stage.
+    stage = Path(str(path)).absolute().parent.parent
+    given: dict[str, CompletedStage] = {}
+    for role, place in {**hyper["inputs"], **inputs}.items():
+        found = outside_stage(stage / str(place))
+        if found is None:
+            raise UserError(
+                f'{path}: input {place} is no finished stage; give inputs={{"{role}": its folder}}'
+            )
+        given[role] = found
+    return kind, config, given, int(hyper["seed"])
 
 
 def _frozen(net: N) -> N:
