@@ -82,6 +82,14 @@ def beyond(
     return f"{part}[{at}] is {value:.4g}{unit} at frame {frame}; at most {most:.4g} is sensible"
 
 
+def odd_value(motion: NDArray[np.floating], layout: MotionLayout) -> str:
+    """Return the worst value that no person reaches, or ""; `ValueError` for one that no motion has."""
+    limits = human_limits(layout)
+    if absurd := beyond(motion, layout, limits, ABSURD):
+        raise ValueError(f"absurd value: {absurd}: a wrong unit, scale or layout")
+    return beyond(motion, layout, limits)
+
+
 @dataclass(frozen=True)
 class CheckedClip:
     """A clip that can be read. `oddities` are (kind, message)."""
@@ -117,13 +125,8 @@ def check_clip(
     if motion.shape != (meta.frames, layout.dim) or not len(motion):
         raise ValueError(f"motion.npy is {list(motion.shape)}, wanted {[meta.frames, layout.dim]}")
     require_finite("motion.npy", motion)
-    limits = human_limits(layout)
-    absurd = beyond(motion, layout, limits, ABSURD)
-    if absurd:
-        raise ValueError(f"motion.npy: {absurd}: a wrong unit, scale or layout")
     oddities: list[tuple[str, str]] = []
-    strange = beyond(motion, layout, limits)
-    if strange:
+    if strange := odd_value(motion, layout):
         oddities.append(("beyond what a person can do", f"motion.npy: {strange}"))
     captioned = False
     for name in ("texts.json", "face_texts.json"):

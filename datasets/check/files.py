@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio.sound import read_sound
-from motionloom.datasets.check.clip import ABSURD, beyond, human_limits, require_sensible
+from motionloom.datasets.check.clip import odd_value, require_sensible
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.bvh.plan import read_motion as read_mocap
@@ -91,7 +91,7 @@ def check_file(path: Path, rules: FileRules | None = None) -> Verdict:
         return Verdict(path, problems=["no such file" if not path.exists() else "not a plain file"])
     try:
         return reader(path, rules or FileRules())
-    except UserError as error:
+    except (UserError, ValueError) as error:
         told = str(error).removeprefix(f"{path}: ").replace(f"{path}:", "line ", 1)
         return Verdict(path, problems=[told])
     except OSError as error:
@@ -160,8 +160,7 @@ def _check_motion(values: NDArray[np.floating], layout: MotionLayout | None) -> 
         return
     if values.shape[1] != layout.dim:
         raise ValueError(f"{values.shape[1]} columns, layout {layout.name} has {layout.dim}")
-    if absurd := beyond(values, layout, human_limits(layout), ABSURD):
-        raise ValueError(f"{absurd}: a wrong unit, scale or layout")
+    odd_value(values, layout)
 
 
 def _check_npy(path: Path, rules: FileRules) -> Verdict:
@@ -174,11 +173,7 @@ def _check_npy(path: Path, rules: FileRules) -> Verdict:
         values = load_array(path, width=layout.dim)
     except UserError as error:
         raise UserError(f"{error}{_layout_hint(path, layout)}") from None
-    limits = human_limits(layout)
-    absurd = beyond(values, layout, limits, ABSURD)
-    if absurd:
-        raise UserError(f"{path}: absurd value: {absurd}: a wrong unit, scale or layout")
-    strange = beyond(values, layout, limits)
+    strange = odd_value(values, layout)
     notes = [f"beyond what a person can do: {strange}"] if strange else []
     return Verdict(path, f"{layout.name} {list(values.shape)} {values.dtype}", notes=notes)
 

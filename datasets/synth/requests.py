@@ -8,33 +8,17 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
 
 from motionloom.datasets.actions.dances import Record
 
-_PATTERNS = {
-    "turn": r"(turn|pivot|spin|rotat)(e|s|es|ed|ing|ning)?|spun|about[- ]face|face the other way",
-    "walk": r"(walk|stroll|wander|trudg|strid|ambl|saunter)(e|s|es|ed|ing)?"
-    r"|(takes?|took|taking) (\w+ ){0,4}steps?|back away|back(s|ed|ing) (away|up|off)",
-    "run": r"(run|jog|dash|sprint)(s|es|ed|ged|ning|ging|ing)?|ran",
-    "wave": r"wav(e|es|ed|ing)",
-    "raise": r"(rais|lift)(e|es|s|ed|ing)?|(arms?|hands?) (up|in the air)",
-    "kick": r"kick(s|ed|ing)?",
-    "punch": r"punch(es|ed|ing)?|(jab|uppercut)(s|bed|bing)?|(hit|swing|swung)(s|ting|ing)? .{0,60}fist",
-    "hop": r"hop(s|ped|ping)?",
-    "jump": r"(jump|leap)(s|ed|ing|t)?|skip(s|ping)? (with a )?rope",
-    "squat": r"squat(s|ted|ting)?|crouch(es|ed|ing)?",
-    "clap": r"clap(s|ped|ping)?|applau(d|ds|ded|ding|se)",
-    "sit": r"sits?|sat|sitting|(take|took|has|have)s? a seat|taking a seat",
-    "bow": r"bow(s|ed|ing)?|(bend|bends|bent|bending) (over|forward)",
-    "lie": r"lies?|lying|lay(s|ing)? down",
-    "crawl": r"crawl(s|ed|ing)?",
-    "dance": r"(danc|groov)(e|es|ed|ing)|disco",
-    "reach": r"reach(es|ed|ing)?|extend(s|ed|ing)? (a|an|one|the|his|her|their|your) (hand|arm)"
-    r"|(pick|picks|picked|picking) (\w+ ){0,5}up",
-    "point": r"point(s|ed|ing)?",
-    "stretch": r"stretch(es|ed|ing)?",
-}
-"""Words for each action. Repeats are bounded, so that no caption takes long."""
+_TABLE = yaml.safe_load(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
+_PATTERNS: dict[str, str] = _TABLE["actions"]
+"""Words for each action."""
+_DIRECTIONS: dict[str, dict[str, str]] = _TABLE["directions"]
+_SPEEDS: dict[str, str] = _TABLE["speeds"]
 _TWO_WORDS = (("turn", "walk"), ("hop", "jump"), ("reach", "bow"), ("stretch", "raise"))
 """Pairs of which a caption with both asks for the first alone: who turns may walk."""
 _RAISED = {"reach": "up", "stretch": "arms?"}
@@ -56,27 +40,6 @@ _FINGERS = (
     rf"(?:wiggling|waving) the fingers of {_HAND}",
 )
 """Phrases about fingers, whose side is not the action's."""
-_DIRECTIONS = {
-    "turn": {"left": "left", "right": "right"},
-    "walk": {
-        "forward": "forwards?",
-        "backward": r"backwards?|back(s|ed|ing)? (away|up|off)|step(s|ped|ping)? back",
-        "clockwise": "clockwise",
-        "counterclockwise": "counterclockwise",
-    },
-    "run": {"forward": "forwards?", "backward": "backwards?"},
-    "jump": {"forward": r"(long|broad) jumps?|forwards?|ahead"},
-    "reach": {
-        "up": r"(reach(es|ed|ing)?|stretch\w*) up|top|high|overhead|above",
-        "down": r"down|floor|ground|toes",
-        "forward": r"forwards?|in front|ahead",
-    },
-    "point": {"up": r"up|sky|ceiling|above", "forward": r"forwards?|in front|ahead"},
-}
-_SPEEDS = {
-    "slowly": r"slow(ly)?|unhurried(ly)?|leisurely",
-    "quickly": r"quick(ly)?|fast|rapid(ly)?|brisk(ly)?|hurried(ly)?",
-}
 _COUNTED = ("kick", "punch", "hop", "jump", "squat", "clap")
 _ONES = "two three four five six seven eight nine ten eleven twelve"
 _TENS = "twenty thirty forty fifty sixty seventy eighty ninety"

@@ -142,13 +142,13 @@ def test_dances_to_drifting_songs_have_their_beats_and_no_others() -> None:
     scores = defaultdict(list)
     for song in SONGS:
         beats = np.array(song.beats_within(5.0, COUNT / RATE - 1))
-        for definition in ("ude", "mint"):
+        for definition in ("bailando", "mint"):
             for shift in (0.0, 0.5):
                 score = beat_align(danced(song), beats + shift * song.beat, RATE, definition)
                 scores[definition, shift].append(score)
     # Sampling at 20 frames a second leaves 0.86 of a perfect score.
-    assert min(np.mean(scores[name, 0.0]) for name in ("ude", "mint")) > 0.75
-    assert max(np.mean(scores[name, 0.5]) for name in ("ude", "mint")) < 0.15
+    assert min(np.mean(scores[name, 0.0]) for name in ("bailando", "mint")) > 0.75
+    assert max(np.mean(scores[name, 0.5]) for name in ("bailando", "mint")) < 0.15
 
 
 def test_size_follows_the_energy_and_a_break_is_held() -> None:
