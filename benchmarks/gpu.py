@@ -10,11 +10,12 @@ named at the end. In this order:
 
 - `steps`: a training step without its loader, on a batch as large as training may see: wall time between
   synchronised points, TFLOP/s and share of the data sheet's peak, peak of memory and what `--dry-run` says;
+  also under `hardware.deterministic`;
 - `trainings`: the same stages as a run trains them, by their own telemetry, the first third left out;
 - `sampling`: whole-body motions of 196 frames, the second of two calls;
 - `bytes`: each training once more: are the weights the same;
 - `stages`: every stage of `baselines-tiny` and `baselines-tiny-ude`, 20 steps each;
-- `compiled`: the steps again, compiled as `train.compile: true` does, and as CUDA graphs.
+- `compiled`: the steps again, compiled, and replayed as CUDA graphs.
 """
 
 from __future__ import annotations
@@ -34,20 +35,19 @@ from bench import Column, arguments, command_line, report
 from rich.console import Console
 
 from motionloom.datasets.base.files import sha256_of
-from motionloom.models.training.alternating import AlternatingModule
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.contract.lookup import previews
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.launch.hardware import choose_device
+from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.training_log import read_flight
 from motionloom.pipeline.store.yaml import dump_yaml
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import Execution, launch
+from motionloom.pipeline.training.execution import Execution, launch, repeatable
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed", "fp16": "16-mixed"}
@@ -106,10 +106,10 @@ class Benchmark:
     """What is measured, at one size on one device."""
 
     def __init__(self, args: Namespace) -> None:
-        self.args, self.device = args, choose_device(args.device)
+        accelerator: Any = "cpu" if args.device == "cpu" else "gpu"
+        self.args, self.device = args, Hardware(accelerator=accelerator).device()
         self.console = Console(file=(args.work / "log.txt").open("a", encoding="utf-8"), width=120)
         self.run = args.work / "run"
-        accelerator = "cpu" if args.device == "cpu" else "gpu"
         self.hardware = [f"hardware.accelerator={accelerator}", "hardware.devices=1"]
         if args.device == "cpu":
             self.hardware += ["hardware.threads=1", "hardware.stall_seconds=0"]
@@ -158,17 +158,16 @@ class Benchmark:
         """Steps for about two seconds, behind four that choose kernels or compile."""
         made = make()
         train: TrainConfig = made.stage.config.train.model_copy(
-            update={"precision": PRECISIONS[precision], "compile": how == "compiled", "accumulate": 1}
+            update={"precision": PRECISIONS[precision], "compile": False, "accumulate": 1}
         )
         module = copy.deepcopy(made.module).train()
-        if how == "graphs":
-            torch.compiler.reset()
-            name = "losses_of" if isinstance(module, AlternatingModule) else "losses"
-            setattr(module, name, torch.compile(getattr(module, name), mode="reduce-overhead"))
+        if how in ("compiled", "graphs"):
+            module.compile_losses(graphs=how == "graphs")
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats()
-        fabric = launch(self.recipes["humantomato"].hardware, train)
+        hardware = self.recipes["humantomato"].hardware.model_copy(update={"deterministic": how == "equal"})
+        fabric = launch(hardware, train)
         execution = Execution(fabric, module, train)
         batch = fabric.to_device(made.batch)
 
@@ -179,8 +178,9 @@ class Benchmark:
             self.synchronize()
             return (time.perf_counter() - begin) / count
 
-        first, second = timed(1), timed(3)
-        seconds = timed(max(3, min(100, int(2 / second))))
+        with repeatable(hardware):
+            first, second = timed(1), timed(3)
+            seconds = timed(max(3, min(100, int(2 / second))))
         cells = {"ms a step": f"{1000 * seconds:.1f}", "first, s": f"{first:.1f}"}
         cells |= {"batch": str(train.batch_size), "TFLOP a step": f"{made.flops / 1e12:.3g}"}
         return cells | self.share(made.flops / seconds, train) | self.memory(made.estimated)
@@ -282,6 +282,7 @@ def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cell
         for precision in PRECISIONS if cuda else ("fp32", "bf16"):  # a CPU has no loss scaler
             make = partial(kept, family, name)
             yield "steps", f"{name} {precision}", partial(bench.step, make, precision, "eager")
+        yield "steps", f"{name} bf16, equal bytes", partial(bench.step, make, "bf16", "equal")
     for name in TRAINED:
         yield "trainings", name, partial(bench.training, name)
     for batch in (1, 32, 256):
