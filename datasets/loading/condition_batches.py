@@ -10,7 +10,6 @@ everywhere.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Literal, NotRequired, cast
 
 import numpy as np
@@ -36,9 +35,6 @@ _CAPTION, _CROP, _DROP = 2, 3, 4
 
 Captioned = Literal["body", "face"]
 """Subject of the captions that every clip must have."""
-
-KEPT = 2**16
-"""Clips whose captions are kept as read: some 50 MB a process."""
 
 
 class ConditionBatch(MotionBatch):
@@ -106,14 +102,8 @@ class ConditionedClips:
         """Which of the modalities that are read every clip of the dataset has, [n, M]."""
         for column, member in enumerate(self.members.values()):
             self.present[:, column] = dataset.has(member)
-        self._captions = lru_cache(KEPT)(self._read_captions)
-
-    def __getstate__(self) -> dict[str, object]:
-        return {name: value for name, value in vars(self).items() if name != "_captions"}
-
-    def __setstate__(self, state: dict[str, object]) -> None:
-        vars(self).update(state)
-        self._captions = lru_cache(KEPT)(self._read_captions)
+        self._captions: dict[int, list[CaptionSpan]] = {}
+        """Those of the clips that were drawn so far, by clip."""
 
     @property
     def names(self) -> list[str]:
@@ -132,7 +122,9 @@ class ConditionedClips:
             if not text:
                 out.append(CaptionSpan("", 0, int(self.dataset.frames[clip])))
                 continue
-            choices = self._captions(clip)
+            if clip not in self._captions:
+                self._captions[clip] = self._read_captions(clip)
+            choices = self._captions[clip]
             out.append(choices[int(draw * len(choices))])
         return out
 

@@ -53,12 +53,6 @@ class TokenStore:
     def groups(self) -> NDArray[np.int64]:
         return np.diff(self.starts)
 
-    def clip(self, index: int, first: int = 0, count: int | None = None) -> Codes:
-        """Codes of (a part of) a clip: per stream int64 [count * per_group]."""
-        begin = int(self.starts[index]) + first
-        end = int(self.starts[index + 1]) if count is None else begin + count
-        return {name: flat[begin * n : end * n] for (name, flat), n in self._streams()}
-
     def stretches(self, begin: NDArray[np.int64], count: NDArray[np.int64]) -> Codes:
         """Codes of `count` [B] groups from group `begin` [B] of the split on: per stream int64
         [B, most * per_group]; after a shorter row's own come others, of no meaning.

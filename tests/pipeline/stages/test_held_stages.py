@@ -65,8 +65,9 @@ def test_tokens_of_clips_that_lack_a_part(data: Data, part: str, bit: int, tmp_p
     kept = np.flatnonzero(store.whole)
     assert 0 < len(kept) < len(dataset) and len(whole.groups) == len(kept) and whole.whole.all()
     for row, clip in enumerate(kept.tolist()):
-        for name, codes in store.clip(clip).items():
-            assert torch.equal(whole.clip(row)[name], codes)
+        one = whole.of(np.arange(len(kept)) == row)
+        for name, codes in store.of(np.arange(len(dataset)) == clip).codes.items():
+            assert torch.equal(one.codes[name], codes)
     everything = replace(loaded, whole=np.ones(len(dataset), dtype=bool))
     assert everything.whole_clips() is everything
 
