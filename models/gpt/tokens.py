@@ -30,6 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import UserError
+from motionloom.models.layers.transformer import product_type
 from motionloom.models.tokenizer.base import Stream
 
 PAD = -1
@@ -233,6 +234,7 @@ class TokenNetwork(nn.Module):
         """Hidden states [B, L, D], kinds [B, L], legal bool [B, L, V] -> float32 [B, L, V], -inf where
         illegal.
         """
+        hidden = hidden.to(product_type(hidden))  # once, not for each head
         out = torch.full((*kinds.shape, self.vocabulary), -torch.inf, device=hidden.device)
         for kind, head in enumerate(self.heads):
             values = head(hidden).float()

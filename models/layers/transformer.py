@@ -72,6 +72,12 @@ class StackConfig(Config):
         return self
 
 
+def product_type(x: Tensor) -> torch.dtype:
+    """The type in which matrix products of x are computed, under autocast or without."""
+    device = x.device.type
+    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
+
+
 class LayerNorm(nn.LayerNorm):
     """Computes in the type of its weights under autocast too, as CUDA's autocast has it: a CPU's kernel for
     mixed types adds up the gradients of the weights in bfloat16, which leaves half of them wrong.
@@ -356,8 +362,7 @@ def _added(mask: Tensor | None, x: Tensor) -> Tensor | None:
     if mask is None:
         return None
     mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
-    device, size = x.device.type, mask.shape[-1]
-    kind = torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
+    kind, size = product_type(x), mask.shape[-1]
     # Kernels of GPUs read rows that begin at multiples of 8, and copy others in every layer.
     hidden = F.pad(~mask, (0, -size % 8), value=True)
     return torch.zeros(hidden.shape, dtype=kind, device=x.device).masked_fill_(hidden, -torch.inf)[..., :size]

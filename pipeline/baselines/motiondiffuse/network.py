@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.network import step_waves
 from motionloom.models.diffusion.schedule import ScheduleConfig
-from motionloom.models.layers.transformer import LayerNorm, StackConfig, Transformer
+from motionloom.models.layers.transformer import LayerNorm, StackConfig, Transformer, product_type
 
 
 class CaptionConfig(StackConfig):
@@ -85,8 +85,8 @@ class Attend(nn.Module):
 
     def forward(self, x: Tensor, mask: Tensor, memory: Tensor | None = None) -> Tensor:
         """x [B, T, C] and what `mask` [B, S] shows: of x itself, or of a memory [B, S, M] -> [B, T, C]."""
-        x = self.norm(x)
-        read = x if self.norm_memory is None or memory is None else self.norm_memory(memory)
+        x = self.norm(x).to(product_type(x))  # once, not for each of the three
+        read = x if self.norm_memory is None or memory is None else self.norm_memory(memory).to(x.dtype)
         query, key, value = (self._split(part) for part in (self.query(x), self.key(read), self.value(read)))
         return linear_attention(query, key, value, mask).transpose(1, 2).flatten(2)
 
