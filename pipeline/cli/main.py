@@ -100,6 +100,16 @@ def info(
         facts.show_info(make_console())
 
 
+GoOn = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--go-on",
+        metavar="STAGE",
+        help="Go on with this training's weights although its optim, loss or train settings changed.",
+    ),
+]
+
+
 @app.command()
 def run(
     recipe: Annotated[str, typer.Argument(help="A shipped recipe's name (see info) or a .yaml file.")],
@@ -116,14 +126,7 @@ def run(
     until: Annotated[
         str | None, typer.Option(help="Only this stage and what it needs; several as A,B.")
     ] = None,
-    go_on: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--go-on",
-            metavar="STAGE",
-            help="Go on with this training's weights although its optim, loss or train settings changed.",
-        ),
-    ] = None,
+    go_on: GoOn = None,
     replace: Annotated[
         bool,
         typer.Option(
@@ -185,6 +188,7 @@ def launch(
         typer.Option("--out", "-o", help="Run folder, as the cluster sees it; default runs/NAME."),
     ] = None,
     sets: Sets = None,
+    go_on: GoOn = None,
     cluster: Annotated[
         list[str] | None,
         typer.Option(
@@ -210,6 +214,7 @@ def launch(
         gpus_per_node=gpus_per_node,
         out=out,
         overrides=sets or (),
+        go_on=go_on or (),
         options=cluster or (),
         dry_run=dry_run,
         console=make_console(),

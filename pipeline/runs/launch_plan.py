@@ -136,6 +136,8 @@ class LaunchPlan:
     overrides: tuple[str, ...]
     out: str
     groups: tuple[Group, ...]
+    go_on: tuple[str, ...] = ()
+    """Trainings that go on although what they compute has changed."""
 
     def job(self, group: Group) -> str:
         """Name of a group's job."""
@@ -153,6 +155,7 @@ class LaunchPlan:
             self.out,
             "--until",
             ",".join(group.last),
+            *(word for name in group.stages if name in self.go_on for word in ("--go-on", name)),
             *sets,
         ]
 
@@ -176,6 +179,7 @@ def make_launch_plan(
     out: Path,
     nodes: int,
     gpus_per_node: int,
+    go_on: Sequence[str] = (),
 ) -> LaunchPlan:
     """Cut a recipe into groups."""
     if nodes < 1 or gpus_per_node < 0:
@@ -205,7 +209,7 @@ def make_launch_plan(
         require_fit(map(recipe.stage, group.stages), recipe.hardware.model_copy(update=there))
     word = _word(recipe.name, 30)
     name = word if word[:1].isalpha() else f"run-{word}"
-    return LaunchPlan(name, recipe, shipped, tuple(overrides), str(out), tuple(groups))
+    return LaunchPlan(name, recipe, shipped, tuple(overrides), str(out), tuple(groups), tuple(go_on))
 
 
 def _machines(options: SlurmOptions, need: Need, nodes: int, gpus: int) -> Machines:

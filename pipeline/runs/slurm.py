@@ -28,6 +28,7 @@ from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.progress import duration
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.process import SAVED
+from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.dry_run import (
     explain_replacements,
     replaced_stages,
@@ -120,6 +121,7 @@ def launch_recipe(
     gpus_per_node: int = 8,
     out: Path | None = None,
     overrides: Sequence[str] = (),
+    go_on: Sequence[str] = (),
     options: Sequence[str] = (),
     dry_run: bool = False,
     console: Console,
@@ -136,7 +138,7 @@ def launch_recipe(
             raise UserError(f"{what} {str(place)!r}: has characters that are not printable; choose another")
     rows: list[PlannedStage] = []
     try:
-        rows = make_plan(loaded, run)
+        rows = make_plan(loaded, run, go_on=go_on)
     except UserError as error:
         if not dry_run or (run / "recipe.yaml").is_file():
             raise
@@ -152,10 +154,13 @@ def launch_recipe(
         out=run,
         nodes=nodes,
         gpus_per_node=gpus_per_node,
+        go_on=go_on,
     )
     for line in plan.lines():
         console.print(line, soft_wrap=True, markup=False)
     planned = [row for row in rows if row.action in {"run", "resume"}]
+    for doubt in doubts(loaded, run, (row.stage for row in planned)):
+        console.print(doubt, style="yellow", soft_wrap=True, markup=False)
     _require_time(plan, slurm, training_times(run, planned))
     if dry_run:
         say_estimate(loaded, console, run, planned)

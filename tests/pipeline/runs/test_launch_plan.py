@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,16 @@ def test_the_paper_waits_in_three_queues() -> None:
     assert "hardware.accelerator=cpu" in first.settings and "hardware.accelerator=cpu" not in third.settings
     words = plan.command(second, "unused.yaml", ["motionloom"])
     assert words[:7] == ["motionloom", "run", "humantomato-paper", "-o", "/runs/x", "--until", "evaluate"]
+
+
+def test_a_training_that_goes_on_is_named_to_its_own_group() -> None:
+    plan = replace(plan_of("humantomato-paper"), go_on=("gpt",))
+    told = [plan.command(group, "r.yaml", ["motionloom"]) for group in plan.groups]
+    assert [words[words.index("--go-on") + 1] if "--go-on" in words else "" for words in told] == [
+        "",
+        "gpt",
+        "",
+    ]
 
 
 def test_without_gpus_all_is_for_cpus() -> None:
