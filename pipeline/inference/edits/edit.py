@@ -16,7 +16,6 @@ from motionloom.datasets.motion.layout import PIECES, piece_columns, piece_joint
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.observed import known_columns
 from motionloom.models.metrics.dance import foot_skating
-from motionloom.models.metrics.editing import accelerations, seam_acceleration, seams_of
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Motion, MotionGenerator
 from motionloom.pipeline.inference.edits.frames import EditFrames, RootPath
@@ -25,6 +24,8 @@ WORDS_EASE = 0.3
 """Seconds in which one stretch of words takes over from another [ours]."""
 _REACH_SECONDS = 0.5
 """In which a figure goes to a pin and comes back [ours]."""
+_SEAM_FRAMES = 2
+"""Frames on either side of a seam that belong to it."""
 
 
 def why_no_edits(generator: MotionGenerator) -> str | None:
@@ -152,16 +153,35 @@ def _report(frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[np
         * float(np.linalg.norm(joints[frame, joint] - np.asarray(wanted)))
         for (frame, joint), wanted in frames.pins.items()
     }
-    body = np.isin(np.arange(len(PIECES)), pieces)
+    kept_body = frames.pieces[:, np.isin(np.arange(len(PIECES)), pieces)]
+    # Frames after which it changes what is kept.
+    seams = np.flatnonzero((kept_body[1:] != kept_body[:-1]).any(axis=1))
     return EditReport(
         kept_cm=100 * float(away[kept].max()) if kept.any() else float("nan"),
         path_cm=100 * float(off_path.max()) if on_path.any() else float("nan"),
         pins_cm=pins,
-        seams=seam_acceleration(joints, fps, seams_of(frames.pieces[:, body])),
+        seams=seam_acceleration(joints, fps, seams),
         inside=float(accelerations(frames.joints, fps).mean()),
         skating=foot_skating(joints, fps),
         clip_skating=foot_skating(frames.joints, fps),
     )
+
+
+def accelerations(joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
+    """Mean size of the joints' accelerations in every inner frame [T - 2], m/s², of joints [T, N, 3]."""
+    second = np.diff(np.asarray(joints, dtype=np.float64), n=2, axis=0) * fps**2
+    return np.asarray(np.linalg.norm(second, axis=-1).mean(axis=-1))
+
+
+def seam_acceleration(joints: NDArray[np.floating], fps: float, seams: NDArray[np.int64]) -> float:
+    """Mean acceleration of joints [T, N, 3] in the frames around seams; NaN where there are none [ours].
+
+    A jump between two frames is an acceleration of twice its size in each of them.
+    """
+    size = accelerations(joints, fps)
+    inner = np.arange(1, len(joints) - 1)
+    near = (np.abs(inner[:, None] - seams - 0.5) < _SEAM_FRAMES).any(axis=1)
+    return float(size[near].mean()) if near.any() else float("nan")
 
 
 def _local(joints: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[np.float64]:

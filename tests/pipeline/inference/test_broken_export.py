@@ -88,7 +88,7 @@ def test_the_text_encoder_is_never_outside(name: str, model: Path) -> None:
     (model.parent / "secret").mkdir()
     (model / "a/b").mkdir(parents=True)
     change(model / "text/text.json", lambda facts: facts.update(encoder=name))
-    with pytest.raises(UserError, match="neither 'minilm' nor a folder beside this file"):
+    with pytest.raises(UserError, match=r"text\.json.*minilm"):
         Bundle.open(model).generate(["a person waves"], seconds=1.0)
 
 
@@ -194,7 +194,7 @@ def test_files_that_were_changed_are_refused(name: str, shipped: Path) -> None:
     data = bytearray((shipped / name).read_bytes())
     data[-2] ^= 1
     (shipped / name).write_bytes(data)
-    with pytest.raises(UserError, match=f"{name}: is not the file that was exported"):
+    with pytest.raises(UserError, match=f"{name}: is not"):
         Bundle.open(shipped)
 
 

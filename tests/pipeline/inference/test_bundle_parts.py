@@ -56,7 +56,7 @@ def test_unfinished_ones_are_not(tmp_path: Path) -> None:
     recipe = load_recipe("bvh-body")
     pretend(recipe, tmp_path, ())
     assert finished_stages(tmp_path) == {} and generators_of(tmp_path) == []
-    with pytest.raises(UserError, match="no finished stage here generates body motion; run the recipe to"):
+    with pytest.raises(UserError, match="generates body motion"):
         Bundle.from_run(tmp_path)
 
 
@@ -65,7 +65,7 @@ def test_an_input_that_has_not_finished_is_named(tmp_path: Path) -> None:
     (tmp_path / "stages/gpt/model.json").write_text(
         json.dumps({"kind": "gpt", "config": {}, "layout": {"name": "body263", "fps": 20, "family": "exact"}})
     )
-    with pytest.raises(UserError, match=": no finished 'tokenizer' stage here; run the recipe to"):
+    with pytest.raises(UserError, match="'tokenizer' stage"):
         Bundle.from_run(tmp_path)
 
 
@@ -95,5 +95,5 @@ def test_a_generator_of_another_version_is_refused(tmp_path: Path) -> None:
     pretend(load_recipe("bvh-body"), tmp_path)
     path = tmp_path / "stages/gpt/artifact.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "version": 99}))
-    with pytest.raises(UserError, match=r"made by version 99 of stage kind gpt, .* run the recipe again"):
+    with pytest.raises(UserError, match="version 99 of"):
         generators_of(tmp_path)

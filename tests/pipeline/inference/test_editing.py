@@ -226,9 +226,9 @@ def test_what_cannot_be_done_is_refused_in_one_sentence(
 
 
 def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="2 frames are no motion"):
+    with pytest.raises(UserError, match="2 frames"):
         require_clip(RecordedClip("short.bvh", walk(frames=2), 20.0))
-    with pytest.raises(UserError, match=r"walk: the figure measures .* is the length unit right"):
+    with pytest.raises(UserError, match="walk: the figure measures"):
         require_clip(RecordedClip("walk", walk(frames=9) * 100, 20.0))
     dog = tmp_path / "dog.bvh"
     dog.write_text(

@@ -100,7 +100,7 @@ def test_a_length_for_each_caption() -> None:
         assert len(motion.joints) == 20
         if row == 1:
             np.testing.assert_allclose(motion.features, made[1].features, atol=1e-5)
-    with pytest.raises(UserError, match="3 captions but 2 lengths"):
+    with pytest.raises(UserError, match="2 lengths"):
         model.generate(CAPTIONS, seconds=[1.0, 1.0])
 
 
@@ -148,7 +148,7 @@ def test_the_face_has_its_own_guidance(kind: str) -> None:
 def test_guidance_of_a_face_that_never_trained_without_text_is_refused(kind: str) -> None:
     config: Any = GPT if kind == "gpt" else DENOISER
     model = bundle(faces=(kind,), face=config.model_copy(update={"condition_dropout": 0.0}))
-    with pytest.raises(UserError, match=r"trained with condition_dropout > 0; .*face_cfg_scale"):
+    with pytest.raises(UserError, match=r"condition_dropout > 0.*face_cfg_scale"):
         model.generate(CAPTIONS, seconds=1.0, sampling=SamplingConfig(cfg_scale=2.0))
     fine = SamplingConfig(cfg_scale=2.0, face_cfg_scale=1.0, denoising_steps=2)
     assert len(model.generate(CAPTIONS, seconds=1.0, sampling=fine)) == 3
@@ -158,7 +158,7 @@ def test_guidance_of_a_face_that_never_trained_without_text_is_refused(kind: str
 def test_more_steps_than_were_trained_are_refused(sampler: Any) -> None:
     model = bundle(faces=("diffusion",))
     asked = SamplingConfig(sampler=sampler, denoising_steps=2000)
-    with pytest.raises(UserError, match="2000 denoising steps are more than the 1000"):
+    with pytest.raises(UserError, match="2000 denoising steps"):
         model.generate(CAPTIONS[:1], seconds=0.2, sampling=asked)
     once = SamplingConfig(sampler=sampler, denoising_steps=1)
     face = model.generate(CAPTIONS[:1], seconds=0.2, sampling=once)[0].face
@@ -204,7 +204,7 @@ def test_a_face_is_chosen_by_its_method_or_its_stage() -> None:
     model = bundle(faces=("gpt", "diffusion"))
     assert model.choose_face(None) == model.choose_face("gpt") == model.choose_face("stage1")
     assert model.choose_face("diffusion") == model.choose_face("stage2") == model.stages[2]
-    with pytest.raises(UserError, match="no face generator 'vae' here; there is gpt, diffusion"):
+    with pytest.raises(UserError, match=r"'vae' here; .*gpt, diffusion"):
         model.choose_face("vae")
 
 
@@ -337,13 +337,13 @@ def test_a_model_without_such_a_tma_refuses(model: MotionModel, tmp_path: Path) 
     assert "candidates" not in model.bundle.of(faces).settings, "TMA reads no faces"
     sentence = replace(model.bundle.generator, gpt=replace(model.bundle.generator.gpt, prior="sentence"))  # type: ignore[type-var,attr-defined]
     assert "candidates" not in sentence.settings
-    with pytest.raises(UserError, match=r"a stream shows its motion as it is drawn"):
+    with pytest.raises(UserError, match="leave candidates out"):
         model.stream("a person walks", seconds=1.0, sampling={"candidates": 2})
     next(model.stream("a person walks", seconds=1.0))  # what the model recommends holds where it can
 
 
 def test_an_evaluation_does_not_let_its_judge_choose() -> None:
-    with pytest.raises(UserError, match="TMA would choose the motions that it then judges"):
+    with pytest.raises(UserError, match="leave candidates at 1"):
         EvaluateConfig.parse({"sampling": {"candidates": 4}}, "evaluate")
 
 

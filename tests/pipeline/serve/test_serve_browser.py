@@ -40,7 +40,7 @@ def test_type_and_watch(visit: Any, until: Any, quick: Any, size: str, tmp_path:
     page.get_by_role("button", name="Generate").click()
     until(page, DRAWN)
     until(page, "!document.getElementById('go').disabled")
-    assert quick.asked == ["a person waves <b>&"] and status(page).startswith("1.5 s of motion, made in")
+    assert quick.asked == ["a person waves <b>&"] and status(page).startswith("1.5 s of motion")
     assert page.evaluate("__viewer.frames") == 30
     assert page.locator("figcaption").text_content() == "a person waves <b>&"
     page.screenshot(path=str(tmp_path / f"{size}.png"), full_page=True)
