@@ -36,7 +36,7 @@ _REASONS = 12
 
 _RUN_OPTIONS: dict[str, tuple[object, object]] = {
     "plan": (
-        Annotated[bool, typer.Option("--plan", help="Only list what would be done, with disk and time.")],
+        Annotated[bool, typer.Option("--plan", help="Only list what would be done, and the disk it takes.")],
         False,
     ),
     "workers": (Workers, 2),
@@ -169,7 +169,7 @@ def convert_command(
     shown = not console.quiet
     if plan:
         conversion = prepare(config, kind=converter, maps=out, workers=workers, progress=shown).looked()
-        planned = conversion.estimated(workers)
+        planned = conversion.plan
         licensed = bool(conversion.converter.licence(planned))
         line = proposed(kind, config, out, planned, licensed=licensed) if planned.items else ""
         if as_json:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import operator
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,7 +13,7 @@ from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter
 from motionloom.datasets.convert.common.look import Look, look_at
-from motionloom.datasets.convert.common.plan import C, ConversionPlan, limited
+from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped
 from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions
@@ -23,9 +21,6 @@ from motionloom.datasets.shards.writer import dataset_writer
 
 SCAN_FILE = ".scan.json"
 """Inside the folder of the shards: what converters remember of their source; may be deleted at any time."""
-
-_TRIAL_CLIPS, _TRIAL_SECONDS = 8, 5.0
-"""Clips converted for the time estimate, and when to stop earlier."""
 
 _CLIPS_PER_SHARD = 256
 
@@ -73,26 +68,12 @@ class Conversion(Generic[C]):
         return look_at(clips, converter.joints, converter.subset, self.config, label=_label)
 
     def looked(self) -> Conversion[C]:
-        self.plan.look = self.look()
-        return self
-
-    def estimated(self, workers: int) -> ConversionPlan[C]:
-        """The plan with disk and time: bytes by the frame counts, time by converting a few clips."""
-        plan, convert = self.plan, self.converter.convert
+        """Itself, with a look at the source and the disk that shards will take in its plan."""
+        plan = self.plan
+        plan.look = self.look()
         width = self.config.motion_layout().dim * (2 if self.config.motion_type == "float16" else 4)
         plan.bytes_needed = sum(plan.frames.values()) * width + len(plan.items) * 4096
-        start, count = time.perf_counter(), 0
-        for _, clip in limited(plan.items, _label, _TRIAL_CLIPS):
-            with contextlib.suppress(Exception):  # the real run reports it; here only time counts
-                convert(clip)
-            count += 1
-            if time.perf_counter() - start > _TRIAL_SECONDS:
-                break
-        if count:
-            each = (time.perf_counter() - start) / count
-            shards = sum(-(-number // _CLIPS_PER_SHARD) for number in plan.counts().values())
-            plan.seconds_needed = each * len(plan.items) / max(1, min(workers, shards))
-        return plan
+        return self
 
 
 def run_conversion(

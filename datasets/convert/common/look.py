@@ -245,7 +245,10 @@ def look_at(
         _subset(name, [clip for clip in clips if clip.subset == name], unreadable[name])
         for name in dict.fromkeys(name for name, _ in chosen)
     ]
-    problems, warnings, suggestions = _judge(clips, config, mapped)
+    oddities = stats_of(clips).oddities()
+    problems = [oddity.text for oddity in oddities if oddity.is_error]
+    warnings = [oddity.text for oddity in oddities if not oddity.is_error]
+    suggestions = _suggest(clips, config, mapped) if problems else []
     # One reason for every clip is a wrong option or map; several reasons are damaged files.
     groups = grouped([drop for _, drop in failed])
     if failed and not clips and len(groups) == 1:
@@ -294,24 +297,3 @@ def _subset(name: str, clips: list[SeenClip], unreadable: int) -> SubsetLook:
         above_floor=round(stats.above_floor, 4) if clips else None,
         fps=tuple(sorted({clip.file_fps for clip in clips})),
     )
-
-
-def _judge(
-    clips: list[SeenClip], config: ConvertConfig, mapped: bool
-) -> tuple[list[str], list[str], list[Suggestion]]:
-    oddities = stats_of(clips).oddities()
-    problems = [oddity.text for oddity in oddities if oddity.is_error]
-    warnings = [oddity.text for oddity in oddities if not oddity.is_error]
-    by_subset: dict[str, list[SeenClip]] = defaultdict(list)
-    for clip in clips:
-        by_subset[clip.subset].append(clip)
-    # A subset may be wrong although the source as a whole is not: that is a warning, not a refusal.
-    known = {oddity.kind for oddity in oddities if oddity.is_error}
-    for name, members in sorted(by_subset.items()):
-        if len(by_subset) > 1:
-            warnings += [
-                f"{name}: {oddity.text}"
-                for oddity in stats_of(members).oddities()
-                if oddity.is_error and oddity.kind not in known
-            ]
-    return problems, warnings, _suggest(clips, config, mapped) if problems else []

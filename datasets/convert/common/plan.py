@@ -16,7 +16,6 @@ from rich.table import Table
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.base.progress import duration
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import Facts, parse_where, require_known
 from motionloom.datasets.convert.common.look import Look
@@ -76,9 +75,6 @@ class ConversionPlan(Generic[C]):
     """Clips to convert under each licence."""
     bytes_needed: int | None = None
     """Disk that the shards will take; None when unknown."""
-    seconds_needed: float | None = None
-    """Estimated time on the planned number of workers, start-up included, from a few clips converted for the
-    purpose."""
     captions: str = ""
     """Number of clips with captions, and those without, where the user brought captions."""
     stop: str = ""
@@ -188,8 +184,6 @@ class ConversionPlan(Generic[C]):
             table.add_row("licence", str(count), "", escape(licence))
         if self.bytes_needed is not None:
             table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
-        if self.seconds_needed is not None:
-            table.add_row("time", "", "", f"about {duration(self.seconds_needed)}")
         for note in self.notes:
             table.add_row("note", "", "", escape(printable(note)))
         if self.stop:
@@ -214,7 +208,6 @@ class ConversionPlan(Generic[C]):
             "notes": list(self.notes),
             "licences": dict(self.licences),
             "bytes_needed": self.bytes_needed,
-            "seconds_needed": self.seconds_needed,
             "look": None if self.look is None else self.look.dump(),
         }
 

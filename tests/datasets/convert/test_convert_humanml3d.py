@@ -142,17 +142,6 @@ def test_other_rate_and_uniform_bones(fixture: Path, tmp_path: Path) -> None:
 # --- dirt ---------------------------------------------------------------------------------------------------
 
 
-def test_a_clip_with_nan_is_left_out(copy: Path, tmp_path: Path) -> None:
-    vectors = published(copy, "900003")
-    vectors[7, 3] = np.nan
-    np.save(copy / "new_joint_vecs/900003.npy", vectors)
-    manifest = convert(copy, tmp_path / "out")
-    (reason,) = reasons(manifest.dropped).values()
-    assert "frame 7" in reason and "column 3" in reason
-    assert "900003" not in motions(tmp_path / "out")
-    assert check(tmp_path / "out") == []
-
-
 def test_one_folder_stands_in_for_the_other(copy: Path, tmp_path: Path) -> None:
     (copy / "new_joint_vecs/900004.npy").unlink()
     convert(copy, tmp_path / "out")

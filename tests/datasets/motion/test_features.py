@@ -176,18 +176,6 @@ def test_paper_representations_are_slices(golden: tuple[dict[str, NDArray], Moti
     np.testing.assert_allclose(decode(ours, small), arrays["recovered"], atol=1e-4)
 
 
-def test_the_quirks_are_there(shared: Path) -> None:
-    with np.load(shared / "golden" / "t1_humanml3d_A.npz", allow_pickle=False) as data:
-        joints, offsets = data["aistturn__joints"], data["tgt_offsets"]
-        still = data["h3d012314__joints"]
-    layout = MotionLayout.named("h3d263")
-    yaw = encode_h3d(joints, layout, offsets)[:, 0]
-    assert yaw[91] < 0 < yaw[92] and yaw[93] < 0, "where the heading passes 180 degrees the sign is wrong"
-    assert encode_h3d(still, layout, offsets)[0, 0] == pytest.approx(0.106, abs=1e-3)
-    exact = MotionLayout.named("body133")
-    assert np.all(encode(joints.astype(np.float64), exact)[85:100, 0] > 0), "the exact family has no flip"
-
-
 def test_batches_equal_single_clips_and_the_skeletons_own_bones_are_the_default() -> None:
     rng = np.random.default_rng(0)
     for name in ("h3d263", "tomato623"):

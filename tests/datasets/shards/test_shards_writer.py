@@ -151,18 +151,6 @@ def test_damaged_or_differently_made_shards_are_not_kept(made: ModuleType, tmp_p
     assert digests(tmp_path / "a") == digests(tmp_path / "b"), "shards of the longer plan must go"
 
 
-def test_a_finished_set_is_not_replaced_by_one_with_other_options(made: ModuleType, tmp_path: Path) -> None:
-    made.write(tmp_path, options={"size": 60, "source_sha256": "a", "more": [1]})
-    want = digests(tmp_path)
-    with pytest.raises(UserError, match=r"more \[1\] -> null"):
-        made.write(tmp_path, count=4, options={"size": 4, "source_sha256": "a"})
-    assert digests(tmp_path) == want
-    made.write(tmp_path, options={"size": 60, "source_sha256": "a", "more": (1,)})
-    assert digests(tmp_path) == want
-    made.write(tmp_path, options={"size": 60, "source_sha256": "b", "more": [1]})  # another item somewhere
-    assert digests(tmp_path)["made-train-000000.tar"] == want["made-train-000000.tar"]
-
-
 def test_bad_samples_are_dropped_with_the_reason(made: ModuleType, tmp_path: Path) -> None:
     def convert(i: int) -> object:
         sample = made.clip(i)
