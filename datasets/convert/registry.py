@@ -73,8 +73,8 @@ def prepare(
     """Look at the whole source and decide what becomes of every file; nothing is converted yet.
 
     `kind` is the converter, by default the one whose config it is. With `out`, the folder of the shards, a
-    source whose listing must read every file (archives) is read once and not again by the next run or by the
-    other parts of a conversion. Joint maps that are guessed are written into `maps`, by default `out`.
+    source whose listing must read every file is read once and not again by the next run or by the other parts
+    of a conversion. Joint maps that are guessed are written into `maps`, by default `out`.
     """
     kind = kind or next((one for one in converters() if one.config_class is type(config)), None)
     if kind is None:

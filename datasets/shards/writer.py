@@ -164,9 +164,7 @@ class DatasetWriter(Generic[T]):
         state = f"{finished:,} of {len(self._tasks):,} shards ({clips:,} clips)"
         if self._todo:
             return f"{self.out}: goes on after {state} of an earlier run"
-        whole = self._how.part is None and (self.out / MANIFEST_FILE).exists()
-        word = "finished already" if whole else "all shards are there"
-        return f"{self.out}: {word}, {state}; nothing to convert"
+        return f"{self.out}: finished already, {state}; nothing to convert"
 
     def pending(self) -> list[T]:
         """Items that must be converted."""
