@@ -29,5 +29,5 @@ def test_gradients_of_normalisation_are_added_up_in_float32() -> None:
     net = Transformer(Sizes(), 2, norm="post")
     x, mask = torch.randn(64, 48, 32), torch.arange(48) < torch.randint(8, 49, (64, 1))
     true = gradients(copy.deepcopy(net).double(), x.double(), mask)
-    for name, found in gradients(net, x, mask).items():
+    for name, found in gradients(net, x.bfloat16(), mask).items():  # as a linear layer before gives it
         assert (found - true[name]).norm() < 0.05 * true[name].norm(), name
