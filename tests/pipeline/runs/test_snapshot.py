@@ -77,10 +77,14 @@ def test_the_last_checkpoint_is_the_finished_model(
         assert folder == small_run.folder, "all is finished"
 
 
-def test_a_generator_of_several_trainings(ude_run: Any, tmp_path: Path) -> None:
+def test_a_generator_of_several_trainings(ude_run: Any, tmp_path: Path, call: Any) -> None:
     """It trains nothing itself, and is made of what is there."""
-    with run_at(cut(ude_run.folder, tmp_path / "run", "dmd"), "newest") as folder:
+    run = cut(ude_run.folder, tmp_path / "run", "dmd")
+    with run_at(run, "newest") as folder:
         assert_same(drawn(folder), drawn(ude_run.folder))
+    done = call("evaluate", run, "--at", "newest", "--clips", 2)
+    assert done.code == 0, done.err
+    assert (run / "at/run-dmd-8/evaluate/metrics.json").is_file()
 
 
 def test_every_command(begun: Path, small_run: Any, tmp_path: Path, call: Callable[..., Any]) -> None:
