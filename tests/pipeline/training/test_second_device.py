@@ -54,6 +54,19 @@ MAY_WAIT = {"ActorCriticModule"}
 """Its rewards are beats of dances, which numpy finds."""
 
 
+OTHERS = """
+name: others
+seed: 7
+stages:
+  data: {kind: synth}
+  stats: {kind: stats}
+  text: {kind: text}
+  tm2t: {kind: tm2t, net: {width: 16, code_dim: 8, num_codes: 12}, critic: {start: 1, width: 8}}
+  inbetween: {kind: inbetween, max_frames: 80, net: {dim: 32, ff: 32, layers: 1, heads: 2}}
+"""
+"""Kinds that those recipes lack; that of beats needs an instrument's sounds."""
+
+
 class Anywhere(CPUAccelerator):
     """Sets up any device."""
 
@@ -114,16 +127,18 @@ def few_steps(recipe: str) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("recipe", ["baselines-tiny", "baselines-tiny-ude"])
+@pytest.mark.parametrize("recipe", ["baselines-tiny", "baselines-tiny-ude", "others.yaml"])
 def test_every_stage_runs_on_a_second_device(
     recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     watch = Watch()
+    monkeypatch.chdir(tmp_path)
+    Path("others.yaml").write_text(OTHERS)
     monkeypatch.setattr(trainer, "launch", on_second)
     monkeypatch.setattr(Hardware, "device", lambda self: SECOND)
     monkeypatch.setattr(Execution, "take_step", lambda self, parts: watch.take_step(self, parts))
     with second_device(watch):
-        run_recipe(recipe, tmp_path, overrides=few_steps(recipe), console=Console(quiet=True))
+        run_recipe(recipe, tmp_path / "run", overrides=few_steps(recipe), console=Console(quiet=True))
     assert watch.found == {}
 
 
