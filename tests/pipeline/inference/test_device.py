@@ -2,40 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from second_device import second_device
 
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.text.build import build_text_cache
-from motionloom.datasets.text.cache import TextCache
-from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import CPU, StageCache
-from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.launch.hardware import Hardware, choose_device
-from motionloom.pipeline.stages.networks.tokens import encode_split
-from motionloom.pipeline.store.networks import embed_motions
 
 CAPTIONS = ["a person waves with the left hand", "a person walks"]
 
 
-@pytest.fixture(scope="module")
-def second() -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[2] / "helpers"))
-        yield importlib.import_module("second_device")
-
-
-def test_the_second_device_is_strict(second: ModuleType) -> None:
-    with second.second_device() as device:
+def test_the_second_device_is_strict() -> None:
+    with second_device() as device:
         far = torch.ones(3).to(device)
         assert far.device == (far + far).device == device and (far + 1).cpu().tolist() == [2, 2, 2]
         with pytest.raises(RuntimeError, match="expected all tensors on second_device:0"):
@@ -48,12 +31,12 @@ def test_the_second_device_is_strict(second: ModuleType) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("face", ["gpt", "vae", "diffusion ddpm", "diffusion ddim", "diffusion dpm++"])
-def test_motions_are_made_where_the_networks_lie(face: str, second: ModuleType, small_run: Any) -> None:
+def test_motions_are_made_where_the_networks_lie(face: str, small_run: Any) -> None:
     kind, _, sampler = face.partition(" ")
     asked = {"face_model": kind, "cfg_scale": 1.5, "denoising_steps": 3, "sampler": sampler or "ddpm"}
     sampling = SamplingConfig.parse(asked, "sampling")
     near = Bundle.open(small_run.folder)
-    with second.second_device() as device:
+    with second_device() as device:
         far = Bundle.open(small_run.folder, device)
         given = far.stage_cache.given(far.main.inputs)
         assert far.device == given["tma"].device == device
@@ -64,33 +47,6 @@ def test_motions_are_made_where_the_networks_lie(face: str, second: ModuleType, 
     ):
         np.testing.assert_allclose(ours.features, theirs.features, atol=1e-4)
         np.testing.assert_allclose(ours.face, theirs.face, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_tokens_captions_and_clips_are_encoded_where_the_networks_lie(
-    second: ModuleType, small_run: Any, tmp_path: Path
-) -> None:
-    stages = finished_stages(small_run.folder)
-    dataset = StageCache().get(stages["data"]).split("test")
-    truths = [truth_of(dataset, i) for i in range(len(dataset))]
-
-    def everything(device: torch.device, name: str) -> list[Any]:
-        stage_cache = StageCache(device)
-        tokenizer, tma = stage_cache.get(stages["tokenizer"]), stage_cache.get(stages["tma"])
-        captions = [truth.caption for truth in truths]
-        cache = build_text_cache(tmp_path / name, captions, "minilm", progress=False, device=str(device))
-        assert isinstance(cache, TextCache)
-        codes = encode_split(tokenizer.net, dataset, tokenizer.stats, 256).codes
-        rebuilt = tokenizer.reconstruct(truths[0].features)
-        motions = embed_motions(tma, [truth.features for truth in truths])
-        values = [*codes.values(), motions, tma.embed_captions(captions, cache)]
-        assert all(value.device == CPU for value in values)
-        return [*(value.numpy() for value in values), rebuilt, cache.sentence(captions)]
-
-    with second.second_device() as device:
-        far = everything(device, "far")
-    for ours, theirs in zip(far, everything(CPU, "near"), strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
 def test_a_choice_of_device(monkeypatch: pytest.MonkeyPatch) -> None:
