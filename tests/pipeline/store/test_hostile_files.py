@@ -36,7 +36,7 @@ from motionloom.datasets.shards.sample import captions_from_json
 from motionloom.datasets.text.cache import CacheInfo, TextCache
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.contract.lookup import open_exported
-from motionloom.pipeline.evaluation.cases import read_cases
+from motionloom.pipeline.evaluation.cases import shown_cases
 from motionloom.pipeline.evaluation.reconstruction import read_basis
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.tokens import TokenStore
@@ -123,7 +123,7 @@ SAFETENSORS: dict[str, Callable[[Path], object]] = {
     "stats.safetensors": FeatureStats.load,
     "audio.safetensors": FrameStats.load,
     "tokens-train.safetensors": lambda path: TokenStore.load(path, {"body": 1}),
-    "cases.safetensors": lambda path: read_cases(path.parent, [{}]),
+    "cases.safetensors": lambda path: shown_cases(path.parent, {"cases": [{}]}),
 }
 DISGUISES = {
     "a pickle": lambda: pickle.dumps(Payload()),
