@@ -55,7 +55,7 @@ STEPPED = {"humantomato": ("tokenizer", "tma", "gpt", "mdm"), "ude": ("utt", "dm
 TRAINED = ("tokenizer", "tma", "gpt")
 FRAMES = 196
 SHORT = {"repeats": 2, "clips": 32, "size": 32, "decodings": 1, "truth_clips": 8, "movement_steps": 5}
-"""What makes evaluations short."""
+"""Settings that make evaluations short."""
 FIRST = {"compiled": 60.0}
 """Seconds that the first row of a table may take, where that is long."""
 Cells = dict[str, str]
@@ -103,7 +103,7 @@ class Step(NamedTuple):
 
 
 class Benchmark:
-    """What is measured, at one size on one device."""
+    """Measurements at one size on one device."""
 
     def __init__(self, args: Namespace) -> None:
         accelerator: Any = "cpu" if args.device == "cpu" else "gpu"

@@ -103,7 +103,7 @@ class ConditionedClips:
         for column, member in enumerate(self.members.values()):
             self.present[:, column] = dataset.has(member)
         self._captions: dict[int, list[CaptionSpan]] = {}
-        """Those of the clips that were drawn so far, by clip."""
+        """Captions of the clips that were drawn so far, by clip."""
 
     @property
     def names(self) -> list[str]:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from motionloom.datasets.motion.features.torch_joints import running_sum
+from motionloom.datasets.motion.features.running_sum import running_sum
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 from motionloom.datasets.schema import UserError
 

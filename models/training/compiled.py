@@ -22,7 +22,7 @@ class Compiled:
     """A function of losses, compiled as one graph when it is called; the network is what it trains."""
 
     _structure = ""
-    """Of the network whose graphs are kept."""
+    """Structure of the network whose graphs are kept."""
 
     def __init__(
         self, losses: Callable[..., dict[str, Tensor]], net: nn.Module, *, graphs: bool = False

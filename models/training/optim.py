@@ -41,7 +41,7 @@ class OptimConfig(Config):
         return dropped * self._scheduled(step, max_steps)
 
     def doubts(self, max_steps: int) -> list[str]:
-        """What will hardly do what is meant in a training of `max_steps`: keys of this config, and why."""
+        """Return keys that will hardly do what is meant in a training of `max_steps`, and why."""
         if self.warmup_steps <= max_steps:
             return []
         reached = self.lr * max_steps / self.warmup_steps

@@ -57,7 +57,7 @@ class ModelCard:
     batch: int
     """Items of a step."""
     local_batch: int
-    """Those that a process takes at once."""
+    """Items of the batch that a process takes at once."""
     memory_bytes: int
     note: str
     """Its tokens, in words."""

@@ -171,7 +171,7 @@ class MotionModel(
         # The warning is of the loop that takes the chunks.
         return MotionStream(
             self.bundle, segments, seed=seed, sampling=drawn, config=config,
-            notice=lambda note: warnings.warn(str(note), stacklevel=6),
+            notice=lambda note: warnings.warn(str(note), stacklevel=5),
         )  # fmt: skip
 
     def edit(

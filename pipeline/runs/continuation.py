@@ -62,7 +62,7 @@ class Continuation:
     """How a training goes on with other settings."""
 
     step: int
-    """Of its newest checkpoint."""
+    """Step of its newest checkpoint."""
     reason: str
     changed: tuple[Change, ...]
     knowingly: bool

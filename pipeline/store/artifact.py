@@ -88,7 +88,7 @@ class Artifact(Config):
     changed: tuple[Change, ...] = Field((), exclude_if=lambda changed: not changed)
     """Settings of a training that were others until a step; `config` holds the last ones."""
     step: int | None = Field(None, exclude_if=lambda step: step is None)
-    """Of weights that were taken from a training before its end: their step."""
+    """Step of weights that were taken from a training before its end."""
     inputs: dict[str, InputStage]
     outputs: dict[str, OutputFile] = Field(default_factory=dict)
 

@@ -122,7 +122,7 @@ class TrainedStageConfig(StageConfig):
         return next((one for one in schedules if not one.endswith(" constant")), None)
 
     def doubts(self) -> list[str]:
-        """What will hardly do what is meant, a sentence each."""
+        """Return a sentence on each setting that will hardly do what is meant."""
         found = optimizers_of(self)
         return [f"{key}.{doubt}" for key, optim in found for doubt in optim.doubts(self.train.steps)]
 

@@ -50,7 +50,7 @@ class Signals:
         self.answered = False
         """Whether the training ends because of it."""
         self.ends_compiling: Callable[[int], BaseException | None] = lambda number: None
-        """What a signal raises while torch compiles; None if something would be lost."""
+        """Return the error that a signal raises while torch compiles; None if something would be lost."""
         self._before: dict[signal.Signals, Handler] = {}
 
     def __enter__(self) -> Signals:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from motionloom.datasets.motion.body.smpl import BodyModel
+from motionloom.datasets.motion.features.running_sum import running_sum
 from motionloom.datasets.motion.kinematics import levels
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
@@ -53,18 +54,6 @@ def present_joints(present: Tensor, layout: MotionLayout) -> Tensor:
         return present.new_ones(len(present), layout.num_joints)
     positions = present[:, layout.without_face().slice("positions")][:, ::3]
     return torch.cat([positions.new_ones(len(present), 1), positions], dim=1)
-
-
-def running_sum(x: Tensor, dim: int) -> Tensor:
-    """Sums along `dim` up to each element; unlike `cumsum`, the same every time on a GPU."""
-    if x.device.type == "cpu":
-        return x.cumsum(dim)
-    size, reach = x.shape[dim], 1
-    while reach < size:  # each sum reaches twice as far back
-        farther = x.narrow(dim, reach, size - reach) + x.narrow(dim, 0, size - reach)
-        x = torch.cat([x.narrow(dim, 0, reach), farther], dim)
-        reach *= 2
-    return x
 
 
 def _turned(x: Tensor, z: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:

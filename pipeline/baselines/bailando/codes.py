@@ -18,7 +18,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.motion.features.torch_joints import running_sum
+from motionloom.datasets.motion.features.running_sum import running_sum
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Config
 from motionloom.models.layers.conv import Conv, ConvTranspose, ResidualBlock, start_weights

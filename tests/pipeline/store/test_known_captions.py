@@ -71,6 +71,17 @@ def test_false_alarms_on_validation_captions_are_as_many_as_stated() -> None:
     assert not KnownCaptions((), NONE).is_far(held_out[0]), "a model without faces calls no face unknown"
 
 
+def test_a_known_caption_is_known_where_validation_repeats_the_training() -> None:
+    """Faces have few captions: all of them are known, and what is kept of them is rounded."""
+    vectors = np.random.default_rng(0).normal(size=(8, 384)).astype(np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    known = representatives(
+        [str(k) for k in range(8)], vectors, vectors.astype(np.float16).astype(np.float32)
+    )
+    assert not any(known.is_far(embedding) for embedding in vectors)
+    assert known.is_far(-vectors[0])
+
+
 def test_other_words_are_known_and_other_things_are_not() -> None:
     encoder = load_text_encoder("minilm")
     known = representatives(TRAINED, encoder.encode(TRAINED).sentence, encoder.encode(HELD_OUT).sentence)
@@ -159,7 +170,7 @@ def test_a_stream_says_so_when_the_captions_turn_comes(small_run: Any, call: Any
     )
     with pytest.warns(UserWarning, match="violin.*The nearest it knows") as warned:
         list(stream)
-    assert len(warned) == 1
+    assert len(warned) == 1 and warned[0].filename == __file__
     stream = model.stream(known, seed=1)
     next(stream)
     stream.say("stock prices fell sharply", seconds=0.4)
