@@ -45,6 +45,10 @@ class TrainingData:
             self._held_out = loader(every_batch(self.validation), self.hardware)
         return self._held_out
 
+    def close(self) -> None:
+        """End the workers of the validation: they answer no signal, and the process would wait for them."""
+        self._held_out = None
+
 
 def every_batch(validation: EvalSource) -> Steps[Batch]:
     """All validation batches, in every process."""

@@ -7,7 +7,7 @@ made, a dry run with previews of it, and loading with the facts that were writte
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from os.path import relpath
 from pathlib import Path
@@ -80,12 +80,16 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     config: type[C]
     inputs: type[I] = cast(type[I], Inputs)
     """Declares what the stage takes."""
-    trainer: str
+    trainer: str = ""
     """The `StageModule` that trains the network, as "package.module:Class"; it is imported where a training
     begins, since Lightning takes seconds."""
     trainer_keys: tuple[str, ...] = ()
     """Settings of the config that the trainer takes as they are."""
     trains = True
+
+    def modules(self, config: C) -> Iterable[str]:
+        """Modules of its classes, and its trainer's, which nothing here imports."""
+        return [*super().modules(config), self.trainer.partition(":")[0]]
 
     def roles(self) -> tuple[Role | Every, ...]:
         return self.inputs.roles() or super().roles()

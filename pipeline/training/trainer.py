@@ -174,6 +174,7 @@ class Training:
                 raise
             finally:
                 self.progress.close()
+                self.data.close()
                 self.profiler.do("stop")
         summary = self.telemetry.summary()
         if summary:

@@ -133,7 +133,7 @@ def test_a_changed_loss_is_a_reason(site: Path, command: list[object], run: Path
     losses.write_text(text)
     assert {name: row["reason"] for name, row in rows.items()} == {
         **dict.fromkeys(("data", "stats", "text"), "finished"),
-        **dict.fromkeys(("tma", "sway"), "code of sway.stages changed"),
+        **dict.fromkeys(("tma", "sway"), "code of sway.losses changed"),
         "generate": "input sway changed",
         "evaluate": "input tma changed",
         "report": rows["report"]["reason"],

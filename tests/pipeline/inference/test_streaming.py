@@ -81,8 +81,16 @@ def test_frames_are_those_of_all_tokens_at_once(model: MotionModel, monkeypatch:
     """Beyond the network's block and across captions: its own tokens, decoded in one piece."""
     tokenizer = model.bundle.generator.tokenizer  # type: ignore[attr-defined]
     stream, drawn = model.stream(two(("a person walks", 14.0), ("a person sits", 3.0)), seed=2), []
-    draw = stream._body._flow.draw
-    stream._body._flow.draw = lambda left: drawn.append(draw(left)) or drawn[-1]  # type: ignore[method-assign]
+    flow = stream._body._flow
+    draw = type(flow).draw
+
+    def recorded(one: Any, left: int | None) -> Any:
+        group = draw(one, left)
+        if one is flow:  # and not the face's
+            drawn.append(group)
+        return group
+
+    monkeypatch.setattr(type(flow), "draw", recorded)
     made = whole(list(stream))
     import torch
 

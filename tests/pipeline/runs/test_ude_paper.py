@@ -95,7 +95,7 @@ def test_it_runs_to_the_end_and_fills_the_tables(
         table = fill(f"ude/{number}", paper_table(f"ude/{number}"), [Path("run")])
         (row,) = [row for row in table.rows if row.source == "ours"]
         assert row.method == "Ours" and all(row.cells), "every column has a figure"
-        said = {one.what: one.ours for one in table.differences}
+        said = {what: ours for found in table.differences.values() for what, ours, _ in found}
         assert said["repeats"] == "3 of tokens, 2 of motion for each" and "dpm++" in said["sampling"]
     file = FigureFile.read(Path("run/stages/evaluate/metrics.json"))
     assert {file.of("tma.top-1", row) is not None for row in (MODEL, NEAREST_WORDS)} == {True}
