@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from bench import Column, arguments, command_line, report
-from model_card import digests, test_clips, truth_from
+from model_card import test_clips, truth_from
 from numpy.typing import NDArray
 from results import page, read_records
 from rich.console import Console
@@ -233,14 +233,12 @@ def training_of(config: SynthConfig, count: int) -> list[Joints]:
 def write_card(model: Path, title: str, description: str, config: SynthConfig) -> None:
     """The card of the shipped model: tables of the records, size and sums of these weights."""
     records = read_records()
-    for name, pulls in {"edit": ("pull 1",), "edit_real": ("pull 0", "pull 1", "pull 5")}.items():
-        # The first table shows what the strength of the pull does; the second repeats the ends alone.
-        records[name]["rows"] = [row for row in records[name]["rows"] if not row["title"].endswith(pulls)]
+    for name in ("edit", "edit_real"):
+        rows = [row for row in records[name]["rows"] if "pull" not in row["title"]]
+        records[name]["rows"] = rows
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
-    sums = "".join(f"    {value}  {name}\n" for name, value in digests(model).items())
     text = page(CARD.read_text(encoding="utf-8"), records)
     text = re.sub(r"[\d.]+ MB", f"{size:.1f} MB", text)
-    text = re.sub(r"( {4}[0-9a-f]{64} .*\n)+", sums, text)
     (model / "README.md").write_text(text, encoding="utf-8")
     actions = ", ".join(name for name in config.action_names if name != "then")
     facts = {"name": title, "description": f"{description}; it knows {actions}", "recipe": RECIPE}

@@ -21,7 +21,6 @@ package:
 from __future__ import annotations
 
 import argparse
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -108,12 +107,6 @@ def rows_of(shares: Mapping[str, Shares]) -> list[list[str]]:
     names = [name for name in names if name not in last] + last
     cells = [shares[title][kind] for title, kind in columns_of(shares)]
     return [[name, *(f"{100 * cell[name]:.1f}" if name in cell else "" for cell in cells)] for name in names]
-
-
-def digests(folder: Path) -> dict[str, str]:
-    """sha256 of every file of weights."""
-    found = sorted(folder.glob("*/*.safetensors"))
-    return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in found}
 
 
 def synthetic_data(recipe: Recipe) -> list[SynthConfig]:
@@ -375,7 +368,6 @@ def card_of(
         f"motionloom export runs/{recipe.name} -o {figures['name']} --half{options}\n"
         f"python benchmarks/model_card.py {figures['name']} --recipe {recipe_file}{settings} --write",
         recipe_seed=recipe.seed,
-        digests="\n".join(f"- `{path}` `{digest}`" for path, digest in digests(model).items()),
     )
 
 
