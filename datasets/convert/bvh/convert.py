@@ -54,7 +54,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     def _content(self, clip: BvhClip) -> str:
         """Digest of a clip's file and of how its joints are read."""
         used = self.maps.get(clip.found.skeleton)
-        made_from = [clip.found.sha256, [used.sources, used.unit, used.up] if used else None]
+        made_from = [clip.found.sha256, used.read_as() if used else None]
         cut = self.config.cut(clip.label())
         return sha256_of_json(made_from if cut == slice(None) else [*made_from, cut.start, cut.stop])
 
@@ -100,9 +100,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         unit = joint_map.unit or ("cm" if config.unit == "auto" else config.unit)
         up = "y" if config.up == "auto" else config.up
         joints = joint_map.apply(motion, unit=unit, up=up)
-        if config.unit == "auto" and not any(
-            one.unit and one.where == joint_map.where for one in self.own_maps
-        ):
+        if joint_map.measured:
             height = measure(joints, motion.fps).height
             own = named_unit(height / metres(unit))
             if own is not None and not PERSON_METRES[0] <= height <= PERSON_METRES[1]:

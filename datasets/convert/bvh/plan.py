@@ -1,8 +1,8 @@
 """BVH conversion, planning: options, the joint map of each skeleton, and what becomes of every file.
 
 Clips have one skeleton when names and parents of their joints are the same; bone lengths may differ. A
-skeleton is guessed once, from the first clip of the plan that has it, so that the number of workers and the
-order of their work change nothing.
+skeleton is guessed once, from the first clip of the first plan that has it, so that neither the number of
+workers nor files that come later change anything.
 """
 
 from __future__ import annotations
@@ -99,12 +99,15 @@ def choose_maps(
         if key in maps:
             continue
         guess = guess_joint_map(motions[0], target)
-        written = _written(guess, key, folder)
-        if guess.certain:
-            maps[key] = guess.joint_map(f"the guess from {guess.source}")
-            plan.notes.append(f"joint map guessed from {guess.source}; {guess.summary()}")
-        else:
-            doubts[key] = f"the joint map of {guess.source} is not certain: {guess.doubts()}; {written}"
+        kept = _kept(guess, key, joints[key], folder)
+        if kept is None:
+            cure = _cure(key, target, folder)
+            doubts[key] = f"the joint map of {guess.source} is not certain: {guess.doubts()}; {cure}"
+            continue
+        maps[key] = kept
+        same = kept.sources == tuple(row.sources for row in guess.rows)
+        how = f"guessed from {guess.source}; {guess.summary()}" if same else f"read from {kept.where}"
+        plan.notes.append(f"joint map {how}")
     # A map that fits no file is a mistake, unless it lies in a folder with the maps of other sources.
     used = {one.where for one in maps.values()}
     for one in own_maps:
@@ -133,7 +136,8 @@ def _settle(
         up=joint_map.up or (None if config.up == "auto" else config.up),
     )
     unit, up, height = settled(stated, motions)
-    name, measured = motions[0].name, replace(stated, unit=unit, up=up)
+    measured = replace(stated, unit=unit, up=up, measured=stated.unit is None)
+    name = motions[0].name
     if stated.unit is None:
         named = f"{metres(unit):.4g} m ({unit if isinstance(unit, str) else 'no known unit fits'})"
         tall = f"the figures are then {height:.2f} m tall"
@@ -157,18 +161,35 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
     return found
 
 
-def _written(guess: JointGuess, key: str, folder: Path | None) -> str:
-    """Write the map of a guess; return what the user can do with it."""
+def _kept(guess: JointGuess, key: str, joints: Sequence[str], folder: Path | None) -> JointMap | None:
+    """Return a skeleton's map that lies in `folder`, as an earlier run guessed it or a hand completed it,
+    so that files that come later change nothing for the others. Where there is none, the guess is written
+    there, and returned if it is certain.
+    """
+    where = _place(key, guess.target)
+    if folder is not None:
+        path = folder / where
+        if not path.exists():
+            write_text(path, guess.text(key))
+        with suppress(UnfinishedMapError):
+            kept = replace(JointMap.load(path, target=guess.target.name), where=where)
+            if guess.certain or kept.sources != tuple(row.sources for row in guess.rows):
+                kept.require_fit(joints, guess.source)
+                return kept
+    return guess.joint_map(where) if guess.certain else None
+
+
+def _place(key: str, target: Skeleton) -> str:
+    """Name of a guessed map in the folder of the shards."""
+    return f"{MAPS_FOLDER}/{target.name}-{key}.json"
+
+
+def _cure(key: str, target: Skeleton, folder: Path | None) -> str:
+    """Return what the user can do about a map that is not certain."""
     if folder is None:
         return "planned with `maps=FOLDER` it writes a map to complete"
-    path = folder / MAPS_FOLDER / f"skeleton-{key}.json"
-    if not path.exists():
-        write_text(path, guess.text(key))
-    elif path.read_text(encoding="utf-8") != guess.text(key) and guess.certain:
-        raise UserError(
-            f"{path}: not the joint map that is guessed; delete it, or use it: --set joint_map={path.parent}"
-        )
-    return f"complete {path} and pass the folder with --set joint_map={path.parent}"
+    path = folder / _place(key, target)
+    return f"complete {path} and give the command again, elsewhere with --set joint_map={path.parent}"
 
 
 class BvhConfig(CaptionConfig):

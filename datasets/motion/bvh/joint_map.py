@@ -82,6 +82,12 @@ class JointMap:
     """Unit of its files, where it is stated."""
     ends: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     """End Sites that the files do not have, by their joints."""
+    measured: bool = False
+    """Whether the unit was measured on the figures, and not stated."""
+
+    def read_as(self) -> list[object]:
+        """Return all that positions depend on, as plain JSON: nothing of where the map came from."""
+        return [self.sources, self.unit, self.up, *([dict(self.ends)] if self.ends else [])]
 
     @staticmethod
     def load(path: Path, *, target: str = "smpl22") -> JointMap:

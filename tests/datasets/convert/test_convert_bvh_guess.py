@@ -113,9 +113,8 @@ def test_what_is_not_certain_is_refused_with_a_map_to_complete(tmp_path: Path) -
     with pytest.raises(UserError, match="to be filled in"):
         convert(source, out, joint_map=path)
     fill_in(path)
-    with pytest.raises(UserError, match="is not certain"):
-        convert(source, out)
-    assert not convert(source, out, joint_map=path).dropped, "what a hand has filled in stays"
+    assert not convert(source, tmp_path / "other", joint_map=path).dropped
+    assert not convert(source, out).dropped, "what a hand has filled in counts"
 
 
 def fill_in(path: Path) -> None:
@@ -147,6 +146,24 @@ def test_maps_are_for_their_own_skeletons(tmp_path: Path) -> None:
     (source / "a.bvh").unlink()
     with pytest.raises(UserError, match="no file"):
         convert(source, tmp_path / "out-3", joint_map=path)
+
+
+@pytest.mark.parametrize("tool", ["LAFAN1", "Mixamo", "Bandai-Namco"])
+def test_files_that_sort_first_and_captions_change_no_map(tool: str, tmp_path: Path) -> None:
+    """The two first commands of the documents, and a folder that grows at its beginning."""
+    source, out = tmp_path / "mocap", tmp_path / "out"
+    for take in range(2):
+        write_figure(source / f"{5 + take}.bvh", build(BY_TOOL[tool]), frames=66, seed=take)
+    plan_of = prepare(BvhConfig(source=source), maps=out).plan
+    (path,) = (out / "joint_maps").iterdir()
+    before = path.read_bytes()
+    captions = tmp_path / "c.csv"
+    captions.write_text("file,caption\n6.bvh,a person walks\n")
+    first = convert(source, out, captions=captions, uncaptioned="keep")
+    assert len(plan_of.items) == sum(shard.samples for shard in first.shards) == 2
+    write_figure(source / "0.bvh", build(BY_TOOL[tool], a_pose=True), frames=66, seed=9)
+    more = convert(source, out, captions=captions, uncaptioned="keep")
+    assert sum(shard.samples for shard in more.shards) == 3 and path.read_bytes() == before
 
 
 def test_a_source_that_is_mostly_rejected_fails(tmp_path: Path) -> None:
