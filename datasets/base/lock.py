@@ -26,10 +26,14 @@ _CANNOT_LOCK = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 
 
 @contextmanager
-def file_lock(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Hold the lock file `path`, made when absent; false when another holds it and we do not `wait`."""
+def file_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
+    """Hold the lock file `path`, made when absent, alone or together with others that hold it `shared`.
+
+    Gives false when another holds it and we do not `wait`.
+    """
+    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
-        handle = _locked(path, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        handle = _locked(path, kind | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
         yield False
         return

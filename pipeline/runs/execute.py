@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
 from rich.markup import escape
 
 from motionloom.datasets.base.files import remove_temporaries, write_text
-from motionloom.datasets.base.lock import file_lock
+from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache, StageContext, StageKind
@@ -24,6 +24,9 @@ from motionloom.pipeline.runs.verify_shards import verify_shards
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import remove_tree, write_json
 from motionloom.pipeline.store.run_folder import identity_of, place_from, require_own, stage_folder
+
+LOCKS = ".locks"
+"""In the run folder: a lock file for each stage."""
 
 
 def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
@@ -40,23 +43,14 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     leads = process_rank() == 0
     if not leads:
         todo = joint  # all other stages run in the lead alone
-    with _lock(run) if leads else nullcontext():
+    with _locks(run, recipe, todo) if leads else nullcontext():
         # All processes start before anything is written, so that they make the same plan.
         team = Team.start(recipe.hardware) if joint else Team()
         if leads:
-            remove_temporaries(run)
-            write_text(run / "recipe.yaml", recipe.to_yaml(run))
-            request = next((row.request for row in todo if row.request is not None), None)
-            if request is None:
-                (run / REQUEST_FILE).unlink(missing_ok=True)
-            else:
-                write_json(run / REQUEST_FILE, request.dump())
             said = doubts(recipe, run, (row.stage for row in todo))
             for doubt in said:
                 console.print(f"[yellow]{escape(doubt)}[/]", soft_wrap=True)
-            for row in plan:
-                if row.action == "skip":
-                    row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))
+            _begin(recipe, run, plan)
         for row in todo:
             stage, folder = row.stage, stage_folder(run, row.stage.name)
             begin = time.perf_counter()
@@ -177,14 +171,38 @@ def _input(
     return InputStage(stage=folder.name, fingerprint=now, folder=place_from(run, folder))
 
 
+def _begin(recipe: Recipe, run: Path, plan: Sequence[PlannedStage]) -> None:
+    """Write what belongs to the whole run."""
+    with file_lock(run / LOCK_FILE):  # other jobs of the run write here too
+        remove_temporaries(run)
+        write_text(run / "recipe.yaml", recipe.to_yaml(run))
+        request = next((row.request for row in plan if row.request is not None), None)
+        if request is None:
+            (run / REQUEST_FILE).unlink(missing_ok=True)
+        else:
+            write_json(run / REQUEST_FILE, request.dump())
+        for row in plan:
+            if row.action == "skip":
+                row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))
+
+
 @contextmanager
-def _lock(run: Path) -> Iterator[None]:
-    """One writer per run folder. The lock ends with its process, even a killed one."""
+def _locks(run: Path, recipe: Recipe, todo: Sequence[PlannedStage]) -> Iterator[None]:
+    """Hold each stage that is to be made, and with other readers those that they are made from.
+
+    Jobs that share no stage thus work in one run folder at once. Locks end with their process, even a killed
+    one.
+    """
     run.mkdir(parents=True, exist_ok=True)
     require_own(run)
-    with file_lock(run / ".lock", wait=False) as mine:
-        if not mine:
-            raise UserError(
-                f"{run}: another motionloom process is working on this run; wait for it or stop it"
-            )
+    (run / LOCKS).mkdir(exist_ok=True)
+    made = {row.stage.name for row in todo}
+    read = {above.name for row in todo for above in recipe.above(row.stage)} - made
+    with ExitStack() as stack:
+        for name in sorted(made | read):
+            if not stack.enter_context(file_lock(run / LOCKS / name, wait=False, shared=name in read)):
+                raise UserError(
+                    f"{run}: another motionloom process is working on this run's stage '{name}'; wait for "
+                    f"it or stop it"
+                )
         yield

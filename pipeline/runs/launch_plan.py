@@ -1,9 +1,10 @@
-"""A recipe cut into groups of stages for a cluster, one after the other, each with its own machines.
+"""A recipe cut into groups of stages for a cluster: one job per branch of its graph, with its own machines.
 
 SLURM schedules (`slurm.py`); this only describes. A group is one command, `motionloom run RECIPE -o OUT
---until LAST`, whose selection covers exactly the stages of the group: the groups before have made what they
-need. The run graph decides what is done: a group that is started twice, after a kill or by mistake, skips
-what is finished and resumes what is not.
+--until LAST`, whose selection covers exactly the stages of the group and what the groups before have made.
+Groups that do not wait for each other run at the same time in one run folder (`execute.py`). The run graph
+decides what is done: a group that is started twice, after a kill or by mistake, skips what is finished and
+resumes what is not.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -20,9 +21,7 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.runs.plan import require_fit
 from motionloom.pipeline.runs.recipe import Recipe
-
-Need = Literal["cpu", "gpu", "all"]
-"""One process without a GPU; one process with one; as many processes on all nodes as there are GPUs."""
+from motionloom.pipeline.training.config import TrainedStageConfig
 
 
 def _one_line(text: str) -> str:
@@ -61,6 +60,10 @@ class SlurmOptions(Config):
     """Seconds before its time limit at which a job is queued again."""
     requeues: int = Field(100, ge=0)
     """Times that one job may be queued again at its time limit; 0 lets it end there."""
+    clips_per_gpu: int = Field(32, ge=1)
+    """Clips of a batch that a GPU takes at least: a training gets as many as its batch has for. By the step
+    on an H100 (docs/results.md, "One GPU"): with 30 clips those of TMA and GPT end as soon as their 2,000
+    kernels are launched at 10 us each, so that more GPUs are no faster."""
     extra: dict[str, Line] = Field(default_factory=dict)
     """More options of sbatch: `extra.constraint=h100`, `extra.qos=high`."""
 
@@ -112,13 +115,15 @@ class Machines:
 
 @dataclass(frozen=True)
 class Group:
-    """Stages that run as one job, after the group before."""
+    """Stages that run as one job."""
 
     name: str
     """A word of lower-case letters, digits and dashes; the first character is a digit."""
     stages: tuple[str, ...]
     last: tuple[str, ...]
     """Stages that no other stage of the group reads."""
+    after: tuple[str, ...]
+    """Names of the groups, all before this one, that must have succeeded."""
     machines: Machines
     settings: tuple[str, ...]
     """Settings of `hardware`, as `--set` takes them."""
@@ -166,7 +171,8 @@ class LaunchPlan:
             at = group.machines
             each = f"{at.processes} processes, {at.gpus} GPUs, {at.cpus} cores"
             stages = ", ".join(group.stages)
-            out.append(f"{group.name}: {stages}; {at.nodes} x ({each}), at most {at.minutes} min")
+            after = f", after {', '.join(group.after)}" if group.after else ""
+            out.append(f"{group.name}: {stages}; {at.nodes} x ({each}), at most {at.minutes} min{after}")
         return out
 
 
@@ -187,19 +193,27 @@ def make_launch_plan(
             f"--nodes {nodes} --gpus-per-node {gpus_per_node}: take 1 node or more and no negative count"
         )
     groups: list[Group] = []
-    for need, stages in _cut(recipe, gpus_per_node):
-        names = tuple(stage.name for stage in stages)
+    jobs = _jobs(recipe, options, nodes, gpus_per_node)
+    names: dict[str, str] = {}  # stage -> its group
+    waits: dict[str, set[str]] = {}  # group -> all groups before it
+    for number, job in enumerate(jobs, 1):
+        stages = tuple(stage.name for stage in job.stages)
+        trained = [stage.name for stage in job.stages if stage.kind.trains]
+        name = f"{number}-{_word((trained or stages)[0], 20)}"
         # `--until` takes all that its stages need, so the last ones name the whole group.
-        read = {name for stage in stages for name in stage.inputs.values()}
-        label = "train" if any(stage.kind.trains for stage in stages) else _word(names[0], 12)
-        machines = _machines(options, need, nodes, gpus_per_node)
+        read = {source for stage in job.stages for source in stage.inputs.values()}
+        direct = {names[source] for source in read if source in names}
+        implied = {group for one in direct for group in waits[one]}
+        waits[name] = direct | implied
+        names |= dict.fromkeys(stages, name)
         groups.append(
             Group(
-                name=f"{len(groups) + 1}-{label}",
-                stages=names,
-                last=tuple(name for name in names if name not in read),
-                machines=machines,
-                settings=_settings(options, need, machines),
+                name=name,
+                stages=stages,
+                last=tuple(stage for stage in stages if stage not in read),
+                after=tuple(group for group in waits if group in direct - implied),
+                machines=_machines(options, job, gpus_per_node),
+                settings=_settings(options, job, gpus_per_node),
             )
         )
     for group in groups:
@@ -212,58 +226,105 @@ def make_launch_plan(
     return LaunchPlan(name, recipe, shipped, tuple(overrides), str(out), tuple(groups), tuple(go_on))
 
 
-def _machines(options: SlurmOptions, need: Need, nodes: int, gpus: int) -> Machines:
-    if need != "all":
+def _machines(options: SlurmOptions, job: _Job, gpus: int) -> Machines:
+    if job.light:
         light = options.light_cpus, options.light_memory_gb, options.light_minutes
-        return Machines(1, 1, int(need == "gpu"), *light)
-    each = max(gpus, 1)
+        return Machines(1, 1, int(job.gpu), *light)
+    nodes, each = job.shape(gpus)
     cpus, memory = options.cpus_per_gpu * each, options.memory_gb_per_gpu * each
-    return Machines(nodes, each, gpus, cpus, memory, options.time_minutes)
+    return Machines(nodes, each, each if gpus else 0, cpus, memory, options.time_minutes)
 
 
-def _settings(options: SlurmOptions, need: Need, machines: Machines) -> tuple[str, ...]:
-    fields = [f"nodes={machines.nodes}", f"devices={machines.processes}"]
-    if need != "all":
+def _settings(options: SlurmOptions, job: _Job, gpus: int) -> tuple[str, ...]:
+    nodes, each = job.shape(gpus)
+    fields = [f"nodes={nodes}", f"devices={each}"]
+    if job.light:
         fields.append(f"convert_workers={options.light_cpus}")
     # A node whose driver is broken must not do a GPU's work on its CPU.
-    fields.append(f"accelerator={'gpu' if machines.gpus else 'cpu'}")
+    fields.append(f"accelerator={'gpu' if job.gpu else 'cpu'}")
     return tuple(f"hardware.{field}" for field in fields)
 
 
-def _cut(recipe: Recipe, gpus: int) -> list[tuple[Need, list[Stage]]]:
-    """Runs of stages that need the same, in an order that can run.
+@dataclass
+class _Job:
+    """A group that grows."""
 
-    A stage is put forward into an earlier group where all that it reads is there: every group waits in the
-    queue once.
+    light: bool
+    """One process, of stages that neither train nor divide their work."""
+    gpu: bool
+    processes: int
+    stages: list[Stage]
+    before: set[int]
+    """Places, among the jobs, of all that it waits for."""
+
+    def shape(self, gpus: int) -> tuple[int, int]:
+        """Nodes, and processes on each."""
+        each = min(self.processes, max(gpus, 1))
+        return self.processes // each, each
+
+
+def _jobs(recipe: Recipe, options: SlurmOptions, nodes: int, gpus: int) -> list[_Job]:
+    """The stages as jobs, each behind those that it waits for.
+
+    A stage goes on in a job that would not wait for more because of it and whose trainings are all above it,
+    so that no training waits for one that it does not need. Light stages wait together: every job waits in
+    the queue once.
     """
-    needs = _needs(recipe, gpus)
-    waiting = list(recipe.stages)
-    done: set[str] = set()
-    out: list[tuple[Need, list[Stage]]] = []
-    while waiting:
-        ready = [stage for stage in waiting if done.issuperset(stage.inputs.values())]
-        # A stage that needs the same machines goes on in the same job, whatever its place in the recipe.
-        same = [stage for stage in ready if out and needs[stage.name] == out[-1][0]]
-        if not same:
-            out.append((needs[ready[0].name], []))
-            same = [ready[0]]
-        out[-1][1].append(same[0])
-        done.add(same[0].name)
-        waiting.remove(same[0])
-    return out
-
-
-def _needs(recipe: Recipe, gpus: int) -> dict[str, Need]:
-    """By stage: what trains, or divides its work, takes all; what reads a trained network takes one GPU."""
-    needs: dict[str, Need] = {}
+    jobs: list[_Job] = []
+    place: dict[str, int] = {}  # stage -> its job
+    above: dict[str, set[str]] = {}
     for stage in recipe.stages:
-        if stage.kind.trains or stage.kind.shares:
-            needs[stage.name] = "all"
-        elif gpus and any(needs[name] != "cpu" for name in stage.inputs.values()):
-            needs[stage.name] = "gpu"
+        own = [name for name in stage.inputs.values() if name in place]
+        above[stage.name] = {*own, *(name for source in own for name in above[source])}
+        direct = {place[name] for name in own}
+        before = direct.union(*(jobs[at].before for at in direct))
+        trains, shares = stage.kind.trains, stage.kind.shares
+        new = _Job(
+            light=not (trains or shares),
+            gpu=gpus > 0
+            and (trains or shares or any(recipe.stage(name).kind.trains for name in above[stage.name])),
+            processes=_processes(stage, options, nodes, gpus),
+            stages=[],
+            before=before,
+        )
+        for at, job in enumerate(jobs):
+            trained = {one.name for one in job.stages if one.kind.trains}
+            alike = (job.light, job.gpu, job.processes) == (new.light, new.gpu, new.processes)
+            if trained:
+                fits = (
+                    (alike or shares)
+                    and not new.light
+                    and trained <= above[stage.name]
+                    and before <= {at, *job.before}
+                )
+            else:
+                fits = alike and not trains and not any(at in jobs[other].before for other in before)
+            if fits:
+                break
         else:
-            needs[stage.name] = "cpu"
-    return needs
+            at, job = len(jobs), new
+            jobs.append(job)
+        job.stages.append(stage)
+        place[stage.name] = at
+        job.before |= before - {at}
+        for other in jobs:
+            if at in other.before:
+                other.before |= job.before
+    # Each waits for more than those that it waits for.
+    return sorted(jobs, key=lambda job: len(job.before))
+
+
+def _processes(stage: Stage, options: SlurmOptions, nodes: int, gpus: int) -> int:
+    """How many a stage can use: whole nodes, or a part of one, among which its batch divides."""
+    each = max(gpus, 1)
+    if not stage.kind.trains:
+        return nodes * each if stage.kind.shares else 1
+    if not isinstance(stage.config, TrainedStageConfig) or stage.config.train.strategy == "fsdp":
+        return nodes * each
+    train = stage.config.train
+    most = min(nodes * each, train.batch_size // options.clips_per_gpu)
+    counts = [count for count in range(2, most + 1) if count <= each or count % each == 0]
+    return max([1, *(count for count in counts if train.batch_size % (count * train.accumulate) == 0)])
 
 
 def _word(text: str, longest: int) -> str:

@@ -1,6 +1,6 @@
-"""`motionloom launch`: a recipe on SLURM, one batch script a group, each waiting for the one before.
+"""`motionloom launch`: a recipe on SLURM, one batch script a group, each waiting for those it reads from.
 
-- `--dependency=afterok` with `--kill-on-invalid-dep`: a group starts when the one before has succeeded, and
+- `--dependency=afterok` with `--kill-on-invalid-dep`: a group starts when those before have succeeded, and
   is cancelled when that can no longer happen. A job that is queued again keeps its id, so what waits for it
   goes on waiting.
 - Preemption and broken nodes queue a job again (`--requeue`). A time limit would not: the batch script is
@@ -108,9 +108,10 @@ class Script:
     path: Path
     text: str
 
-    def submit(self, after: str | None) -> list[str]:
-        """The command that submits it to start after the job `after`."""
-        waiting = [f"--dependency=afterok:{after}"] if after else []
+    def submit(self, ids: Mapping[str, str]) -> list[str]:
+        """The command that submits it behind the groups it waits for, whose jobs are `ids`."""
+        after = [ids[name] for name in self.group.after]
+        waiting = [f"--dependency=afterok:{':'.join(after)}"] if after else []
         return ["sbatch", "--parsable", *waiting, str(self.path)]
 
 
@@ -186,11 +187,10 @@ def _show_scripts(plan: LaunchPlan, options: SlurmOptions, console: Console) -> 
     if plan.shipped is None:
         line = f"would write {folder / RECIPE_FILE}: the resolved recipe"
         console.print(line, soft_wrap=True, markup=False)
-    before: str | None = None
+    ids = {group.name: f"ID-OF-{group.name}" for group in plan.groups}
     for script in slurm_scripts(plan, options, folder, Path.cwd()):
         console.print(f"\n{script.path}:\n{script.text}", soft_wrap=True, markup=False)
-        console.print(" ".join(script.submit(before)), soft_wrap=True, markup=False)
-        before = f"ID-OF-{script.group.name}"
+        console.print(" ".join(script.submit(ids)), soft_wrap=True, markup=False)
 
 
 def slurm_scripts(plan: LaunchPlan, options: SlurmOptions, folder: Path, cwd: Path) -> list[Script]:
@@ -214,22 +214,23 @@ def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> lis
     scripts = slurm_scripts(plan, options, folder, Path.cwd())
     for script in scripts:
         write_text(script.path, script.text)
-    ids: list[str] = []
+    ids: dict[str, str] = {}
     for script in scripts:
-        submitted = subprocess.run(script.submit(ids[-1] if ids else None), capture_output=True, text=True)
+        submitted = subprocess.run(script.submit(ids), capture_output=True, text=True)
         if submitted.returncode != 0:
             if ids:
-                subprocess.run(["scancel", *ids], capture_output=True)
+                subprocess.run(["scancel", *ids.values()], capture_output=True)
             raise UserError(f"sbatch refused {script.path}: {submitted.stderr.strip()}")
-        ids.append(submitted.stdout.strip().partition(";")[0])
-        after = f", after job {ids[-2]}" if len(ids) > 1 else ""
-        console.print(f"{script.group.name}: job {ids[-1]}{after}")
+        ids[script.group.name] = submitted.stdout.strip().partition(";")[0]
+        before = ", ".join(ids[name] for name in script.group.after)
+        console.print(f"{script.group.name}: job {ids[script.group.name]}{before and f', after {before}'}")
+    jobs = list(ids.values())
     console.print(
-        f"watch: squeue --jobs {','.join(ids)}; stop: scancel {' '.join(ids)}; logs: {folder}",
+        f"watch: squeue --jobs {','.join(jobs)}; stop: scancel {' '.join(jobs)}; logs: {folder}",
         soft_wrap=True,
         markup=False,
     )
-    return ids
+    return jobs
 
 
 def _text(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path) -> str:

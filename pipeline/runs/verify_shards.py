@@ -85,5 +85,5 @@ def compare_shards(
         for place, shard in enumerate(shards):
             each: list[State] = list({str(seen[place]): seen[place] for seen, _ in seen_by}.values())
             compared[str(shard.path)] = ComparedFile(sha256=shard.info.sha256, states=each)
-        known.write(record, compared)
+        Compared.add(record, compared)
     return size

@@ -18,6 +18,7 @@ from pathlib import Path
 from pydantic import Field, JsonValue, field_validator
 
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.shards.checksums import state_of
 from motionloom.pipeline.store.files import write_json
@@ -207,8 +208,11 @@ class Compared(Config):
         known = self.files.get(name)
         return known is not None and known.sha256 == sha256 and state in known.states
 
-    def write(self, path: Path, compared: Mapping[str, ComparedFile]) -> None:
-        write_json(path, Compared(files=self.files | dict(compared)).dump())
+    @staticmethod
+    def add(path: Path, compared: Mapping[str, ComparedFile]) -> None:
+        """Note in `path` what has been compared, beside what other jobs of the run note."""
+        with file_lock(path.with_name(LOCK_FILE)):
+            write_json(path, Compared(files=Compared.read(path).files | dict(compared)).dump())
 
 
 def require_unchanged(folder: Path, *, again: bool = False) -> int:
@@ -240,5 +244,5 @@ def require_unchanged(folder: Path, *, again: bool = False) -> int:
         compared[key] = ComparedFile(sha256=info.sha256, states=[state])
     if compared and not exported:
         with suppress(OSError):  # a run that may only be read
-            Compared.read(run / NOTE).write(run / NOTE, compared)
+            Compared.add(run / NOTE, compared)
     return len(compared)

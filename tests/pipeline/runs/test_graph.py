@@ -215,10 +215,30 @@ def test_a_list_of_what_does_not_fit_is_refused(override: str, says: str, tmp_pa
 
 
 def test_two_processes_do_not_share_a_run(tmp_path: Path) -> None:
-    (tmp_path / "run").mkdir()
-    with file_lock(tmp_path / "run/.lock"), pytest.raises(UserError, match="another motionloom process"):
+    (tmp_path / "run/.locks").mkdir(parents=True)
+    held = file_lock(tmp_path / "run/.locks" / ALL[-1])
+    with held, pytest.raises(UserError, match=f"working on this run's stage '{ALL[-1]}'"):
         go(tmp_path)
     assert go(tmp_path) == ALL
+
+
+def test_jobs_of_two_branches_work_in_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While one is made, `both` is; what `one` reads stays as it is. All is as one process makes it."""
+    go(tmp_path, select=Selection(until="left,right"))
+
+    def beside(context: StageContext) -> None:
+        run_add(context)
+        if context.name == "one":
+            assert go(tmp_path, select=Selection(until="both")) == ["both"]
+            with pytest.raises(UserError, match="stage 'right'"):
+                go(tmp_path, select=Selection(first="right", until="both"))
+
+    register_toys(monkeypatch, kind("sum", *TAKES, work=beside))
+    assert go(tmp_path, select=Selection(until="one")) == ["one"] and go(tmp_path) == ["top"]
+    made = {path: path.read_bytes() for path in sorted((tmp_path / "run/stages").rglob("[!t]*.json"))}
+    (tmp_path / "run").rename(tmp_path / "old")
+    register_toys(monkeypatch, kind("sum", *TAKES))
+    assert go(tmp_path) == ALL and made == {path: path.read_bytes() for path in made}
 
 
 def test_a_seed_of_the_data_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

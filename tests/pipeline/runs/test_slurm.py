@@ -53,8 +53,8 @@ def asked(script: slurm.Script) -> dict[str, str]:
 
 
 def test_scripts_ask_for_a_task_a_gpu(tmp_path: Path) -> None:
-    words = ("partition=gpu", "light_partition=cpu", "extra.comment=a b")
-    first, train, last = scripts(tmp_path, "humantomato-paper", *words, nodes=2, gpus=8)
+    words = ("partition=gpu", "light_partition=cpu", "extra.comment=a b", "clips_per_gpu=16")
+    first, train, *_, last = scripts(tmp_path, "humantomato-paper", *words, nodes=2, gpus=8)
     found = asked(train)
     for option in ("ntasks-per-node", "gpus-per-node", "cpus-per-task"):
         assert found[option] == "8"
@@ -68,7 +68,12 @@ def test_scripts_ask_for_a_task_a_gpu(tmp_path: Path) -> None:
     assert words[-1] == "&" and after(words, "--set")[0] == NASTY
     assert {"--nodes=2", "--ntasks-per-node=8", "--gpus-per-node=8"} <= set(words)
     assert not any(line.startswith("srun") for line in first.text.splitlines())
-    assert train.submit("17") == ["sbatch", "--parsable", "--dependency=afterok:17", str(train.path)]
+    assert train.submit({"1-data": "17"}) == [
+        "sbatch",
+        "--parsable",
+        "--dependency=afterok:17",
+        str(train.path),
+    ]
 
 
 def fake_sbatch(folder: Path, monkeypatch: pytest.MonkeyPatch, refuse: str = "") -> Path:
@@ -88,24 +93,26 @@ def fake_sbatch(folder: Path, monkeypatch: pytest.MonkeyPatch, refuse: str = "")
     return record
 
 
-def test_jobs_are_submitted_one_behind_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_are_submitted_behind_what_they_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     record = fake_sbatch(tmp_path / "bin", monkeypatch)
     out, to = tmp_path / "run", console()
     recipe = tmp_path / "own.yaml"
     recipe.write_text("extends: humantomato-tiny\nname: own\n")
     launch_recipe(recipe, gpus_per_node=1, out=out, console=to)
     calls = [line.split() for line in record.read_text().splitlines()]
-    assert [words[2] for words in calls[1:]] == ["--dependency=afterok:1", "--dependency=afterok:2"]
+    # Data; tokenizer, face, TMA; GPT; evaluation; motions and report.
+    behind = [words[2].removeprefix("--dependency=afterok:") for words in calls[1:]]
+    assert behind == ["1", "1", "1", "2:4", "3:5", "6"]
     written = sorted(Path(words[-1]) for words in calls)
     assert all(path.is_file() and path.parent.parent == out / ".slurm" for path in written)
     resolved = load_recipe(written[0].parent / "recipe.yaml")
     assert resolved.name == "own" and all("recipe.yaml -o" in path.read_text() for path in written)
-    assert "scancel 1 2 3" in said(to)
+    assert "scancel 1 2 3 4 5 6 7" in said(to)
 
 
 def test_a_refused_job_takes_those_before_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    record = fake_sbatch(tmp_path / "bin", monkeypatch, refuse="2-train.sbatch")
-    with pytest.raises(UserError, match=r"2-train.sbatch: no such partition"):
+    record = fake_sbatch(tmp_path / "bin", monkeypatch, refuse="2-tokenizer.sbatch")
+    with pytest.raises(UserError, match=r"2-tokenizer.sbatch: no such partition"):
         launch_recipe("humantomato-tiny", gpus_per_node=1, out=tmp_path / "run", console=console())
     assert record.read_text().splitlines()[-1] == "scancel 1"
 
@@ -121,7 +128,7 @@ def test_without_a_cluster_in_a_dry_run_or_in_anothers_folder_nothing_is_written
     # Data that are elsewhere, so that nothing is estimated.
     away = ("stages.data={kind: shards, path: elsewhere}",)
     launch_recipe("humantomato-tiny", gpus_per_node=1, overrides=away, dry_run=True, console=to)
-    assert "2-train" in said(to) and "until evaluate" in " ".join(said(to).replace("- ", "").split())
+    assert "2-tokenizer" in said(to) and "until evaluate" in " ".join(said(to).replace("- ", "").split())
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "recipe.yaml").write_text("name: other\n")
     with pytest.raises(UserError, match="recipe 'other'"):
