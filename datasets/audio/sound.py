@@ -43,12 +43,11 @@ _BLOCK = 2**18
 _UNKNOWN = 2**63 - 1
 """libsndfile's length of a pipe."""
 
-_UNSTATED = 0xFFFFFFFF
-"""Length of the samples of a WAV that does not say it."""
+_UNSTATED = (0xFFFFFFFF, 0x7FFFFFFF)
+"""Lengths of the samples of a WAV that was written into a pipe; some writers take headers off, or round."""
+_ROUNDED = 4096
 
 _OTHER = "wav, flac, ogg and mp3 are read; convert others, as by: ffmpeg -i song.m4a song.wav"
-
-_WAV_SUFFIXES = (".wav", ".wave")
 
 _PART = re.compile(r"(?P<file>.+)@(?P<start>[\d:.]*)(?P<dash>[-\u2013]?)(?P<end>[\d:.]*)", re.DOTALL)
 _TIME = re.compile(r"(?:(?:(\d+):)?(\d+):)?(\d+(?:\.\d*)?)")
@@ -297,11 +296,14 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
 
 @contextmanager
 def _pipe(path: Path) -> Iterator[int]:
-    """The reading end of a pipe through which a thread sends a file."""
+    """The reading end of a pipe through which a thread sends an MP3, without its tag: of a pipe libsndfile
+    skips 50 kB of it at most.
+    """
     out, into = os.pipe()
 
     def send() -> None:
         with suppress(BrokenPipeError), path.open("rb") as source, os.fdopen(into, "wb") as target:
+            source.seek(_tag_bytes(source))
             shutil.copyfileobj(source, target)
 
     thread = Thread(target=send)
@@ -314,8 +316,8 @@ def _pipe(path: Path) -> Iterator[int]:
 
 
 def _check_header(path: Path, name: str) -> None:
-    """`UserError` for files that libsndfile reads without complaint: a WAV or MP3 that is cut short, a `.wav`
-    that is none; and for missing and empty files.
+    """`UserError` for files that libsndfile reads without complaint: a WAV or MP3 that is cut short; and for
+    missing and empty files. The content decides, not the suffix.
     """
     if not path.is_file():
         raise UserError(f"{name}: no such file")
@@ -331,30 +333,35 @@ def _check_header(path: Path, name: str) -> None:
                 start = file.tell()
                 if kind == b"data":
                     # RF64 files, and those that were written into a pipe, state no length here.
-                    if length != _UNSTATED and length > size - start:
+                    stated = not any(most - _ROUNDED <= length <= most for most in _UNSTATED)
+                    if stated and length > size - start:
                         raise UserError(
                             f"{name}: cut short: {size - start} bytes of sound, {length} expected"
                         )
                     return
                 file.seek(start + length + length % 2)  # chunks lie at even places
             raise UserError(f"{name}: no data chunk, or cut short before it")
-        if path.suffix.lower() in _WAV_SUFFIXES:
-            raise UserError(f"{name}: not a WAV file (it does not begin with RIFF ... WAVE)")
-        if (missing := _missing_mp3_bytes(file, head, size)) > 0:
+        if head == b"version http":
+            raise UserError(f"{name}: a Git LFS pointer in place of the sound; fetch it: git lfs pull")
+        if (missing := _missing_mp3_bytes(file, size)) > 0:
             raise UserError(f"{name}: cut short: {missing} bytes of the MP3 are missing")
 
 
-def _missing_mp3_bytes(file: BinaryIO, head: bytes, size: int) -> int:
+def _tag_bytes(file: BinaryIO) -> int:
+    """Length of the ID3 tag, which may hold a picture, before the first frame of an MP3; 0 without one."""
+    file.seek(0)
+    head = file.read(10)
+    # The length is four bytes of seven bits; the fourth flag says that the header is repeated at the end.
+    length = sum((byte & 127) << 7 * (3 - i) for i, byte in enumerate(head[6:]))
+    return 0 if head[:3] != b"ID3" or len(head) < 10 else 10 + length + (10 if head[5] & 16 else 0)
+
+
+def _missing_mp3_bytes(file: BinaryIO, size: int) -> int:
     """Return the bytes that an MP3 lacks of the length stated in its first frame; 0 where none is stated.
 
     libsndfile fills what is missing with silence.
     """
-    # An ID3 tag precedes the first frame; its length is four bytes of seven bits.
-    start = (
-        10 + sum((byte & 127) << 7 * (3 - i) for i, byte in enumerate(head[6:10]))
-        if head[:3] == b"ID3"
-        else 0
-    )
+    start = _tag_bytes(file)
     file.seek(start)
     frame = file.read(256)
     at = max(frame.find(b"Xing"), frame.find(b"Info"))

@@ -50,6 +50,37 @@ def test_every_encoding_gives_the_same_sound(
     assert sound_seconds(path) == pytest.approx(1.0)
 
 
+def test_what_libsndfile_reads_is_read_whatever_its_suffix(tmp_path: Path, tone: np.ndarray) -> None:
+    stereo, suffixes = np.stack([tone, 0.5 * tone], axis=1), (".wav", ".mp3", ".flac", ".dat")
+    for form in soundfile.available_formats():
+        for number, subtype in enumerate(soundfile.available_subtypes(form)):
+            path = tmp_path / f"a{suffixes[number % 4]}"
+            try:
+                soundfile.write(path, stereo, RATE, format=form, subtype=subtype)
+                expected, rate = soundfile.read(path, dtype="float32", always_2d=True)
+            except (soundfile.SoundFileError, ValueError):  # a kind that libsndfile cannot write so
+                continue
+            samples, own_rate = read_sound(path)
+            assert (own_rate, len(samples)) == (rate, len(expected)), (form, subtype)
+            assert np.abs(samples - expected.mean(axis=1).clip(-1, 1)).max() < 1e-5, (form, subtype)
+
+
+def test_what_stands_around_the_samples_changes_none(tmp_path: Path, tone: np.ndarray) -> None:
+    song, tagged = tmp_path / "song.mp3", tmp_path / "cover.mp3"
+    soundfile.write(song, tone, RATE)
+    for picture in (0, 40_000, 90_000, 3_000_000):
+        length = bytes(picture >> 7 * (3 - i) & 127 for i in range(4))
+        tagged.write_bytes(b"ID3\x03\0\0" + length + bytes(picture) + song.read_bytes())
+        assert np.array_equal(read_sound(tagged)[0], read_sound(song)[0])
+    whole, piped = tmp_path / "whole.wav", tmp_path / "piped.wav"
+    soundfile.write(whole, tone, RATE)
+    raw = whole.read_bytes()
+    at = raw.index(b"data") + 4
+    for length in (0xFFFFFFFF, 0xFFFFFFFF - 36, 0x7FFFFFFF, 0x7FFFF000):
+        piped.write_bytes(raw[:at] + length.to_bytes(4, "little") + raw[at + 4 :])
+        assert np.array_equal(read_sound(piped)[0], read_sound(whole)[0])
+
+
 def test_stereo_is_averaged_overshoot_clipped_and_another_unit_refused(
     tmp_path: Path, tone: np.ndarray
 ) -> None:
@@ -69,7 +100,7 @@ def test_stereo_is_averaged_overshoot_clipped_and_another_unit_refused(
         ("zero_samples.wav", "0 samples"),
         ("truncated.wav", "1600 bytes of sound, 16000 expected"),
         ("sample_rate_zero.wav", "no sample rate"),
-        ("not_riff.wav", "not a WAV file"),
+        ("not_riff.wav", "of no known format"),
         ("float_nan.wav", "NaN or infinity at sample 2"),
     ],
 )
