@@ -18,19 +18,28 @@ SOURCE_CHECKSUM = "source_sha256"
 
 @dataclass(frozen=True)
 class Part:
-    """One machine's share of a conversion: every `count`-th shard from `index` (from 0) on."""
+    """One machine's share of a conversion: every `count`-th shard from that of its `number` (from 1) on."""
 
-    index: int
+    number: int
     count: int
 
     def __post_init__(self) -> None:
-        if not 0 <= self.index < self.count:
-            raise UserError(
-                f"part {self.index} of {self.count}: parts are numbered from 0 to {self.count - 1}"
-            )
+        if not 1 <= self.number <= self.count:
+            raise UserError(f"part {self}: parts are numbered from 1 to {self.count}")
+
+    @classmethod
+    def parse(cls, text: str) -> Part:
+        """The part of `3/8`."""
+        number, _, count = text.partition("/")
+        if not (number.isdecimal() and count.isdecimal() and int(count)):
+            raise UserError(f"part '{text}': write it as K/N, such as 3/8 for the third of eight parts")
+        return cls(int(number), int(count))
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
 
     def has(self, position: int) -> bool:
-        return position % self.count == self.index
+        return position % self.count == self.number - 1
 
 
 @dataclass(frozen=True)
@@ -52,6 +61,10 @@ class DatasetFacts:
     """Settings the audio features are made with."""
     dropped: Sequence[Dropped] = ()
     """Clips that the plan has left out already."""
+    lost: Sequence[Dropped] = ()
+    """Those of them that were meant to become samples."""
+    most_lost: float = 1.0
+    """Share of the clips that may be lost; where more are, the finished set is said to be unfit."""
     notes: Sequence[str] = ()
 
     def made_from(self) -> dict[str, object]:
@@ -81,9 +94,6 @@ class WriteOptions:
     progress: bool = True
     part: Part | None = None
     """Make this part only, and no manifest. Parts may run at once; a run without one excludes all others."""
-
-    def has(self, position: int) -> bool:
-        return self.part is None or self.part.has(position)
 
 
 class Reading(Config):

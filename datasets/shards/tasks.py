@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of_json, write_json
 from motionloom.datasets.base.os_errors import of_the_machine
@@ -211,15 +211,14 @@ def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -
         return failed
 
 
-def finished_shard(task: ShardTask[Any]) -> Result | None:
-    """Return an earlier run's result of `task` from the same inputs, or None when it must be made."""
-    path = index_path(task.path)
+def finished_shard(tar: Path, fingerprint: str, *, strict: bool = False) -> Result | None:
+    """Return an earlier run's result of a task from the same inputs, or None when it must be made."""
     try:
-        index = ShardIndex.load_json(path)
-        if index.fingerprint != task.fingerprint or (task.strict and any(index.dropped)):
+        index = ShardIndex.load_json(index_path(tar))
+        if index.fingerprint != fingerprint or (strict and any(index.dropped)):
             return None
         if index.shard is not None:
-            require_intact(LocalShard(task.path, index.shard))
+            require_intact(LocalShard(tar, index.shard))
     except UserError:  # none, or damaged: made again
         return None
     return index.shard, index.dropped

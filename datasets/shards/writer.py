@@ -3,8 +3,8 @@
 - The plan is fixed before anything is converted: items of a split are shuffled once by the seed and cut into
   shards. A dropped item is simply absent from its shard, so what one shard holds never depends on another.
 - One task per shard, run in this process or in a pool of spawned ones, each on one thread: the number of
-  workers cannot change a byte. Several machines may each write a `Part` of the shards; a run without a part
-  then finds them and adds what only one writer can: `index.npz` and `manifest.json`.
+  workers cannot change a byte. Several machines may each write a `Part` of the shards; `join_parts` then
+  finds them and adds what only one writer can: `index.npz` and `manifest.json`.
 - Killed at any moment and run again, the result is the same: tar, then its index, then (all shards done)
   `index.npz`, then `manifest.json`, each renamed into place from a temporary file. A shard is kept on the
   second run when its index carries the same fingerprint and its sha256 still fits.
@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -23,16 +22,23 @@ from functools import partial
 from pathlib import Path
 from typing import Generic, TypeVar
 
-from motionloom.datasets.base.files import remove_temporaries, sync_folder, write_json
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import MANIFEST_FILE, SPLITS, Decisions, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.schema import MANIFEST_FILE, Manifest, Split, UserError
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
-from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
-from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
-from motionloom.datasets.shards.options import SOURCE_CHECKSUM, DatasetFacts, WriteOptions
+from motionloom.datasets.shards.finish import (
+    OLD_FOLDER,
+    Planned,
+    differences,
+    finish,
+    leave_record,
+    remove_strays,
+    shards_in,
+)
+from motionloom.datasets.shards.index import ShardIndex, index_path
+from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.tar import MOST_CLIPS
 from motionloom.datasets.shards.tasks import (
     Convert,
@@ -44,10 +50,6 @@ from motionloom.datasets.shards.tasks import (
 )
 
 T = TypeVar("T")
-
-OLD_FOLDER = ".old"
-"""Inside the folder of the shards: shards of an earlier run whose clips are taken over; removed when the
-manifest stands."""
 
 _NAME = re.compile(r"[A-Za-z0-9_-]+")
 
@@ -102,25 +104,27 @@ class DatasetWriter(Generic[T]):
         self, out: Path, tasks: list[ShardTask[T]], facts: DatasetFacts, how: WriteOptions, pool: Workers
     ) -> None:
         self.out, self._pool = out, pool
-        self._facts, self._how = facts, how
-        self._tasks = [task for at, task in enumerate(tasks) if how.has(at)]
+        self._how, self._name = how, facts.name
+        self._planned = _planned(tasks, facts)
+        part = how.part
+        self._tasks = tasks if part is None else [task for at, task in enumerate(tasks) if part.has(at)]
         with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
-            self._results = list(threads.map(finished_shard, self._tasks))
+            self._results = list(threads.map(_finished, self._tasks))
         self._todo = [at for at, result in enumerate(self._results) if result is None]
         self._news = ""
         if self._todo:
             (out / MANIFEST_FILE).unlink(missing_ok=True)
-        if how.part is None:
-            if self._todo:
+            if part is None:
                 self._take_over(tasks)
-            _remove_strays(out, facts.name, keep={task.path for task in tasks})
+        if part is None:
+            remove_strays(out, self._planned)
 
     def _take_over(self, tasks: list[ShardTask[T]]) -> None:
         """Put the shards of an earlier run aside that are not as planned, and plan to keep their clips."""
         folder = self.out / OLD_FOLDER
         # Shards that do not fit the plan move aside first: their names now belong to other clips.
         finished = {task.path for task, result in zip(tasks, self._results, strict=True) if result}
-        for path in sorted(_shards_in(self.out, self._facts.name, ".tar")):
+        for path in sorted(shards_in(self.out, self._name, ".tar")):
             if path not in finished:
                 folder.mkdir(parents=True, exist_ok=True)
                 path.replace(folder / path.name)
@@ -129,7 +133,7 @@ class DatasetWriter(Generic[T]):
         wanted = {item.made_from for at in self._todo for item in tasks[at].items}
         kept: dict[str, Path] = {}
         sources: set[str] = set()
-        for path in sorted(_shards_in(folder, self._facts.name, ".tar")):
+        for path in sorted(shards_in(folder, self._name, ".tar")):
             with suppress(UserError):  # damaged, or without an index: made again
                 index = ShardIndex.load_json(index_path(path))
                 if index.shard is not None:
@@ -176,43 +180,11 @@ class DatasetWriter(Generic[T]):
 
         A part returns a manifest that covers the part alone.
         """
-        results = self._shards(convert)
-        shards = [shard for shard, _ in results if shard is not None]
-        failed = [drop for _, drops in results for drop in drops]
-        facts = self._facts
-        manifest = Manifest(
-            name=facts.name,
-            layout=facts.layout.name,
-            family=facts.layout.family,
-            fps=facts.layout.fps,
-            skeleton=facts.layout.skeleton_name,
-            licence=facts.licence,
-            converter=facts.converter,
-            converter_version=facts.converter_version,
-            options=facts.options,
-            shards=shards,
-            dropped=[*facts.dropped, *failed],
-            licences=facts.licences,
-            audio=facts.audio,
-            notes=list(facts.notes),
-            excluded=Decisions.of(self.out).left_out,
-        )
-        # The index is written before the manifest: whoever sees a manifest finds everything that it names.
-        if self._how.part is None:
-            write_left_out(self.out, manifest.dropped)
-            if not shards:
-                groups = grouped([*failed, *facts.dropped])
-                some = "; ".join(map(str, groups[:3])) or "there was none"
-                where = f"; all of them: {self.out / LEFT_OUT_FILE}" if len(manifest.dropped) > 1 else ""
-                raise UserError(f"{self.out}: no clip survived the conversion ({some}){where}")
-            made_on = _finish_index(self.out, shards)
-            if len(made_on) > 1:
-                kinds = f"{len(made_on)} kinds of processor ({', '.join(sorted(made_on))})"
-                note = f"made on {kinds}: the last digits of clips may differ from those of a set made on one"
-                manifest = manifest.model_copy(update={"notes": [*manifest.notes, note]})
-            write_json(self.out / MANIFEST_FILE, manifest.dump())
-            shutil.rmtree(self.out / OLD_FOLDER, ignore_errors=True)
-        return manifest
+        part = self._how.part
+        if part is None:
+            return finish(self.out, self._planned, self._shards(convert))
+        leave_record(self.out, part, self._planned)
+        return self._planned.with_results(self._shards(convert))
 
     def _shards(self, convert: Convert[T]) -> list[Result]:
         done = len(self._tasks) - len(self._todo)
@@ -222,6 +194,37 @@ class DatasetWriter(Generic[T]):
                 self._results[self._todo[position]] = result
                 meter.advance()
         return [result for result in self._results if result is not None]
+
+
+def _planned(tasks: Sequence[ShardTask[T]], facts: DatasetFacts) -> Planned:
+    layout = facts.layout
+    manifest = Manifest(
+        name=facts.name,
+        layout=layout.name,
+        family=layout.family,
+        fps=layout.fps,
+        skeleton=layout.skeleton_name,
+        licence=facts.licence,
+        converter=facts.converter,
+        converter_version=facts.converter_version,
+        options=facts.options,
+        shards=[],
+        dropped=list(facts.dropped),
+        licences=facts.licences,
+        audio=facts.audio,
+        notes=list(facts.notes),
+    )
+    return Planned(
+        manifest=manifest,
+        fingerprints={task.path.name: task.fingerprint for task in tasks},
+        items=sum(len(task.items) for task in tasks),
+        lost=list(facts.lost),
+        most_lost=facts.most_lost,
+    )
+
+
+def _finished(task: ShardTask[T]) -> Result | None:
+    return finished_shard(task.path, task.fingerprint, strict=task.strict)
 
 
 def _check_arguments(facts: DatasetFacts, how: WriteOptions) -> None:
@@ -252,67 +255,9 @@ def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dic
     before |= {"layout": manifest.get("layout"), "fps": manifest.get("fps")}
     # Options as JSON has them: a tuple that was written comes back as a list.
     now = {**json.loads(json.dumps(options)), "layout": layout.name, "fps": layout.fps}
-    changed = [
-        _difference(key, before.get(key), now.get(key))
-        for key in sorted({*before, *now})
-        if key != SOURCE_CHECKSUM and before.get(key) != now.get(key)
-    ]
+    changed = differences(before, now)
     if changed:
         raise UserError(
-            f"{out} holds this dataset, finished with other options ({'; '.join(changed[:3])}"
-            f"{f'; and {len(changed) - 3} more' if len(changed) > 3 else ''}); choose another folder, or "
-            f"delete this one to make it anew"
+            f"{out} holds this dataset, finished with other options ({'; '.join(changed)}); choose another "
+            f"folder, or delete this one to make it anew"
         )
-
-
-def _difference(key: str, before: object, now: object) -> str:
-    """`fps 20.0 -> 10.0`; facts of files are not spelled out."""
-    if isinstance(before, dict) or isinstance(now, dict):
-        return f"{key} is another"
-    return f"{key} {json.dumps(before)} -> {json.dumps(now)}"
-
-
-def _remove_strays(out: Path, name: str, keep: set[Path]) -> None:
-    """Delete temporary files of killed runs, and shards of this dataset that the plan does not have."""
-    names = {path.name for path in keep} | {index_path(path).name for path in keep}
-    for folder in (out, *out.glob(".*/")):
-        remove_temporaries(folder)
-    for path in _shards_in(out, name, ".tar", ".index.json"):
-        if path.name not in names:
-            path.unlink()
-    sync_folder(out)
-
-
-def _shards_in(folder: Path, name: str, *suffixes: str) -> list[Path]:
-    """Shards of the data set `name`, or their indices."""
-    shard = re.compile(
-        rf"{re.escape(name)}-({'|'.join(SPLITS)})-\d{{6,}}({'|'.join(map(re.escape, suffixes))})"
-    )
-    return [path for path in folder.iterdir() if shard.fullmatch(path.name)] if folder.is_dir() else []
-
-
-def _finish_index(out: Path, shards: list[ShardInfo]) -> set[str]:
-    """Write `index.npz`; the kinds of processor that the shards were made on."""
-    splits: dict[Split, SplitIndex] = {}
-    owners: dict[str, str] = {}
-    made_on: set[str] = set()
-    for split in SPLITS:
-        splits[split] = SplitIndex.build(
-            _unique(ShardIndex.load_json(index_path(out / shard.name)), shard.name, owners, made_on)
-            for shard in shards
-            if shard.split == split
-        )
-    save_index(out, splits)
-    return made_on
-
-
-def _unique(index: ShardIndex, shard: str, owners: dict[str, str], made_on: set[str]) -> ShardIndex:
-    made_on |= index.kinds
-    for clip in index.clips:
-        if clip.id in owners:
-            raise UserError(
-                f"clip id '{clip.id}' is in {owners[clip.id]} and again in {shard}; "
-                f"make the converter's ids unique"
-            )
-        owners[clip.id] = shard
-    return index

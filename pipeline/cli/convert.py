@@ -23,6 +23,7 @@ from typer.main import get_command
 from motionloom.datasets.convert.registry import converter_named, names
 from motionloom.datasets.schema import MANIFEST_FILE, Manifest, UserError, nearest
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
+from motionloom.datasets.shards.options import Part
 from motionloom.pipeline.cli.options import AsJson, Workers, fields_of, print_json, set_option
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
@@ -38,6 +39,13 @@ _RUN_OPTIONS: dict[str, tuple[object, object]] = {
     "plan": (
         Annotated[bool, typer.Option("--plan", help="Only list what would be done, and the disk it takes.")],
         False,
+    ),
+    "part": (
+        Annotated[
+            str | None,
+            typer.Option("--part", metavar="K/N", help="Make only the K-th of N parts, on any machine."),
+        ],
+        None,
     ),
     "workers": (Workers, 2),
     "sets": (Annotated[list[str] | None, set_option("A setting, as listed above.")], None),
@@ -79,15 +87,18 @@ def _command(name: str) -> Any:
     entry = converter_named(name)
     config = entry.config_class
 
-    def run(source: Path, out: Path, plan: bool, workers: int, sets: list[str] | None, as_json: bool,
-            **everyday: Any) -> None:  # fmt: skip
+    def run(source: Path, out: Path, plan: bool, part: str | None, workers: int, sets: list[str] | None,
+            as_json: bool, **everyday: Any) -> None:  # fmt: skip
         if as_json and not plan:
             raise UserError("--json is for the plan: give --plan too")
         settings = {key: value for key, value in everyday.items() if value is not None}
         settings |= fields_of(sets, "--set")
         fields = {**settings, "source": source}
         console = make_console(aside=as_json)
-        convert_command(name, fields, out, plan=plan, workers=workers, console=console, as_json=as_json)
+        share = None if part is None else Part.parse(part)
+        convert_command(
+            name, fields, out, plan=plan, part=share, workers=workers, console=console, as_json=as_json
+        )
 
     parameters = [
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),
@@ -102,6 +113,8 @@ def _command(name: str) -> Any:
     listed = "\n".join(f"- `{key}`: {_help(config, key)}" for key in _settings(config))
     run.__doc__ = (
         f"{entry.summary}\n\nExample: `motionloom data convert {name} {entry.example} --plan`\n\n"
+        f"In eight parts: `motionloom data convert {name} … --part 1/8` to `--part 8/8`, in any order on "
+        f"machines that see both folders; then `motionloom data join {entry.example.split()[1]}`\n\n"
         f"Settings for `--set KEY=VALUE`:\n\n{listed}"
     )
     app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
@@ -156,6 +169,7 @@ def convert_command(
     out: Path,
     *,
     plan: bool,
+    part: Part | None = None,
     workers: int,
     console: Console,
     as_json: bool = False,
@@ -172,10 +186,14 @@ def convert_command(
         planned = conversion.plan
         licensed = bool(conversion.converter.licence(planned))
         line = proposed(kind, config, out, planned, licensed=licensed) if planned.items else ""
+        line += f" --part {part}" if part and line else ""
+        share = conversion.share(part) if part else {}
         if as_json:
-            print_json(planned.dump() | {"command": line})
+            print_json(planned.dump() | {"command": line, "part": share})
         else:
             _say_plan(planned, console)
+            if part:
+                say(console, f"part {part}: {share['shards']:,} shards, {share['clips']:,} clips")
             say(console, f"convert it: {line}" if line else "nothing of it can be converted")
         return
     require_folder(out)
@@ -183,8 +201,16 @@ def convert_command(
     for note in conversion.plan.notes:
         say(console, f"note: {note}")
     manifest = run_conversion(
-        conversion, out, workers=workers, progress=shown, say=lambda line: say(console, line)
+        conversion, out, workers=workers, progress=shown, part=part, say=lambda line: say(console, line)
     )
+    if part is not None:
+        clips = sum(shard.samples for shard in manifest.shards)
+        say(
+            console,
+            f"part {part} is made: {len(manifest.shards):,} shards, {clips:,} clips; when all parts are: "
+            f"{shlex.join(['motionloom', 'data', 'join', str(out)])}",
+        )
+        return
     say_manifest(manifest, out, console)
     for note in manifest.notes:
         if note not in conversion.plan.notes:  # said before

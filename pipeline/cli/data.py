@@ -57,6 +57,21 @@ def synth(
 
 
 @data_app.command()
+def join(out: Annotated[Path, typer.Argument(help="Folder with the shards of all parts.")]) -> None:
+    """One data set of the parts that `data convert --part` made; exit code 1 when any is missing.
+
+    Example: `motionloom data join shards`
+    """
+    from motionloom.datasets.shards.finish import join_parts
+
+    console = make_console()
+    manifest = join_parts(out)
+    say_manifest(manifest, out, console)
+    for note in manifest.notes:
+        say(console, f"note: {note}")
+
+
+@data_app.command()
 def check(
     paths: Annotated[
         list[Path],

@@ -15,14 +15,12 @@ from motionloom.datasets.convert.common.converter import Converter
 from motionloom.datasets.convert.common.look import Look, look_at
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.schema import Manifest, UserError
-from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped
 from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions
+from motionloom.datasets.shards.tasks import plan_shards
 from motionloom.datasets.shards.writer import dataset_writer
 
 SCAN_FILE = ".scan.json"
 """Inside the folder of the shards: what converters remember of their source; may be deleted at any time."""
-
-_CLIPS_PER_SHARD = 256
 
 _label = operator.methodcaller("label")
 
@@ -46,6 +44,8 @@ class Conversion(Generic[C]):
         return self.converter.options() | {"source_sha256": sha256_of_json(content)}
 
     def facts(self) -> DatasetFacts:
+        # Of a few chosen clips (`limit`) those count that were tried.
+        lost = [] if self.config.limit else [*self.plan.broken, *self.plan.rejected]
         return DatasetFacts(
             name=self.config.name,
             layout=self.converter.layout,
@@ -57,6 +57,8 @@ class Conversion(Generic[C]):
             licences=self.plan.licences,
             audio=self.converter.audio(),
             dropped=self.plan.left_out(),
+            lost=lost,
+            most_lost=self.config.most_rejected,
             notes=self.plan.notes,
         )
 
@@ -66,6 +68,14 @@ class Conversion(Generic[C]):
             return None
         clips, converter = [clip for _, clip in self.plan.items], self.converter
         return look_at(clips, converter.joints, converter.subset, self.config, label=_label)
+
+    def share(self, part: Part) -> dict[str, int]:
+        """Numbers of shards and clips that a part would make."""
+        tasks = plan_shards(
+            Path(), self.plan.items, self.facts(), WriteOptions(), _label, self.converter.depends_on
+        )
+        own = [task for at, task in enumerate(tasks) if part.has(at)]
+        return {"shards": len(own), "clips": sum(len(task.items) for task in own)}
 
     def looked(self) -> Conversion[C]:
         """Itself, with a look at the source and the disk that shards will take in its plan."""
@@ -82,17 +92,16 @@ def run_conversion(
     *,
     workers: int = 1,
     seed: int = 0,
-    clips_per_shard: int = _CLIPS_PER_SHARD,
+    clips_per_shard: int = WriteOptions.clips_per_shard,
     progress: bool = True,
     part: Part | None = None,
     say: Callable[[str], None] = lambda _: None,
 ) -> Manifest:
-    """Write the shards.
+    """Write the shards, or those of `part` alone, of which `join_parts` makes one data set.
 
-    Before the first clip a few are looked at (`config.look`). `say` gets what an earlier run has finished,
-    and what the look found odd. Same input and options give the same bytes for any `workers`; a killed run
-    goes on at the first unfinished shard. With `part`, only that part is made, without a manifest (the one
-    returned covers the part); the run without one then finds all parts and writes index and manifest.
+    Before the first clip a few are looked at (`config.look`), in each part the same of the whole source.
+    `say` gets what an earlier run has finished, and what the look found odd. Same input and options give the
+    same bytes for any `workers` and parts; a killed run goes on at the first unfinished shard.
     """
     how = WriteOptions(workers, clips_per_shard, seed, progress=progress, part=part)
     plan = conversion.plan
@@ -105,28 +114,10 @@ def run_conversion(
     ) as writer:
         if writer.progress_line:
             say(writer.progress_line)
-        # Parts of a cluster's job do not look: the run that planned them has.
-        if part is None and writer.pending():
+        if writer.pending():
             seen = plan.look or conversion.look()
             if seen is not None:
                 seen.require_people(plan.name)
                 for warning in seen.warnings:
                     say(f"warning: {warning}")
-        manifest = writer.write(conversion.converter.convert)
-    if part is None:
-        _require_most(conversion, manifest, out)
-    return manifest
-
-
-def _require_most(conversion: Conversion[C], manifest: Manifest, out: Path) -> None:
-    """`UserError` when most of a source could not be converted: a wrong map or unit rather than bad clips."""
-    plan = conversion.plan
-    # Of a few chosen clips (`limit`) those count that were tried.
-    before = [] if conversion.config.limit else [*plan.broken, *plan.rejected]
-    lost = [*before, *manifest.dropped[len(plan.left_out()) :]]
-    clips = len(plan.items) + len(before)
-    if len(lost) > conversion.config.most_rejected * clips:
-        raise UserError(
-            f"{out}: {len(lost)} of {clips} clips cannot be used ({grouped(lost)[0]}); the rest is "
-            f"converted; all reasons are in {out / LEFT_OUT_FILE}; to accept them: --set most_rejected=1"
-        )
+        return writer.write(conversion.converter.convert)

@@ -9,13 +9,14 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 
 from pydantic import Field
 
 from motionloom.datasets.base.files import sha256_of_json, write_json
+from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.motion.bvh.asf import JOINED
 from motionloom.datasets.schema import Config, UserError, read_plain
@@ -106,6 +107,20 @@ def scan_files(
     progress: bool = False,
 ) -> Scan:
     """Read the header of every motion file, in the order of `names`; `keep` is the file that remembers."""
+    with ExitStack() as stack:
+        if keep is not None:
+            with suppress(OSError):  # no locks, or no writing there: each scans for itself
+                keep.parent.mkdir(parents=True, exist_ok=True)
+                # Parts of a conversion that begin at once: one reads the source, the others what it found.
+                lock = keep.with_suffix(".lock")
+                stack.enter_context(file_lock(lock))
+                stack.callback(lock.unlink, missing_ok=True)
+        return _scan_files(root, names, header, keep, workers, progress)
+
+
+def _scan_files(
+    root: Path, names: Sequence[str], header: Header, keep: Path | None, workers: int, progress: bool
+) -> Scan:
     keys = {_state(root, name): name for name in names}
     known = _load(keep)
     kept = {key: known.files[key] for key in keys if key in known.files}

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from bvh_clips import unpack_bandai
 
-from motionloom.datasets.base.lock import LOCK_FILE
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
 from motionloom.datasets.convert.bvh.plan import BvhClip
 from motionloom.datasets.convert.common.conversion import run_conversion
@@ -21,6 +20,7 @@ from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, Split, UserError
+from motionloom.datasets.shards.finish import join_parts
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, index_path
 from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
@@ -120,21 +120,23 @@ def test_a_finished_conversion_reads_nothing_again(
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_parts_and_one_last_run_give_the_same_bytes(copy: Path, tmp_path: Path, count: int) -> None:
+def test_parts_and_their_join_give_the_same_bytes(copy: Path, tmp_path: Path, count: int) -> None:
     (copy / "broken.bvh").write_text("HIERARCHY\nMOTION\nFrames: 60\nFrame Time: 0.033333\n1 2 3\n")
     given = config(copy, uncaptioned="keep")
     whole = convert(given, tmp_path / "whole", clips_per_shard=2)
     out = tmp_path / "out"
-    names = [
-        s.name for index in reversed(range(count)) for s in run_part(given, out, Part(index, count)).shards
-    ]
-    assert sorted(names) == sorted(shard.name for shard in whole.shards)
+    for number in reversed(range(2, count + 1)):
+        run_part(given, out, Part(number, count))
+    if count > 1:
+        with pytest.raises(UserError, match=f"part 1/{count}"):
+            join_parts(out)
+    run_part(given, out, Part(1, count))
     assert not (out / "manifest.json").exists()
-    assert convert(given, out, clips_per_shard=2) == whole
+    assert join_parts(out) == whole
     assert bytes_of(out) == bytes_of(tmp_path / "whole")
     before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
-    run_part(given, out, Part(0, count))  # all is there: nothing is made, and the manifest stays
-    (out / LOCK_FILE).unlink()  # parts leave it, the last run takes it away
+    run_part(given, out, Part(1, count))  # all is there: nothing is made, and the manifest stays
+    assert join_parts(out) == whole
     assert {path.name: path.stat().st_mtime_ns for path in out.iterdir()} == before
 
 

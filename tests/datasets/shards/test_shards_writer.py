@@ -195,7 +195,7 @@ def test_parts_of_several_kinds_of_processor_are_noted(
 ) -> None:
     for number, kind in enumerate(("x86_64 AVX2", "x86_64 AVX512")):
         monkeypatch.setattr(tasks, "_processor", lambda kind=kind: kind)
-        made.write(tmp_path, part=Part(number, 2))
+        made.write(tmp_path, part=Part(number + 1, 2))
     (note,) = made.write(tmp_path).notes
     assert "(x86_64 AVX2, x86_64 AVX512)" in note
     assert made.write(tmp_path, clips_per_shard=10).notes == [note], "clips that are taken over bring theirs"
@@ -211,12 +211,12 @@ def test_parts_work_at_once_and_leave_each_others_files(made: ModuleType, tmp_pa
 
     def convert(i: int) -> object:
         stranger.touch()
-        made.write(tmp_path, part=Part(1, 2))  # another part, while this one writes
+        made.write(tmp_path, part=Part(2, 2))  # another part, while this one writes
         with pytest.raises(UserError, match=tmp_path.name):
             made.write(tmp_path)
         return made.clip(i)
 
-    made.write(tmp_path, convert=convert, part=Part(0, 2))
+    made.write(tmp_path, convert=convert, part=Part(1, 2))
     assert stranger.exists(), "a part must not clean up: the file may be another part's"
     made.write(tmp_path)
     assert not stranger.exists() and not (tmp_path / LOCK_FILE).exists()
@@ -225,12 +225,12 @@ def test_parts_work_at_once_and_leave_each_others_files(made: ModuleType, tmp_pa
 def test_a_part_is_refused_while_a_whole_run_writes(made: ModuleType, tmp_path: Path) -> None:
     def convert(i: int) -> object:
         with pytest.raises(UserError, match=tmp_path.name):
-            made.write(tmp_path, part=Part(0, 2))
+            made.write(tmp_path, part=Part(1, 2))
         return made.clip(i)
 
     made.write(tmp_path, count=5, convert=convert)
-    with pytest.raises(UserError, match="part 2 of 2"):
-        Part(2, 2)
+    with pytest.raises(UserError, match="part 3/2"):
+        Part(3, 2)
 
 
 def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path: Path) -> None:

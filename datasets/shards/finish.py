@@ -1,0 +1,211 @@
+"""The end of a conversion: list of what was left out, `index.npz` and `manifest.json` over finished shards.
+
+A whole run ends with it; parts leave a record each (`Planned`), by which `join_parts` does the same later.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from motionloom.datasets.base.files import remove_temporaries, sync_folder, write_json
+from motionloom.datasets.base.lock import folder_lock
+from motionloom.datasets.schema import (
+    MANIFEST_FILE,
+    SPLITS,
+    Config,
+    Decisions,
+    Dropped,
+    Manifest,
+    ShardInfo,
+    Split,
+    UserError,
+)
+from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
+from motionloom.datasets.shards.options import SOURCE_CHECKSUM, Part
+from motionloom.datasets.shards.tasks import Result, finished_shard
+
+OLD_FOLDER = ".old"
+"""Inside the folder of the shards: shards of an earlier run whose clips are taken over; removed when the
+manifest stands."""
+PARTS_FOLDER = ".parts"
+"""Inside it, too: the record of each part, until they are joined."""
+
+
+class Planned(Config):
+    """All that a finished set says beside its shards; equal in all parts of one conversion."""
+
+    manifest: Manifest
+    """Without shards; `dropped` are those that the plan left out."""
+    fingerprints: dict[str, str]
+    """Of every shard, of all parts, by its name, in the manifest's order."""
+    items: int
+    """Items of all shards."""
+    lost: list[Dropped]
+    most_lost: float
+    """As in `DatasetFacts`."""
+
+    def with_results(self, results: Sequence[Result]) -> Manifest:
+        """The manifest of shards that are made."""
+        shards = [shard for shard, _ in results if shard is not None]
+        failed = [drop for _, drops in results for drop in drops]
+        return self.manifest.model_copy(
+            update={"shards": shards, "dropped": [*self.manifest.dropped, *failed]}
+        )
+
+
+def leave_record(out: Path, part: Part, planned: Planned) -> None:
+    """Write a part's record; none where all is made and joined already."""
+    if not (out / MANIFEST_FILE).exists():
+        write_json(out / PARTS_FOLDER / f"{part.number}-of-{part.count}.json", planned.dump())
+
+
+def join_parts(out: Path) -> Manifest:
+    """Make one data set of the finished parts in `out`; one that is joined already is left as it is.
+
+    `UserError` for parts that are missing, unfinished, or made of other sources or with other settings.
+    """
+    if not out.is_dir():
+        raise UserError(f"{out}: no such folder")
+    with folder_lock(out):
+        records = {
+            Part.parse(path.stem.replace("-of-", "/")): Planned.load_json(path)
+            for path in sorted((out / PARTS_FOLDER).glob("*-of-*.json"))
+        }
+        if not records:
+            if (out / MANIFEST_FILE).exists():
+                return Manifest.load_json(out / MANIFEST_FILE)
+            raise UserError(f"{out}: no part in it; make the parts first: data convert … --part 1/8")
+        planned = _require_one_plan(out, records)
+        with ThreadPoolExecutor() as threads:  # hashing runs outside the interpreter's lock
+            fingerprints = planned.fingerprints.items()
+            results = list(threads.map(lambda shard: finished_shard(out / shard[0], shard[1]), fingerprints))
+        count = max(part.count for part in records)
+        missing = sorted({at % count + 1 for at, result in enumerate(results) if result is None})
+        if missing:
+            parts = [f"{number}/{count}" for number in missing]
+            raise UserError(
+                f"{out}: part {', '.join(parts)} {'is' if len(parts) == 1 else 'are'} missing or not "
+                f"finished: give the same data convert … --part {parts[0]}"
+            )
+        remove_strays(out, planned)
+        return finish(out, planned, [result for result in results if result is not None])
+
+
+def _require_one_plan(out: Path, records: Mapping[Part, Planned]) -> Planned:
+    """What all parts have planned."""
+    (one, planned), *others = records.items()
+    for part, other in others:
+        if other.fingerprints != planned.fingerprints:
+            changed = differences(_settings(planned), _settings(other))
+            told = "; ".join(changed) or "its files, captions or joint maps are others"
+            raise UserError(
+                f"{out}: part {part} is not of the same source and settings as part {one} ({told}): "
+                f"give one of them again, or delete its record in {out / PARTS_FOLDER}"
+            )
+    return planned
+
+
+def _settings(planned: Planned) -> dict[str, object]:
+    manifest = planned.manifest
+    named = {"name": manifest.name, "layout": manifest.layout, "fps": manifest.fps}
+    return {**manifest.options, **named}
+
+
+def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+    """Options that differ, at most three of them, as `fps 20.0 -> 10.0`; the source is no option."""
+    keys = [
+        key for key in sorted({*before, *now}) if key != SOURCE_CHECKSUM and before.get(key) != now.get(key)
+    ]
+    told = [_difference(key, before.get(key), now.get(key)) for key in keys[:3]]
+    return [*told, f"and {len(keys) - 3} more"] if len(keys) > 3 else told
+
+
+def _difference(key: str, before: object, now: object) -> str:
+    """`fps 20.0 -> 10.0`; facts of files are not spelled out."""
+    if isinstance(before, dict) or isinstance(now, dict):
+        return f"{key} is another"
+    return f"{key} {json.dumps(before)} -> {json.dumps(now)}"
+
+
+def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
+    """Write all that a finished set has beside its shards, the manifest last.
+
+    `UserError` when no clip, or too few of the clips, became samples.
+    """
+    manifest = planned.with_results(results)
+    manifest = manifest.model_copy(update={"excluded": Decisions.of(out).left_out})
+    failed = manifest.dropped[len(planned.manifest.dropped) :]
+    write_left_out(out, manifest.dropped)
+    if not manifest.shards:
+        groups = grouped([*failed, *planned.manifest.dropped])
+        some = "; ".join(map(str, groups[:3])) or "there was none"
+        where = f"; all of them: {out / LEFT_OUT_FILE}" if len(manifest.dropped) > 1 else ""
+        raise UserError(f"{out}: no clip survived the conversion ({some}){where}")
+    # The index is written before the manifest: whoever sees a manifest finds everything that it names.
+    made_on = _finish_index(out, manifest.shards)
+    if len(made_on) > 1:
+        kinds = f"{len(made_on)} kinds of processor ({', '.join(sorted(made_on))})"
+        note = f"made on {kinds}: the last digits of clips may differ from those of a set made on one"
+        manifest = manifest.model_copy(update={"notes": [*manifest.notes, note]})
+    write_json(out / MANIFEST_FILE, manifest.dump())
+    for folder in (OLD_FOLDER, PARTS_FOLDER):
+        shutil.rmtree(out / folder, ignore_errors=True)
+    # A wrong map or unit rather than bad clips.
+    lost, clips = [*planned.lost, *failed], planned.items + len(planned.lost)
+    if len(lost) > planned.most_lost * clips:
+        raise UserError(
+            f"{out}: {len(lost)} of {clips} clips cannot be used ({grouped(lost)[0]}); the rest is "
+            f"converted; all reasons are in {out / LEFT_OUT_FILE}; to accept them: --set most_rejected=1"
+        )
+    return manifest
+
+
+def remove_strays(out: Path, planned: Planned) -> None:
+    """Delete temporary files of killed runs, and shards of this dataset that the plan does not have."""
+    for folder in (out, *out.glob(".*/")):
+        remove_temporaries(folder)
+    for path in shards_in(out, planned.manifest.name, ".tar", ".index.json"):
+        if path.name.replace(".index.json", ".tar") not in planned.fingerprints:
+            path.unlink()
+    sync_folder(out)
+
+
+def shards_in(folder: Path, name: str, *suffixes: str) -> list[Path]:
+    """Shards of the data set `name`, or their indices."""
+    shard = re.compile(
+        rf"{re.escape(name)}-({'|'.join(SPLITS)})-\d{{6,}}({'|'.join(map(re.escape, suffixes))})"
+    )
+    return [path for path in folder.iterdir() if shard.fullmatch(path.name)] if folder.is_dir() else []
+
+
+def _finish_index(out: Path, shards: Sequence[ShardInfo]) -> set[str]:
+    """Write `index.npz`; the kinds of processor that the shards were made on."""
+    splits: dict[Split, SplitIndex] = {}
+    owners: dict[str, str] = {}
+    made_on: set[str] = set()
+    for split in SPLITS:
+        splits[split] = SplitIndex.build(
+            _unique(ShardIndex.load_json(index_path(out / shard.name)), shard.name, owners, made_on)
+            for shard in shards
+            if shard.split == split
+        )
+    save_index(out, splits)
+    return made_on
+
+
+def _unique(index: ShardIndex, shard: str, owners: dict[str, str], made_on: set[str]) -> ShardIndex:
+    made_on |= index.kinds
+    for clip in index.clips:
+        if clip.id in owners:
+            raise UserError(
+                f"clip id '{clip.id}' is in {owners[clip.id]} and again in {shard}; "
+                f"make the converter's ids unique"
+            )
+        owners[clip.id] = shard
+    return index
