@@ -14,6 +14,7 @@ from motionloom.datasets.convert import sets as _sets
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion
 from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter, Converter, PlanSettings
+from motionloom.datasets.convert.common.earlier import moved_clips
 from motionloom.datasets.schema import UserError
 
 _HELPERS = ("captions", "common", "sets")
@@ -79,6 +80,7 @@ def prepare(
     kind = kind or next((one for one in converters() if one.config_class is type(config)), None)
     if kind is None:
         raise UserError(f"no converter takes a {type(config).__name__}; register its converter, or name it")
-    converter = kind(config)
+    converter, folder = kind(config), maps or out
     scan = None if out is None else out / SCAN_FILE
-    return Conversion(converter, converter.plan(PlanSettings(workers, progress, scan, maps or out)))
+    plan = converter.plan(PlanSettings(workers, progress, scan, folder))
+    return Conversion(converter, plan, "" if folder is None else moved_clips(folder, plan))

@@ -189,9 +189,11 @@ def convert_command(
         line += f" --part {part}" if part and line else ""
         share = conversion.share(part) if part else {}
         if as_json:
-            print_json(planned.dump() | {"command": line, "part": share})
+            print_json(planned.dump() | {"command": line, "part": share, "moved": conversion.moved})
         else:
             _say_plan(planned, console)
+            if conversion.moved:
+                say(console, conversion.moved)
             if part:
                 say(console, f"part {part}: {share['shards']:,} shards, {share['clips']:,} clips")
             say(console, f"convert it: {line}" if line else "nothing of it can be converted")

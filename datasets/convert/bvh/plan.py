@@ -320,7 +320,7 @@ def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
 
 def _decide(config: BvhConfig, folder: Path, scan: Scan, stated: str) -> ConversionPlan[BvhClip]:
     found = scan.files.values()
-    listing = config.listing([file.path for file in found], [file.path for file in found if not file.problem])
+    listing = config.listing([file.path for file in found])
     draft = ConversionPlan[BvhClip](config, notes=listing.notes, stated=stated)
     contents: dict[str, str] = {}
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.

@@ -8,7 +8,7 @@ with (`/data/mocap/walks/walk.bvh`). A name that two files fit is an error.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -17,8 +17,8 @@ from motionloom.datasets.base.files import sha256_of, sha256_of_json
 from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, read_captions
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
-from motionloom.datasets.convert.common.splits import hash_split, read_split_files, subject_splits
-from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.convert.common.splits import SplitRule, hash_split, read_split_files
+from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
 
 
 class FileNames:
@@ -73,14 +73,30 @@ class Listing:
     free: tuple[str, ...]
     """Files without captions."""
     notes: list[str]
+    rule: SplitRule | None = None
+    """The rule that the user has named in place of split files."""
 
     def id_of(self, path: str) -> str:
         return self.rows[path].id if path in self.rows else bare(path)
 
     def split_of(self, path: str) -> Split:
-        """By the split files, else the captions, else a hash of the id."""
+        """By the user's rule or split files, else the captions, else a hash of the id."""
         stated = self.rows[path].split if path in self.rows else None
-        return (self.splits or {}).get(path) or stated or hash_split(self.id_of(path))
+        listed = None if self.rule else (self.splits or {}).get(path) or stated
+        rule = self.rule or SplitRule()
+        return listed or hash_split(rule.name(self.id_of(path), path), rule.seed)
+
+    def empty_splits(self, paths: Mapping[str, Split]) -> list[str]:
+        """Return a note on splits that a hash leaves without a clip, with what helps; none for lists."""
+        empty = [split for split in SPLITS if split not in paths.values()]
+        stated = self.rule is None and any(row.split for row in self.rows.values())
+        if not empty or not paths or stated or self.splits is not None:
+            return []
+        rule = self.rule or SplitRule()
+        other = rule.another(rule.name(self.id_of(path), path) for path in paths)
+        cure = f" or a rule that fills them (--set splits={other})" if other else ""
+        lists = ", ".join(f"{split}.txt" for split in SPLITS)
+        return [f"no clip is in {' or '.join(empty)}; give lists ({lists}: --set splits=FOLDER){cure}"]
 
     def texts_of(self, path: str) -> tuple[Caption, ...]:
         return self.rows[path].texts if path in self.rows else ()
@@ -150,9 +166,6 @@ def _stem(name: str) -> str:
     return bare(name).rsplit("/", 1)[-1].lower()
 
 
-BY_SUBJECTS = "subjects"
-"""Word in place of a folder of splits."""
-
 _SHOWN = 3
 """Names that a sentence lists."""
 
@@ -165,8 +178,8 @@ class CaptionConfig(ConvertConfig):
     files or of such lists (docs/sources.md). Without it clips have no captions.
     """
     splits: Path | None = None
-    """Folder of train.txt, val.txt, test.txt, or `subjects` for all clips of a person in one split; else the
-    captions' `split`, else 80/5/15 by hash of the id.
+    """Folder of train.txt, val.txt, test.txt, or `subjects` for all clips of a person in one split, by a hash
+    of the name (`subjects:3` by another one, `clips:3` by each id); else the captions' `split`, else `clips`.
     """
     uncaptioned: Literal["stop", "drop", "keep"] = "stop"
     """Clips that the given captions do not name: stop and say which, leave them out, or keep them.
@@ -181,16 +194,12 @@ class CaptionConfig(ConvertConfig):
         """Return the fields that the output depends on; `stop` counts as `drop`: both write captions."""
         return super().options() | {"uncaptioned": "drop" if self.uncaptioned == "stop" else self.uncaptioned}
 
-    def listing(self, paths: Sequence[str], readable: Sequence[str] | None = None) -> Listing:
-        """Return the captions and splits of motion files, by their paths in the source; subjects are split by
-        those that are readable.
-        """
+    def listing(self, paths: Sequence[str]) -> Listing:
+        """Return the captions and splits of motion files, by their paths in the source."""
         rows = () if self.captions is None else read_captions(self.captions).values()
-        if str(self.splits) == BY_SUBJECTS and not Path(BY_SUBJECTS).exists():
-            splits, notes = subject_splits(paths if readable is None else readable)
-            return replace(list_clips(paths, rows, None, notes), splits=splits)
-        listed, notes = read_split_files(self.splits) if self.splits else (None, [])
-        return list_clips(paths, rows, listed, notes)
+        rule = None if self.splits is None or self.splits.exists() else SplitRule.parse(str(self.splits))
+        listed, notes = read_split_files(self.splits) if self.splits and not rule else (None, [])
+        return replace(list_clips(paths, rows, listed, notes), rule=rule)
 
 
 def digest_of(path: Path) -> dict[str, str]:
@@ -208,6 +217,7 @@ def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: List
     """
     for name, clip_id in found.missing.items():
         draft.miss(name, f"clip '{clip_id}' is listed, but its file is not in the source")
+    draft.notes += found.empty_splits({clip.label(): split for split, clip in draft.items})
     if config.captions is None:
         return
     bare_clips, captioned = draft.bare_clips, draft.captioned

@@ -31,6 +31,8 @@ class Conversion(Generic[C]):
 
     converter: Converter[Any, C]
     plan: ConversionPlan[C]
+    moved: str = ""
+    """Clips of an earlier run that are in another split now, counted."""
 
     @property
     def config(self) -> ConvertConfig:
@@ -112,8 +114,8 @@ def run_conversion(
     with dataset_writer(
         out, plan.items, conversion.facts(), how, describe=_label, depends_on=depends_on
     ) as writer:
-        if writer.progress_line:
-            say(writer.progress_line)
+        for line in filter(None, (writer.progress_line, conversion.moved)):
+            say(line)
         if writer.pending():
             seen = plan.look or conversion.look()
             if seen is not None:

@@ -1,13 +1,15 @@
-"""Splits of a source: its own split files, else 80/5/15 by a hash of the id."""
+"""Splits of a source: its own split files, else 80/5/15 by a hash of each id or subject alone."""
 
 from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, cast
 
-from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.files import check_id, read_text_file
 from motionloom.datasets.schema import SPLITS, Split, UserError
 
@@ -49,9 +51,9 @@ def split_files(folder: Path) -> list[tuple[Split, Path]]:
     return sorted(found, key=lambda pair: SPLITS.index(pair[0]))
 
 
-def hash_split(clip_id: str) -> Split:
-    """80/5/15 by the id alone, so a clip keeps its split when others come or go."""
-    share = hash_share(clip_id)
+def hash_split(name: str, seed: int = 0) -> Split:
+    """80/5/15 by a name alone, so that what has it keeps its split when others come or go."""
+    share = hash_share(f"{seed}:{name}" if seed else name)
     if share < TRAIN_SHARE:
         return "train"
     return "val" if share < TRAIN_SHARE + VAL_SHARE else "test"
@@ -137,31 +139,39 @@ def subject_of(path: str) -> str:
     return folder or re.split(r"[_\-. ]", stem)[0]
 
 
-def subject_splits(paths: Sequence[str]) -> tuple[dict[str, Split], list[str]]:
-    """Split of every file, all of a subject in one: about 80/5/15 of the files, in the order of a hash.
+_RULE = re.compile(r"(subjects|clips)(?::(\d{1,9}))?")
+_SEEDS_TRIED = 500
 
-    Of three subjects and more, each split has one. The note says how many subjects are where.
-    """
-    groups: dict[str, list[str]] = {}
-    for path in paths:
-        groups.setdefault(subject_of(path), []).append(path)
-    splits: dict[str, Split] = {}
-    # Subjects are taken in the order of a hash until each split has its share of the *files*.
-    done, subjects = 0, dict.fromkeys(("train", "val", "test"), 0)
-    # Those with many clips come last: a test set of one of them would be too large.
-    order = sorted(groups, key=lambda name: (len(groups[name]) > len(paths) / 4, sha256_of_json(name)))
-    for number, name in enumerate(order):
-        share = (done + len(groups[name]) / 2) / len(paths)
-        split: Split = "train"
-        if len(order) > 1 and (number == 0 or share < 1 - TRAIN_SHARE - VAL_SHARE):
-            split = "test"
-        elif len(order) > 2 and (not subjects["val"] or share < 1 - TRAIN_SHARE):
-            split = "val"
-        subjects[split] += 1
-        done += len(groups[name])
-        splits |= dict.fromkeys(groups[name], split)
-    counts = ", ".join(f"{count} {split}" for split, count in subjects.items())
-    return splits, [f"split by subject: {counts}"]
+
+@dataclass(frozen=True)
+class SplitRule:
+    """Splits by a hash of subjects or of clip ids: `subjects`, `clips`, or with another seed `subjects:3`."""
+
+    by: Literal["subjects", "clips"] = "clips"
+    seed: int = 0
+
+    @classmethod
+    def parse(cls, words: str) -> SplitRule | None:
+        """Return the rule that some words name, or None."""
+        found = _RULE.fullmatch(words)
+        return found and cls(cast(Literal["subjects", "clips"], found[1]), int(found[2] or 0))
+
+    def name(self, clip_id: str, path: str) -> str:
+        """Return what of a clip is hashed."""
+        return subject_of(path) if self.by == "subjects" else clip_id
+
+    def another(self, names: Iterable[str]) -> str:
+        """Return the rule with the seed that gives every split some of these names, nearest to 80/5/15; empty
+        where there is none.
+        """
+        distinct, best = sorted(set(names)), (float(len(SPLITS)), "")
+        for seed in range(1, _SEEDS_TRIED if len(distinct) >= len(SPLITS) else 1):
+            counts = Counter(hash_split(name, seed) for name in distinct)
+            wanted = {"train": TRAIN_SHARE, "val": VAL_SHARE, "test": 1 - TRAIN_SHARE - VAL_SHARE}
+            far = sum(abs(counts[split] / len(distinct) - wanted[split]) for split in SPLITS)
+            if all(counts[split] for split in SPLITS) and far < best[0]:
+                best = far, f"{self.by}:{seed}"
+        return best[1]
 
 
 def _stem(path: str) -> str:

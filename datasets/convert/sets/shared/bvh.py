@@ -50,9 +50,9 @@ class BvhSetConfig(BvhConfig):
     def unfit(self, path: str) -> str:
         return "" if stem(path) in self.rows() else "not in the tables of the set"
 
-    def listing(self, paths: Sequence[str], readable: Sequence[str] | None = None) -> Listing:
+    def listing(self, paths: Sequence[str]) -> Listing:
         if self.captions is not None:
-            return super().listing(paths, readable)
+            return super().listing(paths)
         known, here = self.rows(), {stem(path): path for path in paths}
         rows = [
             CaptionRow(name, row.texts, here[name], hash_split(row.group), name)
