@@ -23,6 +23,9 @@ from motionloom.datasets.schema import Config, UserError
 
 Sampler = Literal["ddpm", "ddim", "dpm++"]
 
+_NOISE = 0.9
+"""Share of the training's steps at which motion is still as good as noise, so that drawing begins there."""
+
 
 class StepOutput(Protocol):
     """Result of a denoising step."""
@@ -41,7 +44,9 @@ class Scheduler(Protocol):
 
     def add_noise(self, original_samples: Tensor, noise: Tensor, timesteps: Tensor) -> Tensor: ...
 
-    def set_timesteps(self, num_inference_steps: int) -> None: ...
+    def set_timesteps(
+        self, num_inference_steps: int | None = None, *, timesteps: list[int] | None = None
+    ) -> None: ...
 
     def step(self, model_output: Tensor, timestep: Tensor, sample: Tensor, **more: object) -> StepOutput: ...
 
@@ -93,14 +98,28 @@ class ScheduleConfig(Config):
 
         return self._made(DDPMScheduler, clip_sample=False, steps_offset=offset)
 
+    def _ddim(self, offset: int) -> Scheduler:
+        from diffusers import DDIMScheduler
+
+        made: Any = self._made(DDIMScheduler, clip_sample=False, steps_offset=offset)
+        if not self.set_alpha_to_one:
+            made.final_alpha_cumprod = made.alphas_cumprod[0]
+        scheduler: Scheduler = made
+        return scheduler
+
+    def _solver(self, order: int) -> Scheduler:
+        from diffusers import DPMSolverMultistepScheduler
+
+        last = "zero" if order > 1 or self.set_alpha_to_one else "sigma_min"
+        how = {"algorithm_type": "dpmsolver++", "solver_order": order, "final_sigmas_type": last}
+        return self._made(DPMSolverMultistepScheduler, **how)
+
     def _made(self, kind: Any, **options: object) -> Scheduler:
         """A scheduler of diffusers with tables in float64."""
         made = kind(num_train_timesteps=self.steps, prediction_type=self.predicts, **options)
         made.betas = torch.from_numpy(self.beta_table())
         made.alphas = 1 - made.betas
         made.alphas_cumprod = made.alphas.cumprod(0)
-        if kind.__name__ == "DDIMScheduler" and not self.set_alpha_to_one:
-            made.final_alpha_cumprod = made.alphas_cumprod[0]
         scheduler: Scheduler = made
         return scheduler
 
@@ -110,20 +129,24 @@ class ScheduleConfig(Config):
             raise UserError(
                 f"{steps} denoising steps are more than the {self.steps} of this model's training; take fewer"
             )
-        # Where all steps of the training are taken there is no room for an offset.
-        offset = min(self.steps_offset, self.steps - 1 - (steps - 1) * (self.steps // steps))
-        made: Scheduler
-        if kind == "ddpm":
-            made = self._ddpm(offset)
-        elif kind == "ddim":
-            from diffusers import DDIMScheduler
-
-            made = self._made(DDIMScheduler, clip_sample=False, steps_offset=offset)
-        else:
-            from diffusers import DPMSolverMultistepScheduler
-
-            made = self._made(DPMSolverMultistepScheduler, algorithm_type="dpmsolver++")
-        made.set_timesteps(steps)
+        if kind == "dpm++":
+            made = self._solver(order=2)
+            made.set_timesteps(steps)
+            return made
+        # Equal strides as published, where they reach the noise that motion is drawn from. diffusers rounds a
+        # stride down otherwise, and begins as low as half of the training's noise.
+        stride = self.steps // steps
+        if self.steps % steps == 0 and self.steps - stride >= _NOISE * self.steps:
+            # Where all steps of the training are taken there is no room for an offset.
+            offset = min(self.steps_offset, stride - 1)
+            made = self._ddpm(offset) if kind == "ddpm" else self._ddim(offset)
+            made.set_timesteps(steps)
+            return made
+        # Strides that differ by one, from the last step down. DDIM takes equal ones only; it is the solver of
+        # first order (Lu et al. 2022, section 4.1).
+        trailing = np.round(self.steps * (1 - np.arange(steps) / steps)).astype(int) - 1
+        made = self._ddpm(0) if kind == "ddpm" else self._solver(order=1)
+        made.set_timesteps(timesteps=trailing.tolist())
         return made
 
     def denoise(
@@ -142,10 +165,9 @@ class ScheduleConfig(Config):
         """
         scheduler = self.sampler(kind, steps)
         x = x if skip else x * scheduler.init_noise_sigma
-        extra = {} if kind == "dpm++" else {"generator": noise}
         for step in scheduler.timesteps[skip:]:
             found = predict(scheduler.scale_model_input(x, step), step)
-            stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, **extra).prev_sample
+            stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, generator=noise).prev_sample
             x = stepped
         return x
 

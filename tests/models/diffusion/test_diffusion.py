@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener, TextDenoiser, TextDenoiserConfig
 from motionloom.models.diffusion.sampling import sample_motions
@@ -55,6 +58,45 @@ def test_a_shift_is_noise_so_many_times_as_strong(shift: float) -> None:
     noise = np.sqrt((1 - kept) / kept)[:-1]
     np.testing.assert_allclose(np.sqrt((1 - shifted) / shifted)[:-1], shift * noise, rtol=1e-9)
     assert (np.diff(shifted) < 0).all() and shifted[-1] >= 0
+
+
+@pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
+def test_any_number_of_steps_begins_in_noise(sampler: Sampler) -> None:
+    for total in (50, 1000):
+        for steps in {*range(1, total, 1 + total // 40), total // 3, total // 2 + 1, total - 1, total}:
+            taken = ScheduleConfig(steps=total).sampler(sampler, steps).timesteps.tolist()
+            assert len(taken) == steps and taken[0] >= 0.9 * total - 1, (total, steps, taken[0])
+            # The solver's own spacing may take a step twice where it takes all of them.
+            twice = sampler == "dpm++" and steps == total
+            assert all(0 <= later < sooner + twice for sooner, later in pairwise(taken)), (total, steps)
+
+
+@pytest.mark.parametrize("steps", [1, 7, 40, 334, 501, 600, 1000])
+@pytest.mark.parametrize("predicts", ["sample", "epsilon"])
+def test_ddim_of_any_number_of_steps_equals_its_formula(
+    steps: int, predicts: Literal["sample", "epsilon"]
+) -> None:
+    config = ScheduleConfig(betas="linear", predicts=predicts)
+    kept = np.cumprod(1 - config.beta_table())
+    taken = config.sampler("ddim", steps).timesteps.tolist()
+
+    def motion(x: Tensor, at: int) -> Tensor:
+        """Its mean, where motion has mean 2 and deviation 0.5."""
+        signal, noise = kept[at], 1 - kept[at]
+        return 2 + 0.25 * signal**0.5 / (0.25 * signal + noise) * (x - 2 * signal**0.5)
+
+    def predict(x: Tensor, step: Tensor) -> Tensor:
+        at = int(step)
+        found = motion(x, at)
+        return found if predicts == "sample" else (x - kept[at] ** 0.5 * found) / (1 - kept[at]) ** 0.5
+
+    x = torch.randn(3, 4, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    drawn = config.denoise(predict, x.clone(), [], "ddim", steps)
+    for at, following in zip(taken, [*taken[1:], -1], strict=True):
+        found, next_kept = motion(x, at), kept[following] if following >= 0 else 1.0
+        noise = (x - kept[at] ** 0.5 * found) / (1 - kept[at]) ** 0.5
+        x = next_kept**0.5 * found + (1 - next_kept) ** 0.5 * noise
+    assert torch.allclose(drawn, x, atol=2e-4)
 
 
 @pytest.mark.usefixtures("float64")
