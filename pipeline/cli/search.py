@@ -19,7 +19,8 @@ def search(
     root: Annotated[Path, typer.Argument(help="Folder with manifest.json.")],
     words: Annotated[str, typer.Argument(help="What the person does.")] = "",
     like: Annotated[
-        str, typer.Option(help="A clip's id, or a file (.npz of generate, .npy): clips like it.")
+        str,
+        typer.Option(help="A clip's id, or a file (.bvh; .npz or .glb of generate; .npy): clips like it."),
     ] = "",
     model: Annotated[
         str, typer.Option(help="Run, export or shipped model whose TMA reads words and motions.")
@@ -44,7 +45,7 @@ def search(
     if words:
         query = found.words(words)
     elif file.is_file():
-        query = found.motion(*found.motion_file(file.read_bytes(), like))
+        query = found.motion_file(file)
     else:
         query = found.clip(like)
     hits = []

@@ -7,8 +7,6 @@ encoder that the TMA was trained with reads the text; nothing is fetched.
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,7 +18,6 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file, sha256_of, sha256_of_json
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.check.clip import require_sensible
 from motionloom.datasets.check.faults import Fault
 from motionloom.datasets.check.suspects import Place, Splits, floored_joints, open_splits
 from motionloom.datasets.motion.canonical import canonicalize, resample
@@ -32,8 +29,10 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError
 from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tar import npy_from_bytes
+from motionloom.pipeline.contract.editing import RecordedClip
 from motionloom.pipeline.contract.lookup import finished_stages, open_exported
 from motionloom.pipeline.contract.stage import ALIGNMENT, StageCache
+from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.networks import LoadedTma, embed_motions
@@ -139,27 +138,20 @@ class Search:
         features, present = features_for(self.tma, joints, fps)
         return np.asarray(embed_motions(self.tma, [features], [present])[0])
 
-    def motion_file(self, raw: bytes, where: str) -> tuple[NDArray[np.float64], float]:
-        """Joints [T, 22 or 52, 3] and frame rate of a file: the .npz of `generate`, or an .npy of joints or
-        of the set's columns [T, D], at the set's frame rate.
+    def motion_file(self, path: Path) -> Vectors:
+        """The embedding [Z] of a clip's file (`read_clip`), or of an .npy of joints or of the set's columns
+        [T, D], at the set's frame rate.
         """
-        layout, fps = next(iter(self.splits.values())).layout, None
-        if raw.startswith(b"PK"):
-            with NpzFile(io.BytesIO(raw), where) as stored:
-                values = stored.numbers("joints")
-                if "metadata" in stored.names:
-                    fps = _stated_fps(str(stored.array("metadata")), where)
+        if path.suffix.lower() != ".npy":
+            clip = read_clip(path)
         else:
-            values = npy_from_bytes(raw, where).astype(np.float64)
-        if values.ndim == 2:
-            values = joints_of(values, layout)
-        if values.ndim != 3 or values.shape[1] not in (22, 52) or values.shape[2] != 3 or len(values) < 4:
-            raise UserError(f"{where}: {list(values.shape)}, wanted joints [T >= 4, 22 or 52, 3]")
-        try:
-            require_sensible("joints", values.reshape(len(values), -1))
-        except ValueError as error:
-            raise UserError(f"{where}: {error}") from None
-        return values, fps or layout.fps
+            layout = next(iter(self.splits.values())).layout
+            values = npy_from_bytes(path.read_bytes(), str(path)).astype(np.float64)
+            joints = joints_of(values, layout) if values.ndim == 2 else values
+            if joints.ndim != 3 or joints.shape[1] not in (BODY_JOINTS, 52) or joints.shape[2] != 3:
+                raise UserError(f"{path}: {list(joints.shape)}, wanted joints [T, 22 or 52, 3]")
+            clip = require_clip(RecordedClip(str(path), joints, layout.fps))
+        return self.motion(clip.joints, clip.fps)
 
     def best(self, query: Vectors, count: int = 12, without: str = "") -> list[Hit]:
         """The clips nearest to an embedding [Z], the best first, except the one with the id `without`."""
@@ -206,16 +198,6 @@ def features_for(tma: LoadedTma, joints: NDArray[np.floating], fps: float) -> tu
         joints = np.concatenate([joints, np.repeat(joints[:, _WRISTS], fingers, axis=1)], axis=1)
     joints = canonicalize(resample(joints[:, : layout.num_joints], fps, layout.fps))
     return encode(joints, layout.without_face()), present
-
-
-def _stated_fps(metadata: str, where: str) -> float:
-    try:
-        fps = float(json.loads(metadata)["fps"])
-    except (ValueError, KeyError, TypeError, RecursionError):
-        fps = 0.0
-    if not 1 <= fps <= 1000:
-        raise UserError(f"{where}: its metadata states no frame rate of 1 to 1000; write it by generate")
-    return fps
 
 
 def _embedded(splits: Splits, places: Sequence[Place], tma: LoadedTma, progress: bool) -> Iterator[Vectors]:
