@@ -138,7 +138,7 @@ FLOORS = {
     "launch",
     "models": "utt diffusion gpt tokenizer pretrained tma evaluator quantize discriminator "
     "condition metrics training layers",
-    "datasets": "check synth actions loading convert shards modalities text motion audio base",
+    "datasets": "check convert synth actions loading shards modalities text motion audio base",
 }
 """The rooms of each folder, from the top floor to the ground: a room imports from those after it."""
 
@@ -169,7 +169,7 @@ def top_of(room: str) -> str:
 
 READERS = {
     "synth": "pipeline/cli/data pipeline/stages/data pipeline/baselines/beats pipeline/evaluation "
-    "pipeline/inference/checks",
+    "pipeline/inference/checks datasets/convert/aistpp",
     "actions": "datasets/synth pipeline/stages/data pipeline/evaluation pipeline/inference/checks",
 }
 """Who may import the synthetic source, and the rules on joints that know its actions."""

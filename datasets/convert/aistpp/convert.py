@@ -1,7 +1,8 @@
 """AIST++ -> shards: SMPL dances at 60 fps with their music (UDE section 4.1).
 
 `motions/SEQUENCE.pkl` are the annotations, `splits/crossmodal_{train,val,test}.txt` and `ignore_list.txt` the
-lists, `wavs/` the music: `SEQUENCE.wav`, or `MUSIC.wav` for every dance to a piece. Metres are smpl_trans /
+lists, `wavs/` the music: `SEQUENCE.wav`, or `MUSIC.wav` for every dance to a piece; `music=band` plays other
+music in its place. Metres are smpl_trans /
 smpl_scaling. The floor of the source is anywhere: like every other source, a clip is moved to the canonical
 place (floor 0, first root above the origin, first heading +Z).
 """
@@ -16,16 +17,28 @@ from typing import Literal
 
 import numpy as np
 
+from motionloom.datasets.convert.aistpp.accompaniment import song_for, tempo_of
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import read_ids
-from motionloom.datasets.convert.sets.shared.body import SOUND_SUFFIXES, BodyConfig, BodyRelease
+from motionloom.datasets.convert.sets.shared.body import (
+    SOUND_SUFFIXES,
+    BodyConfig,
+    BodyRelease,
+    analyse,
+    cut_of,
+)
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.synth.music.band import band_version
+from motionloom.datasets.synth.music.recording import render_song
 
 FPS = 60.0
 MOTIONS = "motions"
+BAND_RATE = 32_000
+"""Hz at which the band is recorded; one that every codec of its recordings knows."""
 MOTION_LICENCE = "CC-BY-4.0"
 MUSIC_LICENCE = "CC-BY-4.0 AND LicenseRef-AIST-Dance-DB"
 """Annotations: CC BY 4.0. Music: the terms of use of the AIST Dance Video Database, which no converter can
@@ -54,6 +67,7 @@ class AistppConfig(BodyConfig):
     """Options of the AIST++ converter; `source` is the folder of the annotations, with motions/ in it."""
 
     layouts = ("body133", "h3d263", "smpl75")
+    everyday = ("music",)
 
     name: str = "aistpp"
     layout: str = "body133"
@@ -62,6 +76,9 @@ class AistppConfig(BodyConfig):
     """Folder of crossmodal_train.txt, _val.txt and _test.txt; default: splits/ in the source."""
     sound: Literal["optional", "require", "none"] = "require"
     """Whether a sequence needs its music; `none` converts the motion alone."""
+    music: Literal["release", "band"] = "release"
+    """`band` plays music of ours at the tempo and phase of each dance in place of AIST's, which may not be
+    passed on: clips are then under CC BY 4.0 alone. Needs FluidSynth (`pip install 'motionloom[band]'`)."""
     music_folder: Path | None = None
     """Folder of `<sequence>.wav` or `<music>.wav` (also flac, mp3, ogg); default: wavs/ in the source."""
     caption_genre: bool = False
@@ -69,8 +86,14 @@ class AistppConfig(BodyConfig):
 
     @property
     def stores_music(self) -> bool:
-        """Whether shards hold sound, or features of it."""
-        return self.sound != "none" and (self.audio_features or self.sound_rate > 0)
+        """Whether shards hold AIST's songs, or features of them."""
+        heard = self.sound != "none" and (self.audio_features or self.sound_rate > 0)
+        return heard and self.music == "release"
+
+    @property
+    def has_band(self) -> bool:
+        """Whether a band plays to the dances."""
+        return self.sound != "none" and self.music == "band"
 
 
 class Aistpp(BodyRelease[AistppConfig]):
@@ -105,6 +128,12 @@ class Aistpp(BodyRelease[AistppConfig]):
             except UserError as error:
                 draft.fail(f"{MOTIONS}/{name}.pkl", error)
                 continue
+            problem = "on the ignore list" if name in self.ignored else ""
+            if self.config.has_band:
+                try:
+                    tempo_of(facts["music"])
+                except UserError as error:
+                    problem = problem or str(error)
             genre = GENRES.get(facts["genre"], f"{facts['genre']} dance")
             caption = Caption(text=f"a dancer performs {genre}", source="genre")
             # By music: pieces are shared by many dances, and one in two splits would leak.
@@ -112,7 +141,7 @@ class Aistpp(BodyRelease[AistppConfig]):
                 name, f"{MOTIONS}/{name}.pkl", (caption,) if self.config.caption_genre else (),
                 group=facts["music"], facts=dict(facts),
                 sound=music.get(name) or music.get(facts["music"]),
-                problem="on the ignore list" if name in self.ignored else "",
+                problem=problem,
             )  # fmt: skip
 
     def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
@@ -131,7 +160,7 @@ class Aistpp(BodyRelease[AistppConfig]):
     def _music(self) -> dict[str, str]:
         """Music files by name without suffix, with their folder."""
         folder, sound = self.sound_folder, self.config.sound
-        if sound == "none":
+        if sound == "none" or self.config.has_band:
             return {}
         if not folder.is_dir():
             if sound == "require" or self.config.music_folder is not None:
@@ -143,6 +172,9 @@ class Aistpp(BodyRelease[AistppConfig]):
         return {path.stem: path.name for path in reversed(files) if path.name[0] != "."}
 
     def with_sound(self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
+        if self.config.has_band:
+            yield from entries
+            return
         for entry in super().with_sound(entries, draft):
             both = entry.sound is not None and self.config.stores_music
             yield replace(entry, licence=MUSIC_LICENCE if both else None)
@@ -154,7 +186,24 @@ class Aistpp(BodyRelease[AistppConfig]):
         return str(clip.entry.facts["genre"])
 
     def song(self, clip: ReleaseClip) -> str:
-        return str(clip.entry.facts["music"])
+        return clip.id if self.config.has_band else str(clip.entry.facts["music"])
+
+    def options(self) -> dict[str, object]:
+        return super().options() | ({"band": band_version()} if self.config.has_band else {})
+
+    def convert(self, clip: ReleaseClip) -> Sample:
+        sample, config = super().convert(clip), self.config
+        if not config.has_band:
+            return sample
+        facts = clip.entry.facts
+        joints = self.posed(self.read(clip))
+        song = song_for(clip.id, str(facts["genre"]), str(facts["music"]), joints, clip.fps)
+        sound = render_song.__wrapped__(song, BAND_RATE)
+        piece = analyse(sound, BAND_RATE, config.audio_settings(), config.fps, config.sound_rate)
+        audio, wav = cut_of(config, piece, 0.0, len(sample.motion) / config.fps)
+        # What plays is known, and need not be heard again by a beat tracker.
+        truth = {"bpm": song.bpm, "first_beat": song.first}
+        return replace(sample, meta=sample.meta.model_copy(update={"truth": truth}), audio=audio, wav=wav)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return len(read_aist_motion(path, label).poses), FPS

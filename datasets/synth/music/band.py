@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.song import Section, Song
 
@@ -50,17 +51,10 @@ class Instruments:
     """Sixteen players, dry and at the rate of the samples."""
 
     def __init__(self, rate: int) -> None:
-        try:
-            import fluidsynth
-        except ImportError as error:  # the binding, or the library that it binds
-            raise UserError(
-                f"songs of `music: played` need FluidSynth ({error}); pip install 'motionloom[band]' and the "
-                f"library (Debian: apt install libfluidsynth3)"
-            ) from None
-        font = sound_font()
+        engine, font = _fluidsynth(), sound_font()
         dry = {"synth.reverb.active": 0, "synth.chorus.active": 0}
         self.rate = rate
-        self.synth: Any = fluidsynth.Synth(gain=0.5, samplerate=rate, channels=16, **dry)
+        self.synth: Any = engine.Synth(gain=0.5, samplerate=rate, channels=16, **dry)
         self._font = self.synth.sfload(str(font))
 
     def select(self, channel: int, program: int) -> None:
@@ -88,12 +82,30 @@ class Instruments:
         return np.asarray(sound / max(1.0, float(np.abs(sound).max())), dtype=np.float32)
 
 
+def band_version() -> str:
+    """Return the checksum of the sound font; `UserError` where no band can play."""
+    _fluidsynth()
+    return sha256_of(sound_font())
+
+
+def _fluidsynth() -> Any:
+    """Return the binding of FluidSynth; `UserError` where it or the library that it binds is missing."""
+    try:
+        import fluidsynth
+    except ImportError as error:
+        raise UserError(
+            f"songs that a band plays need FluidSynth ({error}); pip install 'motionloom[band]' and the "
+            f"library (Debian: apt install libfluidsynth3)"
+        ) from None
+    return fluidsynth
+
+
 def sound_font() -> Path:
     """The file; `UserError` where there is none."""
     path = Path(os.environ.get("MOTIONLOOM_SOUND_FONT", SOUND_FONT))
     if not path.is_file():
         raise UserError(
-            f"{path}: no such sound font, which songs of `music: played` need; install one (Debian: "
+            f"{path}: no such sound font, which songs that a band plays need; install one (Debian: "
             f"apt install fluid-soundfont-gm libfluidsynth3) or name it in MOTIONLOOM_SOUND_FONT"
         )
     return path
@@ -130,8 +142,9 @@ class LineUp:
 
     @staticmethod
     def drawn(song: Song, rng: np.random.Generator) -> LineUp:
-        """For a genre of sways fewer drums and more pads."""
+        """For a genre of sways fewer drums and more pads; to recorded motion all drums, on even beats."""
         calm = song.style.style == "sway"
+        danced = song.first is not None
         kits = ("full", "sparse", "hats", "kick", "hands", "none")
         kit = str(
             rng.choice(
@@ -141,9 +154,9 @@ class LineUp:
         feel = str(rng.choice(("even", "half", "double", "syncopated"), p=(0.55, 0.15, 0.1, 0.2)))
         bare = kit in ("none", "hats")
         return LineUp(
-            kit,
-            feel,
-            swing=float(rng.uniform(0.1, 0.33)) if rng.random() < 0.2 else 0.0,
+            "full" if danced else kit,
+            "even" if danced else feel,
+            swing=0.0 if danced else float(rng.uniform(0.1, 0.33)) if rng.random() < 0.2 else 0.0,
             programs={part: int(rng.choice(list(choices))) for part, choices in _PROGRAMS.items()},
             with_bass=rng.random() < 0.9 or bare,
             with_chords=rng.random() < 0.9 or bare,

@@ -53,6 +53,9 @@ class Song:
     seconds: float
     played: bool = False
     """A band's song rather than an even one."""
+    first: float | None = None
+    """Seconds to the first beat of a played song that goes with recorded motion: four beats a bar, one tempo,
+    no intro and no breaks. None: all of these are drawn."""
 
     @property
     def beat(self) -> float:
@@ -67,7 +70,7 @@ class Song:
     @cached_property
     def meter(self) -> int:
         """Beats of a bar."""
-        return 3 if self.played and self._drawn(1).random() < 0.12 else BEATS
+        return 3 if self.played and self.first is None and self._drawn(1).random() < 0.12 else BEATS
 
     @cached_property
     def form(self) -> tuple[Section, ...]:
@@ -76,12 +79,14 @@ class Song:
             return (Section(SECTION_BARS, 0, _EVEN_ENERGY), Section(SECTION_BARS, 1, _EVEN_ENERGY))
         rng = self._drawn(2)
         bars = int(np.ceil(self.seconds / (self.beat * self.meter))) + 2
-        out = [Section(int(rng.integers(0, 5)), 0, float(rng.uniform(0.2, 0.5)))]
+        out = (
+            [Section(int(rng.integers(0, 5)), 0, float(rng.uniform(0.2, 0.5)))] if self.first is None else []
+        )
         kind = int(rng.integers(2))
         while sum(section.bars for section in out) < bars:
             energy = rng.uniform(0.4, 0.7) if kind == 0 else rng.uniform(0.7, 1.0)
             out.append(Section(int(rng.choice([2, 4, 4, 8])), kind, float(energy)))
-            if rng.random() < 0.3:
+            if self.first is None and rng.random() < 0.3:
                 out.append(Section(int(rng.integers(1, 3)), kind, 0.0))
             kind = 1 - kind if rng.random() < 0.75 else kind
         return tuple(section for section in out if section.bars)
@@ -92,6 +97,8 @@ class Song:
         numbers = np.arange(-_BEFORE, int(self.seconds / self.beat) + 3 * _BEFORE)
         if not self.played:
             return np.asarray(numbers * self.beat), numbers.astype(np.float64)
+        if self.first is not None:
+            return np.asarray(self.first + numbers * self.beat), numbers.astype(np.float64)
         rng = self._drawn(3)
         steps = np.full(len(numbers), self.beat)
         if rng.random() < 0.5:  # a band without a click: its tempo wanders by some percent within some bars

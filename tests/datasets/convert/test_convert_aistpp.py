@@ -7,13 +7,24 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import librosa
 import numpy as np
 import pytest
 import soundfile
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features
 from motionloom.datasets.check.dataset import check
-from motionloom.datasets.convert.aistpp.convert import MUSIC_LICENCE, AistppConfig
+from motionloom.datasets.convert.aistpp.accompaniment import (
+    BAND_GENRES,
+    kinematic_beats,
+    phase_of,
+    song_for,
+    tempo_of,
+)
+from motionloom.datasets.convert.aistpp.convert import GENRES as AIST_GENRES
+from motionloom.datasets.convert.aistpp.convert import MOTION_LICENCE, MUSIC_LICENCE, AistppConfig
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import prepare
@@ -22,8 +33,10 @@ from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Manifest
+from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.synth.music.band import band_version
+from motionloom.datasets.synth.music.genres import GENRES as SONG_GENRES
 
 REAL = "gBR_sBM_cAll_d04_mBR0_ch01"
 IGNORED = "gBR_sBM_cAll_d04_mBR0_ch08"
@@ -224,3 +237,68 @@ def test_lengths_that_differ_are_cut_or_left_out(copy: Path) -> None:
     soundfile.write(copy / f"wavs/{REAL}.wav", music[: round(10.9 * rate)], rate)  # its own comes first
     plan = prepare(AistppConfig(source=copy)).plan
     assert any("12.00 s" in d.reason and "10.90 s" in d.reason for d in plan.dropped)
+
+
+# ---- music of our own
+
+
+def test_a_band_plays_at_the_tempo_and_phase_of_the_dance(fixture: Path, tmp_path: Path) -> None:
+    """The genuine dance: librosa hears its tempo in what plays, and beats where it stops; CC BY 4.0 alone."""
+    try:
+        band_version()
+    except UserError as error:
+        pytest.skip(str(error))
+    config = AistppConfig(source=fixture, music="band", sound_rate=32_000)
+    shards = [convert(config, tmp_path / name) for name in ("one", "two")]
+    assert [s.sha256 for s in shards[0].shards] == [s.sha256 for s in shards[1].shards]
+    assert shards[0].licence == MOTION_LICENCE
+    assert {d.source: "mHO9" in d.reason for d in shards[0].dropped}[f"motions/{TEST}.pkl"], "no such piece"
+    reader, i = clip_of(tmp_path / "one", "train", REAL)
+    meta, audio, wav = reader.meta(i), reader.array(i, "audio.npy"), reader.wav(i)
+    assert audio is not None and wav is not None and meta.truth is not None
+    assert (meta.licence, meta.song, len(audio)) == (MOTION_LICENCE, REAL, meta.frames)
+    assert len(wav[0]) == 12 * wav[1]
+    # 80 beats a minute; librosa may hear twice as many, and hears each some 25 ms late.
+    _, heard = librosa.beat.beat_track(y=wav[0], sr=wav[1], units="time", hop_length=256)
+    period = np.median(np.diff(heard))
+    times = round(0.75 / period)
+    assert meta.truth["bpm"] == 80 and times in (1, 2) and times * period == pytest.approx(0.75, rel=0.02)
+    late = (heard - meta.truth["first_beat"] + period / 2) % period - period / 2
+    assert 0.0 < np.median(late) < 0.05
+    # The dance at 80 a minute, and at no other of AIST's tempi.
+    beats, weights = kinematic_beats(real_joints(fixture, BodyModel.neutral("smpl22")), 60.0)
+    assert phase_of(beats, weights, 0.75) == meta.truth["first_beat"]
+
+    def met(bpm: int) -> float:
+        first = phase_of(beats, weights, 60 / bpm)
+        away = (beats - first + 30 / bpm) % (60 / bpm) - 30 / bpm
+        return float(np.mean(np.abs(away) < 0.05))
+
+    assert max(map(met, range(80, 140, 5)), key=float) == met(80) > 0.8
+
+
+@given(
+    bpm=st.integers(80, 135), phase=st.floats(0, 1, exclude_max=True), seed=st.integers(0, 10**6),
+    fps=st.sampled_from([30.0, 60.0]),
+)  # fmt: skip
+@settings(max_examples=40, deadline=None)
+def test_planted_beats_are_found_to_one_frame(bpm: int, phase: float, seed: int, fps: float) -> None:
+    """A dance that stops on each beat, to which it adds stops elsewhere, halts and trembling."""
+    rng = np.random.default_rng(seed)
+    period, t = 60 / bpm, np.arange(round(12 * fps)) / fps
+    speed = np.abs(np.sin(np.pi * (t / period - phase)))
+    for at in rng.uniform(0, 12, 4):
+        speed *= 1 - 0.9 * np.exp(-((t - at) ** 2) / (2 * 0.05**2))
+    speed = speed + 0.05 * rng.random(len(t))
+    joints = np.cumsum(speed)[:, None, None] / fps * rng.standard_normal((1, 22, 3))
+    found = phase_of(*kinematic_beats(joints, fps), period)
+    away = (found - phase * period + period / 2) % period - period / 2
+    assert abs(away) <= 1 / fps
+
+
+def test_tempi_of_the_pieces() -> None:
+    assert [tempo_of(f"mBR{n}") for n in range(6)] == [80, 90, 100, 110, 120, 130]
+    assert [tempo_of(f"mHO{n}") for n in range(6)] == [110, 115, 120, 125, 130, 135]
+    assert set(BAND_GENRES) == set(AIST_GENRES) and set(BAND_GENRES.values()) <= set(SONG_GENRES)
+    still = np.zeros((60, 22, 3))
+    assert song_for(REAL, "BR", "mBR0", still, 60.0).first == 0.0

@@ -202,20 +202,27 @@ class BodyRelease(Release[Cfg]):
         if clip.entry.sound is not None:
             seconds = len(motion) / layout.fps
             start = clip.first / clip.fps
-            rows, wav = cut_of(self.config, self.sound_folder, clip.entry.sound, start, seconds)
+            config = self.config
+            piece = piece_of_music(
+                self.sound_folder, clip.entry.sound, config.audio_settings(), config.fps, config.sound_rate
+            )
+            rows, wav = cut_of(config, piece, start, seconds)
         meta = meta.model_copy(update={"song": self.song(clip)})
         return Sample(meta, motion, texts=list(clip.entry.texts), audio=rows, wav=wav)
 
 
+Piece = tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]
+"""Audio features of a whole piece, a row for each frame of the shards, and its samples; None: not kept."""
+
+
 def cut_of(
-    config: BodyConfig, folder: Path, sound: str, start: float, seconds: float
+    config: BodyConfig, piece: Piece, start: float, seconds: float
 ) -> tuple[NDArray[np.float32] | None, Wav | None]:
     """The part of a piece from second `start` on that is `seconds` long.
 
     Audio features [T, 438], a row for each frame of the motion, and the sound itself.
     """
-    settings = config.audio_settings()
-    features, samples = piece_of_music(folder, sound, settings, config.fps, config.sound_rate)
+    features, samples = piece
     rows: NDArray[np.float32] | None = None
     if features is not None:
         first, count = round(start * config.fps), max(1, round(seconds * config.fps))
@@ -228,14 +235,18 @@ def cut_of(
 
 
 @lru_cache(maxsize=_KEPT_PIECES)
-def piece_of_music(
-    folder: Path, sound: str, settings: AudioSettings | None, fps: float, rate: int
-) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+def piece_of_music(folder: Path, sound: str, settings: AudioSettings | None, fps: float, rate: int) -> Piece:
     """Features of a whole music file at `fps` (where settings are given), samples at `rate` (unless 0)."""
     if settings is None and not rate:
         return None, None
     label = f"{folder.name}/{sound}"
-    samples, found = read_sound(inside(folder, sound, label), label)
+    return analyse(*read_sound(inside(folder, sound, label), label), settings, fps, rate)
+
+
+def analyse(
+    samples: NDArray[np.float32], found: int, settings: AudioSettings | None, fps: float, rate: int
+) -> Piece:
+    """The same of samples [S], `found` a second."""
     features = None
     if settings is not None:
         analysed = audio_features(samples, found, settings)
