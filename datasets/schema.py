@@ -9,14 +9,23 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import stat
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, SerializerFunctionWrapHandler, ValidationError, model_serializer
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    PlainSerializer,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+)
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 
 HANDS, FACE = 1, 2
 """Bits of what a clip has beside its body."""
@@ -42,6 +51,16 @@ def nearest(name: str, valid: Sequence[str], shown: Sequence[str] | None = None,
     near = difflib.get_close_matches(name, valid, n=1, cutoff=0.5)
     names = valid if shown is None else shown
     return f"; did you mean '{near[0]}'?" if near else f"; valid {what}: {', '.join(names)}"
+
+
+def require_local(path: Path) -> None:
+    """Refuse a URL where a path is wanted: as a path, `s3://bucket/x` is a folder named `s3:`."""
+    if found := re.match(r"([A-Za-z][A-Za-z0-9+.-]+):/", str(path)):
+        raise UserError(
+            f"{found[1]}://{str(path)[found.end() :].lstrip('/')}: no URL is read or written here, only this "
+            f"machine's files; `motionloom data copy` carries data sets there and back, and stages of kind "
+            f"`shards` read them there"
+        )
 
 
 MOST_JSON_BYTES = 2**28
@@ -78,9 +97,18 @@ class Config(BaseModel):
     def parse(cls, data: Any, where: str) -> Self:
         """Validate `data`; a `UserError` names `where` (a file or a dotted key) and the nearest name."""
         try:
-            return cls.model_validate(data)
+            made = cls.model_validate(data)
         except ValidationError as error:
             raise UserError(explain(error, cls, where)) from None
+        made._require_local_paths()
+        return made
+
+    def _require_local_paths(self) -> None:
+        for value in self.__dict__.values():
+            if isinstance(value, Path):
+                require_local(value)
+            elif isinstance(value, Config):
+                value._require_local_paths()
 
     @classmethod
     def load_json(cls, path: Path) -> Self:
@@ -136,14 +164,40 @@ def _model_in(annotation: Any) -> type[BaseModel] | None:
     return found.pop() if len(found) == 1 else None
 
 
+# Readers that infer columns from the first rows (Arrow, so Hugging Face `datasets`) refuse a field that is
+# null or of other keys there and filled later: what a clip does not have is stored as a value of its type.
+_Text = Annotated[
+    str | None, BeforeValidator(lambda text: text or None), PlainSerializer(lambda text: text or "")
+]
+"""None is stored as empty text."""
+_End = Annotated[
+    float | None,
+    BeforeValidator(lambda end: None if end == -1 else end),
+    PlainSerializer(lambda end: -1.0 if end is None else end),
+]
+"""None is stored as -1."""
+_Tokens = Annotated[
+    list[str] | None,
+    BeforeValidator(lambda tokens: (tokens.split() if isinstance(tokens, str) else tokens) or None),
+    PlainSerializer(lambda tokens: " ".join(tokens or ())),
+]
+"""Stored as one text with spaces between, as HumanML3D has them; None is empty text."""
+_Record = Annotated[
+    dict[str, Any] | None,
+    BeforeValidator(lambda record: parse_json(record or "null", "truth") if type(record) is str else record),
+    PlainSerializer(lambda record: "" if record is None else json.dumps(record, allow_nan=False)),
+]
+"""Stored as JSON text, since the keys of one clip are not another's; None is empty text."""
+
+
 class Caption(Config):
     """One caption of a clip. `start`/`end` are seconds; `end` None means to the end of the clip."""
 
     text: str
     start: float = 0.0
-    end: float | None = None
+    end: _End = None
     source: str = ""
-    tokens: list[str] | None = None
+    tokens: _Tokens = None
     """`word/POS` tags where the source brings them (HumanML3D)."""
 
 
@@ -164,16 +218,11 @@ class ClipMeta(Config):
     licence: str
     has_hands: bool = True
     has_face: bool = True
-    mirror_of: str | None = None
-    truth: dict[str, Any] | None = None
+    mirror_of: _Text = None
+    truth: _Record = None
     """True content of a synthetic clip (action, direction, side, count, hand, face)."""
-    song: str | None = None
+    song: _Text = None
     """The piece of music of a recorded dance, by the source's name; several clips may have one."""
-
-    @model_serializer(mode="wrap")
-    def _without_no_song(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Clips without music are written as they always were."""
-        return {name: value for name, value in handler(self).items() if name != "song" or value is not None}
 
     @property
     def present(self) -> int:

@@ -10,7 +10,7 @@ import urllib.request
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, require_local
 
 _HUB = re.compile(r"[A-Za-z0-9][\w.-]*(/[A-Za-z0-9][\w.-]*)?")
 _ENDPOINT = "https://huggingface.co"
@@ -18,7 +18,8 @@ _SHOWN = 5
 
 
 def no_such_folder(folder: Path) -> str:
-    """One sentence about a folder that is not there, with the nearest names that are."""
+    """One sentence about a folder that is not there, with the nearest names that are. Raises for a URL."""
+    require_local(folder)
     place, name = folder, folder.name
     while not place.is_dir() and place != place.parent:
         place, name = place.parent, place.name

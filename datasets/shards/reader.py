@@ -72,7 +72,8 @@ def read_manifest(store: Store, digest: str | None = None) -> tuple[Manifest, st
     manifest = Manifest.parse(parse_json(raw, where), where)
     if manifest.schema_version != SCHEMA_VERSION:
         raise UserError(
-            f"{where}: schema version {manifest.schema_version}, not {SCHEMA_VERSION}; convert again"
+            f"{where}: schema version {manifest.schema_version}, not {SCHEMA_VERSION}: of another release; "
+            f"give the command that made it again (this folder will do)"
         )
     for shard in manifest.shards:
         if not _SHARD_NAME.fullmatch(shard.name) or f"-{shard.split}-" not in shard.name:
@@ -280,10 +281,8 @@ class ShardDataset:
         return self._place(self._row(i), member)
 
     def _place(self, row: int, member: str) -> str:
-        shard = self._shard_of(row)
-        name = self._shards[shard].name
-        number = name.removesuffix(".tar").rpartition("-")[2]
-        return f"{self._store.where(name)}: '{number}-{row - self._first[shard]:06d}.{member}'"
+        name = self._shards[self._shard_of(row)].name
+        return f"{self._store.where(name)}: clip '{self._index.id(row)}': {member}"
 
     def _check_motion_sizes(self) -> None:
         """Every motion fills its member exactly, so no later read can leave the file or mix two clips."""

@@ -1,4 +1,4 @@
-"""Stores of a data set's files: a folder, a web server or an S3 bucket, behind one interface.
+"""Stores of a data set's files: a folder, a web server, an S3 bucket or a data set on the hub, alike.
 
 Only the schemes of `SCHEMES` are opened, and the check comes before anything else: no `pipe:`, no chained or
 shell URL ever reaches a library. Requests go through fsspec and are repeated by `persist`. Credentials
@@ -22,7 +22,7 @@ from urllib.parse import unquote, urlsplit
 from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError, read_plain
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 
-SCHEMES = ("file", "http", "https", "s3")
+SCHEMES = ("file", "http", "https", "s3", "hf")
 
 _CONNECT_SECONDS, _READ_SECONDS = 15, 60
 
@@ -90,6 +90,12 @@ class LocalStore:
         """A whole shard, buffered, from its beginning."""
         return self._open(shard.name)
 
+    def system(self) -> Any:
+        """The fsspec file system that `where` names files of."""
+        import fsspec
+
+        return fsspec.filesystem("file", auto_mkdir=True)
+
     def _open(self, name: str) -> BinaryIO:
         try:
             if (self.root / name).exists() and not (self.root / name).is_file():  # a pipe would be waited for
@@ -121,7 +127,7 @@ class RemoteStore:
                 with cached:
                     return cached.read()
         where = self.where(MANIFEST_FILE)
-        raw = _as_before(persist(where, lambda: self._system().cat_file(where), first=True), digest, where)
+        raw = _as_before(persist(where, lambda: self.system().cat_file(where), first=True), digest, where)
         name = f"{hashlib.sha256(raw).hexdigest()}.manifest.json"
         self.cache.get(name, len(raw), lambda path: path.write_bytes(raw)).close()
         return raw
@@ -131,7 +137,7 @@ class RemoteStore:
         url = self.where(INDEX_FILE)
 
         def fetch(path: Path) -> None:
-            persist(url, lambda: self._system().get_file(url, str(path)))
+            persist(url, lambda: self.system().get_file(url, str(path)))
 
         return self.cache.get(f"{digest}.index.npz", 0, fetch)
 
@@ -143,7 +149,7 @@ class RemoteStore:
         url = self.where(shard.name)
 
         def fetch() -> None:
-            self._system().get_file(url, str(path))
+            self.system().get_file(url, str(path))
             size = path.stat().st_size
             if size != shard.bytes:
                 raise OSError(f"{size} bytes, the manifest says {shard.bytes}: truncated or changed")
@@ -153,8 +159,8 @@ class RemoteStore:
 
         persist(url, fetch)
 
-    def _system(self) -> Any:
-        settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith("AWS_")))
+    def system(self) -> Any:
+        settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith(("AWS_", "HF_"))))
         return _connect(cast(str, _scheme(self.place)), os.getpid(), settings)
 
 
@@ -169,7 +175,7 @@ def _connect(scheme: str, pid: int, settings: tuple[tuple[str, str], ...]) -> An
     Its own retries are off: `persist` is the only one that repeats.
     """
     try:
-        import fsspec  # type: ignore[import-untyped]
+        import fsspec
 
         if scheme == "s3":
             import s3fs  # type: ignore[import-untyped]  # noqa: F401 (a missing one is reported by name)
@@ -187,6 +193,8 @@ def _connect(scheme: str, pid: int, settings: tuple[tuple[str, str], ...]) -> An
             )
             system.retries = 1
             return system
+        if scheme == "hf":  # the library repeats what may pass, and knows for how long the hub asks to wait
+            return fsspec.filesystem("hf", skip_instance_cache=True)
         import aiohttp
 
         timeout = aiohttp.ClientTimeout(total=None, connect=_CONNECT_SECONDS, sock_read=_READ_SECONDS)
@@ -207,7 +215,7 @@ ATTEMPTS = 8
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 15.0
 """Seconds between tries: doubled each time, at random between half and whole."""
 
-_LIBRARIES = {"aiohttp", "aiobotocore", "botocore", "fsspec", "s3fs", "urllib3"}
+_LIBRARIES = {"aiohttp", "aiobotocore", "botocore", "fsspec", "huggingface_hub", "s3fs", "urllib3"}
 _ABSENT = "no such file on the server"
 
 T = TypeVar("T")
@@ -258,7 +266,7 @@ def _refusal(error: Exception) -> str | None:
     if isinstance(error, PermissionError) or status in (401, 403):
         return (
             "the server refuses access; set the credentials in the environment (AWS_ACCESS_KEY_ID and "
-            "AWS_SECRET_ACCESS_KEY, or AWS_PROFILE) and check that they may read here"
+            "AWS_SECRET_ACCESS_KEY, or AWS_PROFILE; HF_TOKEN) and check that they may read here"
         )
     if "Credentials" in type(error).__name__ or type(error).__name__ in (
         "ProfileNotFound",
@@ -287,6 +295,8 @@ def _status(error: BaseException | None) -> int | None:
         response = getattr(error, "response", None)
         if isinstance(response, dict):
             status = response.get("ResponseMetadata", {}).get("HTTPStatusCode", status)
+        elif response is not None:  # of the hub's library
+            status = getattr(response, "status_code", status)
         if isinstance(status, int):
             return status
         error = error.__cause__ or error.__context__

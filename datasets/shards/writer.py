@@ -26,7 +26,7 @@ from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import MANIFEST_FILE, Manifest, Split, UserError
+from motionloom.datasets.schema import MANIFEST_FILE, Manifest, Split, UserError, require_local
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.finish import (
     OLD_FOLDER,
@@ -91,6 +91,7 @@ def dataset_writer(
     """
     how = how or WriteOptions()
     _check_arguments(facts, how)
+    require_local(out)
     out.mkdir(parents=True, exist_ok=True)
     with folder_lock(out, shared=how.part is not None), Workers(how.workers) as pool:
         _check_same_dataset(out, facts.name, facts.layout, facts.options)

@@ -24,7 +24,7 @@ from motionloom.datasets.convert.registry import converter_named, names
 from motionloom.datasets.schema import MANIFEST_FILE, Manifest, UserError, nearest
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.options import Part
-from motionloom.pipeline.cli.options import AsJson, Workers, fields_of, print_json, set_option
+from motionloom.pipeline.cli.options import AsJson, Commands, Workers, fields_of, print_json, set_option
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
 
@@ -117,7 +117,7 @@ def _command(name: str) -> Any:
         f"machines that see both folders; then `motionloom data join {entry.example.split()[1]}`\n\n"
         f"Settings for `--set KEY=VALUE`:\n\n{listed}"
     )
-    app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
+    app = Commands(add_completion=False, rich_markup_mode="markdown")
     app.command(name)(run)
     return get_command(app)
 

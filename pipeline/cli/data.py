@@ -11,7 +11,15 @@ from rich.console import Console
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import grouped
 from motionloom.pipeline.cli.convert import convert_app, say_manifest
-from motionloom.pipeline.cli.options import AsJson, Workers, fields_of, plain, print_json, set_option
+from motionloom.pipeline.cli.options import (
+    AsJson,
+    Commands,
+    Workers,
+    fields_of,
+    plain,
+    print_json,
+    set_option,
+)
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place, require_folder
 
@@ -23,7 +31,7 @@ _SUSPECTS = 60
 _ALIKE = 5
 """Findings that say the same and are still listed one by one."""
 
-data_app = typer.Typer(
+data_app = Commands(
     help="Shards: synthesise, convert, check, describe.", no_args_is_help=True, rich_markup_mode="markdown"
 )
 data_app.add_typer(convert_app, name="convert")
@@ -69,6 +77,26 @@ def join(out: Annotated[Path, typer.Argument(help="Folder with the shards of all
     say_manifest(manifest, out, console)
     for note in manifest.notes:
         say(console, f"note: {note}")
+
+
+@data_app.command()
+def copy(
+    source: Annotated[str, typer.Argument(metavar="SRC", help="Folder or URL of a data set.")],
+    target: Annotated[
+        str, typer.Argument(metavar="DST", help="Folder, s3://BUCKET/FOLDER or hf://datasets/OWNER/NAME.")
+    ],
+) -> None:
+    """Carry a data set to a bucket, the hub or a folder, or back; every file is compared by its sha256.
+
+    Given again it goes on: what lies there whole is not sent. The manifest goes last.
+
+    Example: `motionloom data copy shards s3://my-bucket/shards`
+    """
+    from motionloom.datasets.shards.copy import copy_dataset
+
+    console = make_console()
+    copied = copy_dataset(source, target, progress=console.is_terminal)
+    say(console, f"{target}: {copied.sent} files sent, {copied.kept} were there")
 
 
 @data_app.command()

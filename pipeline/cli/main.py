@@ -30,6 +30,7 @@ from motionloom.pipeline.cli.generate import generate
 from motionloom.pipeline.cli.options import (
     AsJson,
     At,
+    Commands,
     Device,
     ModelFolder,
     RunFolder,
@@ -43,7 +44,7 @@ from motionloom.pipeline.cli.search import search
 from motionloom.pipeline.launch.console import SafeConsole, make_console, quiet_libraries
 from motionloom.pipeline.launch.process import LOST, Interrupted, JointError, TeamError, leave, process_rank
 
-app = typer.Typer(
+app = Commands(
     name="motionloom",
     help="Text or music to whole-body motion: data, training and generation (HumanTOMATO, UDE).",
     no_args_is_help=True,

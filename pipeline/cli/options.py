@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from pydantic_core import to_jsonable_python
 
-from motionloom.datasets.schema import UserError, nearest
+from motionloom.datasets.schema import UserError, nearest, require_local
 
 ModelFolder = Annotated[
     str,
@@ -36,6 +37,27 @@ Device = Annotated[
     str, typer.Option(help="auto (a GPU if there is one; stages go by the recipe), cpu, cuda or cuda:N.")
 ]
 Workers = Annotated[int, typer.Option(help="Processes; the shards are the same bytes for any number.")]
+
+
+class Commands(typer.Typer):
+    """A `typer.Typer` whose commands refuse a URL for any of their paths before they do anything."""
+
+    def command(self, *arguments: Any, **options: Any) -> Any:
+        decorate = super().command(*arguments, **options)
+
+        def register(function: Callable[..., object]) -> Callable[..., object]:
+            @wraps(function)
+            def called(**values: Any) -> object:
+                for value in values.values():
+                    for path in value if isinstance(value, list | tuple) else (value,):
+                        if isinstance(path, Path):
+                            require_local(path)
+                return function(**values)
+
+            decorate(called)
+            return function
+
+        return register
 
 
 def set_option(help: str) -> Any:

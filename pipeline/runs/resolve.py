@@ -32,7 +32,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError, explain, nearest
+from motionloom.datasets.schema import UserError, explain, nearest, require_local
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import CompletedStage, Every, StageConfig, stage_kinds
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, is_place
@@ -70,6 +70,7 @@ def find_recipe(name_or_path: str) -> Path:
     """A recipe file by path, or a shipped recipe by name; `FOLDER/SIZE` is a name too."""
     path = Path(name_or_path)
     if path.suffix in {".yaml", ".yml"}:
+        require_local(path)
         if not path.is_file():
             raise UserError(f"{path}: no such recipe file")
         return path

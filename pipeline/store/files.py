@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import IO, Any
 
 from motionloom.datasets.base import files
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, require_local
 
 
 def require_folder(folder: Path) -> None:
-    """Refuse an output folder that is a file, or is below one; creates nothing."""
+    """Refuse an output folder that is a file, is below one, or is a URL; creates nothing."""
+    require_local(folder)
     existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
     if existing.exists() and not existing.is_dir():
         raise UserError(f"{existing}: is a file, and a folder is needed here; choose another name")

@@ -79,7 +79,7 @@ def fail(request: BaseHTTPRequestHandler, kind: int) -> None:
         request.send_header("Content-Length", "0")
         request.end_headers()
         return
-    if kind == 3:
+    if kind == 3 and request.command != "HEAD":  # whose answer has no body
         request.send_response(200)
         request.send_header("Content-Length", "1000000")
         request.end_headers()

@@ -1,0 +1,116 @@
+"""A data set carried from one place to another: a folder, a bucket, or a data set on the hub.
+
+A file that lies at the target with its sha256 is not sent again, so a copy that was killed goes on where it
+was. What was sent is compared there. The manifest goes last, and one of an older state is taken away first:
+no reader ever takes half a copy for a whole one.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+from motionloom.datasets.base.progress import Meter
+from motionloom.datasets.schema import CLEANED_FILE, INDEX_FILE, MANIFEST_FILE, Manifest, UserError
+from motionloom.datasets.shards.index import index_path
+from motionloom.datasets.shards.left_out import LEFT_OUT_FILE
+from motionloom.datasets.shards.reader import read_manifest
+from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store, persist
+
+
+class Copied(NamedTuple):
+    """Files that a copy sent, and those that lay at the target already."""
+
+    sent: int
+    kept: int
+
+
+def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
+    """Carry the data set at `source` to `target`, folders or URLs. Raises `UserError` for a damaged byte."""
+    here, there = open_store(source), open_store(target)
+    if there.place.startswith("http"):
+        raise UserError(f"{target}: a web server is only read; name a folder, s3://… or hf://datasets/…")
+    manifest, digest = read_manifest(here)
+    _make_way(there, manifest, digest)
+    sums = {shard.name: shard.sha256 for shard in manifest.shards}
+    # Without the others of these a data set can be read; `data convert` and `data clean` go on with them.
+    needed = {*sums, INDEX_FILE, MANIFEST_FILE}
+    names = [*sums, *map(_index_name, sums), LEFT_OUT_FILE, CLEANED_FILE, INDEX_FILE, MANIFEST_FILE]
+    sent = kept = 0
+    with tempfile.TemporaryDirectory() as folder, Meter("copying", len(names), shown=progress) as meter:
+        for name in names:
+            try:
+                new = _carry(here, there, name, sums.get(name), Path(folder))
+            except MissingFileError:
+                if name in needed:
+                    raise
+            else:
+                sent, kept = sent + new, kept + (not new)
+            meter.advance()
+    return Copied(sent, kept)
+
+
+def _make_way(there: Store, manifest: Manifest, digest: str) -> None:
+    """Take the manifest of an older state away, and first the shards that it alone has."""
+    if _digest(there, MANIFEST_FILE) in (None, digest):
+        return
+    old, _ = read_manifest(there)
+    if old.name != manifest.name:
+        raise UserError(f"{there.place}: holds data set '{old.name}', not '{manifest.name}'; name another")
+    gone = sorted({shard.name for shard in old.shards} - {shard.name for shard in manifest.shards})
+    for name in (*map(_index_name, gone), *gone, MANIFEST_FILE):
+        if _digest(there, name) is not None:
+            persist(there.where(name), partial(there.system().rm_file, there.where(name)))
+
+
+def _carry(here: Store, there: Store, name: str, wanted: str | None, folder: Path) -> bool:
+    """Send a file unless it is there, and compare it then; whether it was sent."""
+    if wanted is not None and _digest(there, name) == wanted:
+        return False
+    source, target, path = here.where(name), there.where(name), folder / name
+    if isinstance(here, LocalStore):
+        path = here.root / name
+        if not path.is_file():
+            raise MissingFileError(f"{source}: no such file")
+    else:
+        persist(source, lambda: here.system().get_file(source, str(path)))
+    with path.open("rb") as file:
+        found = hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
+    if wanted not in (None, found):
+        raise UserError(f"{source}: the sha256 is not the manifest's: damaged; nothing of it is copied")
+    if wanted is None and _digest(there, name) == found:
+        return False
+    try:
+        persist(target, lambda: there.system().put_file(str(path), target))
+    except MissingFileError:
+        raise UserError(f"{there.place}: no such bucket or repository; make it first") from None
+    finally:
+        if path.parent == folder:
+            path.unlink()
+    if _digest(there, name) != found:
+        raise UserError(f"{target}: is not what was sent, by its sha256; give the command again")
+    return True
+
+
+def _digest(store: Store, name: str) -> str | None:
+    """sha256 of a file as it lies there, by its bytes or the hub's own record of them; None without one."""
+    where = store.where(name)
+
+    def digest() -> str:
+        system = store.system()
+        if large := system.info(where).get("lfs"):
+            return str(large["sha256"])
+        with system.open(where, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    try:
+        return persist(where, digest, first=True)
+    except MissingFileError:
+        return None
+
+
+def _index_name(shard: str) -> str:
+    return index_path(Path(shard)).name
