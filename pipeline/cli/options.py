@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import typer
 from pydantic_core import to_jsonable_python
@@ -39,15 +39,18 @@ Device = Annotated[
 Workers = Annotated[int, typer.Option(help="Processes; the shards are the same bytes for any number.")]
 
 
+F = TypeVar("F", bound=Callable[..., object])
+
+
 class Commands(typer.Typer):
     """A `typer.Typer` whose commands refuse a URL for any of their paths before they do anything."""
 
-    def command(self, *arguments: Any, **options: Any) -> Any:
-        decorate = super().command(*arguments, **options)
+    def command(self, name: str | None = None) -> Callable[[F], F]:  # type: ignore[override]
+        decorate = super().command(name)
 
-        def register(function: Callable[..., object]) -> Callable[..., object]:
+        def register(function: F) -> F:
             @wraps(function)
-            def called(**values: Any) -> object:
+            def called(**values: object) -> object:
                 for value in values.values():
                     for path in value if isinstance(value, list | tuple) else (value,):
                         if isinstance(path, Path):
