@@ -99,7 +99,8 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically, newlines as they are."""
-    write_bytes(path, text.encode("utf-8"))
+    # Bytes of a file's name that are no UTF-8 are lone surrogates here: `\udc8f`, as JSON escapes them.
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def write_json(path: Path, data: object, *, sort_keys: bool = False, allow_nan: bool = False) -> None:

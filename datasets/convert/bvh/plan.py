@@ -116,7 +116,8 @@ def choose_maps(
     # An uncertain skeleton costs its clips, not the conversion, as long as any other clip is left.
     left = [clip for _, clip in plan.items if clip.found.skeleton in doubts]
     if left and len(left) == len(plan.items):
-        raise UserError(f"{config.source}: {next(iter(doubts.values()))}")
+        doubt, place = next(iter(doubts.values())), MAPS_FOLDER if folder is None else folder / MAPS_FOLDER
+        raise UserError(f"{config.source}: {doubt.replace(MAPS_FOLDER, str(place))}")
     plan.items = [item for item in plan.items if item[1].found.skeleton not in doubts]
     plan.notes += doubts.values()
     for key in maps.keys() & settles & first_clips.keys():
@@ -188,8 +189,9 @@ def _cure(key: str, target: Skeleton, folder: Path | None) -> str:
     """Return what the user can do about a map that is not certain."""
     if folder is None:
         return "planned with `maps=FOLDER` it writes a map to complete"
-    path = folder / _place(key, target)
-    return f"complete {path} and give the command again, elsewhere with --set joint_map={path.parent}"
+    # As the manifest has it, where no path of a machine stands: from the folder of the shards on.
+    where = _place(key, target)
+    return f"complete {where} and give the command again, elsewhere with --set joint_map={MAPS_FOLDER}"
 
 
 class BvhConfig(CaptionConfig):

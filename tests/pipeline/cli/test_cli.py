@@ -21,6 +21,7 @@ from rich.console import Console
 from motionloom.datasets.check.files import FileRules
 from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.schema import Manifest
+from motionloom.datasets.shards.index import ShardIndex
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.convert import say_manifest
 from motionloom.pipeline.cli.main import app
@@ -199,6 +200,34 @@ def test_a_wrong_axis_is_seen_by_plan_conversion_and_check(tmp_path: Path, call:
     lying = tmp_path / "lying"
     assert call(*words[:4], lying, *more, "--set", "look=0").code == 0
     assert call("data", "check", lying).code == 1
+
+
+def test_parts_are_planned_made_and_joined(tmp_path: Path, call: Call) -> None:
+    (tmp_path / "splits").mkdir()
+    for seed, split in enumerate(("train", "val", "test")):
+        write_clip(tmp_path / f"mocap/{seed}.bvh", seed)
+        (tmp_path / f"splits/{split}.txt").write_text(f"{seed}\n")
+    words = ("data", "convert", "bvh", tmp_path / "mocap", "--licence", "CC0", "--workers", 1)
+    splits, out, whole = ("--set", f"splits={tmp_path / 'splits'}"), tmp_path / "out", tmp_path / "whole"
+    assert call("data", "join", tmp_path).code == 2 and call(*words, out, "--part", "3/2").code == 2
+    plan = json.loads(call(*words, out, *splits, "--part", "1/2", "--plan", "--json").out)
+    assert plan["command"].endswith("--part 1/2") and not list(out.glob("*.tar"))
+    assert call(*words, out, *splits, "--part", "1/2").code == 0
+    tars = [ShardIndex.load_json(path) for path in out.glob("*.index.json")]
+    assert plan["part"] == {"shards": len(tars), "clips": sum(len(tar.clips) for tar in tars)}
+    assert call(*words, out, *splits, "--set", "fps=10", "--part", "2/2").code == 0
+    other = call("data", "join", out)
+    assert other.code == 2 and "fps 20.0 -> 10.0" in other.err and not (out / "manifest.json").exists()
+    assert call(*words, out, *splits, "--part", "2/2").code == 0
+    (out / "bvh-val-000000.tar").write_bytes(b"damaged")
+    missing = call("data", "join", out)
+    assert missing.code == 2 and "--part 2/2" in missing.err
+    assert call(*words, out, *splits, "--part", "2/2").code == 0
+    assert call("data", "join", out).code == call("data", "join", out).code == 0
+    assert call(*words, whole, *splits).code == 0
+    assert {path.name: path.read_bytes() for path in out.glob("*.*")} == {
+        path.name: path.read_bytes() for path in whole.glob("*.*")
+    }
 
 
 ODD = {
