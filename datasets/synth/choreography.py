@@ -141,7 +141,7 @@ def _accents(song: Song, start: float, t: Array, high: float, low: float) -> Arr
         2 * (song.beat_number(start + float(t[-1])) // song.meter + 2),
     )
     numbers = halves * song.meter / 2
-    energy = np.array([song.energy(int(number)) for number in numbers])
+    energy = np.array([song.section_of(int(number)).energy for number in numbers])
     strength = np.where(energy > 0, 0.7 + 0.4 * np.minimum(energy, _EVEN), 0.15)
     return keys(t + start, song.times(numbers), strength * np.where(halves % 2 == 0, high, low))
 
@@ -152,7 +152,7 @@ def _plan(song: Song, start: float, end: float, rng: np.random.Generator) -> _Pl
     while first > 0 and song.section_of(first - 1) is song.section_of(first):
         first -= song.meter  # phrases are counted from where the section begins
     numbers = list(range(first, song.beat_number(end) + 3))
-    energy = np.array([song.energy(number) for number in numbers])
+    energy = np.array([song.section_of(number).energy for number in numbers])
     still = energy == 0
     accent = ~still & np.concatenate([[False], still[:-1]])
     dancer = rng.uniform(0.87, 1.13) * min(1.0, song.beat / _SHORT_BEAT)
@@ -173,7 +173,8 @@ def _phrases(song: Song, numbers: list[int], rng: np.random.Generator) -> list[_
     """The phrase of each beat. Phrases end after two bars of their section, and with it."""
     out: list[_Phrase] = []
     for number in numbers:
-        section, energy = song.section_of(number), song.energy(number)
+        section = song.section_of(number)
+        energy = section.energy
         beats = sum(phrase is out[-1] for phrase in out)
         same = bool(out) and section is song.section_of(number - 1)
         if same and (energy == 0 or beats < 2 * song.meter):
@@ -198,7 +199,7 @@ def _draw_phrase(song: Song, number: int, energy: float, rng: np.random.Generato
         chances = np.array(list(weights.values()))
         legs = list(weights)[int(rng.choice(len(chances), p=chances / chances.sum()))]
         own = rng.random() < _OWN_ARMS
-        arms = genre.arms[song.section(number)] if own else _one_of(MORE_ARMS[song.genre], rng)
+        arms = genre.arms[song.section_of(number).kind] if own else _one_of(MORE_ARMS[song.genre], rng)
         way = _one_of(ARM_WAYS, rng)
     return _Phrase(legs, arms, way, float(rng.normal(0.0, 0.05)), float(rng.uniform(-0.06, 0.1)))
 

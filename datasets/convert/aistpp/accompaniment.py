@@ -10,12 +10,10 @@ smoothing is used; the phase is that at which the tempo's grid meets most of the
 from __future__ import annotations
 
 import hashlib
-import re
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.song import Song
 
 SMOOTHING = 5.0 / 60.0
@@ -25,31 +23,23 @@ NEAR = 3.0 / 60.0
 STEP = 0.001
 """Seconds between the phases that are tried."""
 
-BAND_GENRES = {
-    "BR": "hiphop",
-    "PO": "disco",
-    "LO": "disco",
-    "MH": "hiphop",
-    "LH": "hiphop",
-    "HO": "house",
-    "WA": "disco",
-    "KR": "hiphop",
-    "JS": "rock",
-    "JB": "ballad",
+GENRES = {
+    "BR": ("break dance", "hiphop"),
+    "PO": ("pop dance", "disco"),
+    "LO": ("lock dance", "disco"),
+    "MH": ("middle hip-hop", "hiphop"),
+    "LH": ("LA style hip-hop", "hiphop"),
+    "HO": ("house dance", "house"),
+    "WA": ("waack dance", "disco"),
+    "KR": ("krump", "hiphop"),
+    "JS": ("street jazz", "rock"),
+    "JB": ("ballet jazz", "ballad"),
 }
-"""The band's genre for each of AIST's: its own where there is one (house, hip-hop; waacking is danced to
+"""AIST's genres in words, and the band's: the same where it has one (house, hip-hop; waacking is danced to
 disco, locking and popping to funk, its neighbour), else the nearest in character **[ours]**."""
 
-_MUSIC = re.compile(r"m([A-Z]{2})([0-5])")
-
-
-def tempo_of(music: str) -> int:
-    """Return the beats a minute of a piece: 80 for `mBR0`, 135 for `mHO5`; `UserError` for another name."""
-    match = _MUSIC.fullmatch(music)
-    if match is None or match[1] not in BAND_GENRES:
-        raise UserError(f"no tempo is known of music '{music}'; AIST's pieces are mBR0 to mJB5")
-    number = int(match[2])
-    return 110 + 5 * number if match[1] == "HO" else 80 + 10 * number
+TEMPI = {f"m{genre}{n}": 110 + 5 * n if genre == "HO" else 80 + 10 * n for genre in GENRES for n in range(6)}
+"""Beats a minute of every piece."""
 
 
 def kinematic_beats(
@@ -85,8 +75,8 @@ def phase_of(beats: NDArray[np.floating], weights: NDArray[np.floating], period:
 
 def song_for(sequence: str, genre: str, music: str, joints: NDArray[np.floating], fps: float) -> Song:
     """Return the song that the band plays to a dance, joints [T, N, 3]; a function of these and the name."""
-    bpm = tempo_of(music)
+    bpm = TEMPI[music]
     seed = int.from_bytes(hashlib.sha256(sequence.encode()).digest()[:4], "big")
     first = phase_of(*kinematic_beats(joints, fps), 60.0 / bpm)
     seconds = len(joints) / fps
-    return Song(0, seed, BAND_GENRES[genre], bpm, seed % 12, seconds, played=True, first=first)
+    return Song(0, seed, GENRES[genre][1], bpm, seed % 12, seconds, played=True, first=first)

@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 
-from motionloom.datasets.convert.aistpp.accompaniment import song_for, tempo_of
+from motionloom.datasets.convert.aistpp.accompaniment import GENRES, TEMPI, song_for
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
@@ -45,22 +45,11 @@ MUSIC_LICENCE = "CC-BY-4.0 AND LicenseRef-AIST-Dance-DB"
 grant; shards that hold sound, or features made from it, stand under both.
 """
 
-_SEQUENCE = re.compile(r"g([A-Z]{2})_s([A-Z]{2})_c(?:All|\d\d)_d(\d+)_m([A-Z]{2}\d+)_ch(\d+)")
-"""Genre, situation (BM basic, FM advanced), dancer, music, choreography."""
-_FACTS = ("genre", "situation", "dancer", "music", "choreography")
-
-GENRES = {
-    "BR": "break dance",
-    "PO": "pop dance",
-    "LO": "lock dance",
-    "MH": "middle hip-hop",
-    "LH": "LA style hip-hop",
-    "HO": "house dance",
-    "WA": "waack dance",
-    "KR": "krump",
-    "JS": "street jazz",
-    "JB": "ballet jazz",
-}
+_SEQUENCE = re.compile(
+    r"g(?P<genre>[A-Z]{2})_s(?P<situation>[A-Z]{2})_c(?:All|\d\d)_d(?P<dancer>\d+)_(?P<music>m[A-Z]{2}\d+)"
+    r"_ch(?P<choreography>\d+)"
+)
+"""The situation is BM, basic, or FM, advanced."""
 
 
 class AistppConfig(BodyConfig):
@@ -129,12 +118,9 @@ class Aistpp(BodyRelease[AistppConfig]):
                 draft.fail(f"{MOTIONS}/{name}.pkl", error)
                 continue
             problem = "on the ignore list" if name in self.ignored else ""
-            if self.config.has_band:
-                try:
-                    tempo_of(facts["music"])
-                except UserError as error:
-                    problem = problem or str(error)
-            genre = GENRES.get(facts["genre"], f"{facts['genre']} dance")
+            if self.config.has_band and facts["music"] not in TEMPI:
+                problem = f"no tempo is known of music '{facts['music']}'; AIST's pieces are mBR0 to mJB5"
+            genre, _ = GENRES.get(facts["genre"], (f"{facts['genre']} dance", ""))
             caption = Caption(text=f"a dancer performs {genre}", source="genre")
             # By music: pieces are shared by many dances, and one in two splits would leak.
             yield Entry(
@@ -176,8 +162,8 @@ class Aistpp(BodyRelease[AistppConfig]):
             yield from entries
             return
         for entry in super().with_sound(entries, draft):
-            both = entry.sound is not None and self.config.stores_music
-            yield replace(entry, licence=MUSIC_LICENCE if both else None)
+            heard = entry.sound is not None and self.config.stores_music
+            yield replace(entry, licence=MUSIC_LICENCE if heard else None)
 
     def licence(self, plan: ConversionPlan[ReleaseClip]) -> str:
         return self.config.licence or (MUSIC_LICENCE if self.config.stores_music else MOTION_LICENCE)
@@ -220,5 +206,4 @@ def _facts(sequence: str) -> dict[str, str]:
     match = _SEQUENCE.fullmatch(sequence)
     if match is None:
         raise UserError(f"'{sequence}' is not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01")
-    facts = dict(zip(_FACTS, match.groups(), strict=True))
-    return facts | {"music": f"m{facts['music']}"}
+    return match.groupdict()

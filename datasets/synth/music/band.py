@@ -15,6 +15,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -253,14 +254,9 @@ def _harmony(song: Song, bar: int, section: Section, how: LineUp, rng: np.random
     degree = genre.progressions[section.kind][bar % 4]
     loud = 0.5 + 0.5 * section.energy
     root = 33 + song.key + genre.semitones(degree)  # A1 is 33
-    chord = [
-        57 + song.key % 12 - (12 if song.key > 6 else 0) + genre.semitones(degree + third)
-        for third in (0, 2, 4)
-    ]
+    chord = _chord(song, degree)
     if how.with_bass and section.energy > 0.25:
-        pattern = [step for step in range(steps) if genre.bass[step % 16] != "."] or [0]
-        for place, step in enumerate(pattern):
-            until = pattern[place + 1] if place + 1 < len(pattern) else steps
+        for place, (step, until) in enumerate(_spans(genre.bass, steps)):
             pitch = root + (12 if genre.name == "disco" and place % 2 else 0)
             yield _note(song, bar, step, until, how, _BASS, pitch, 95 * loud)
     if how.with_chords:
@@ -268,9 +264,7 @@ def _harmony(song: Song, bar: int, section: Section, how: LineUp, rng: np.random
             for step in range(0, steps, 2):
                 yield _note(song, bar, step, step + 2, how, _CHORDS, chord[step // 2 % 3], 80 * loud)
         else:
-            hits = [step for step in range(steps) if genre.chord[step % 16] != "."] or [0]
-            for place, step in enumerate(hits):
-                until = hits[place + 1] if place + 1 < len(hits) else steps
+            for step, until in _spans(genre.chord, steps):
                 for pitch in chord:
                     yield _note(song, bar, step, until, how, _CHORDS, pitch, 78 * loud)
     if how.with_pad or not (how.with_chords or how.with_bass):
@@ -287,6 +281,18 @@ def _harmony(song: Song, bar: int, section: Section, how: LineUp, rng: np.random
             step += length
 
 
+def _chord(song: Song, degree: int) -> list[int]:
+    """Pitches of a chord around A3, which is 57."""
+    base = 57 + song.key - (12 if song.key > 6 else 0)
+    return [base + song.style.semitones(degree + third) for third in (0, 2, 4)]
+
+
+def _spans(pattern: str, steps: int) -> list[tuple[int, int]]:
+    """Sixteenths from each hit of a bar's pattern to the next; the whole bar where it has none."""
+    hits = [step for step in range(steps) if pattern[step % 16] != "."] or [0]
+    return list(pairwise([*hits, steps]))
+
+
 def _break(song: Song, bar: int, how: LineUp, begins: bool) -> Iterator[Note]:
     """One chord on the first beat of a break, which rings; nothing after it."""
     if not begins:
@@ -294,9 +300,7 @@ def _break(song: Song, bar: int, how: LineUp, begins: bool) -> Iterator[Note]:
     genre = song.style
     if how.kit in ("full", "sparse"):
         yield _stroke(song, bar, 0, how, _CRASH, 80)
-    degree = genre.progressions[0][0]
-    for third in (0, 2, 4):
-        pitch = 57 + song.key % 12 - (12 if song.key > 6 else 0) + genre.semitones(degree + third)
+    for pitch in _chord(song, genre.progressions[0][0]):
         yield _note(song, bar, 0, 4 * song.meter, how, _PAD if how.with_pad else _CHORDS, pitch, 70)
 
 

@@ -138,14 +138,6 @@ class Song:
             bar -= section.bars
         raise AssertionError("a form has bars")
 
-    def section(self, beat: int) -> int:
-        """Kind of section (0 is A, 1 is B) of a beat by number."""
-        return self.section_of(beat).kind
-
-    def energy(self, beat: int) -> float:
-        """0..1, of a beat by number: how loud and full the music is there; 0 in a break."""
-        return self.section_of(beat).energy
-
     def _drawn(self, what: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, self.number, 239, what])
 

@@ -34,7 +34,7 @@ def synthesize(song: Song, rate: int) -> NDArray[np.float32]:
     bars = int(np.ceil(song.seconds / (BEATS * song.beat)))
     sixteenth = song.beat / 4
     for bar in range(bars):
-        kind = song.section(bar * BEATS)
+        kind = song.section_of(bar * BEATS).kind
         begin = bar * BEATS * song.beat
         for pattern, sound, loud in drums:
             for step, level in _hits(pattern):

@@ -17,13 +17,12 @@ from hypothesis import strategies as st
 from motionloom.datasets.audio.features import AudioSettings, audio_features
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.aistpp.accompaniment import (
-    BAND_GENRES,
+    GENRES,
+    TEMPI,
     kinematic_beats,
     phase_of,
     song_for,
-    tempo_of,
 )
-from motionloom.datasets.convert.aistpp.convert import GENRES as AIST_GENRES
 from motionloom.datasets.convert.aistpp.convert import MOTION_LICENCE, MUSIC_LICENCE, AistppConfig
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.common.conversion import run_conversion
@@ -297,8 +296,8 @@ def test_planted_beats_are_found_to_one_frame(bpm: int, phase: float, seed: int,
 
 
 def test_tempi_of_the_pieces() -> None:
-    assert [tempo_of(f"mBR{n}") for n in range(6)] == [80, 90, 100, 110, 120, 130]
-    assert [tempo_of(f"mHO{n}") for n in range(6)] == [110, 115, 120, 125, 130, 135]
-    assert set(BAND_GENRES) == set(AIST_GENRES) and set(BAND_GENRES.values()) <= set(SONG_GENRES)
+    assert [TEMPI[f"mBR{n}"] for n in range(6)] == [80, 90, 100, 110, 120, 130]
+    assert [TEMPI[f"mHO{n}"] for n in range(6)] == [110, 115, 120, 125, 130, 135]
+    assert {band for _, band in GENRES.values()} <= set(SONG_GENRES)
     still = np.zeros((60, 22, 3))
     assert song_for(REAL, "BR", "mBR0", still, 60.0).first == 0.0

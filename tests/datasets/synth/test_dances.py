@@ -159,7 +159,7 @@ def test_size_follows_the_energy_and_a_break_is_held() -> None:
         assert foot_skating(joints, RATE) < 0.01
         for frame, value in enumerate(speed):
             beat = song.beat_number(5.0 + (frame + 0.5) / RATE) - 1
-            around = [song.energy(beat + away) for away in (-1, 0, 1)]
+            around = [song.section_of(beat + away).energy for away in (-1, 0, 1)]
             if max(around) == 0:
                 speeds["break"].append(value)
             elif min(around) > 0:

@@ -73,7 +73,8 @@ def test_strokes_fall_on_the_grid_and_a_break_rings() -> None:
         straight += how.swing == 0.0
         assert (late < 1e-6).all() == (how.swing == 0.0) and late.max() < how.swing / 2 + 1e-6
         for beat in range(1, int(18 / song.beat)):
-            if song.energy(beat) == 0.0 == song.energy(beat - 1):  # within a break nothing is struck
+            # Within a break nothing is struck.
+            if song.section_of(beat).energy == 0.0 == song.section_of(beat - 1).energy:
                 breaks += 1
                 begin, end = song.times([beat, beat + 1])
                 assert not ((struck > begin - 1e-6) & (struck < end - 1e-6)).any()
