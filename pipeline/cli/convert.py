@@ -105,7 +105,7 @@ def _command(name: str) -> Any:
         _parameter("out", Annotated[Path, typer.Argument(help="Folder for the shards.")]),
     ]
     for key in config.everyday:
-        option = typer.Option(f"--{key}", help=_help(config, key))
+        option = typer.Option(_flag(key), help=_help(config, key))
         parameters.append(_parameter(key, Annotated[config.model_fields[key].annotation, option], None))
     parameters += [_parameter(key, kind, default) for key, (kind, default) in _RUN_OPTIONS.items()]
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
@@ -124,6 +124,11 @@ def _command(name: str) -> Any:
 
 def _parameter(name: str, annotation: object, default: object = inspect.Parameter.empty) -> inspect.Parameter:
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _flag(key: str) -> str:
+    """The option of an everyday field."""
+    return f"--{key.replace('_', '-')}"
 
 
 def _settings(config: type[ConvertConfig]) -> list[str]:
@@ -241,7 +246,7 @@ def proposed(
         value = changes.get(key, getattr(config, key))
         if key == "source" or value is None or value == field.get_default(call_default_factory=True):
             continue
-        words += [f"--{key}", str(value)] if key in config.everyday else ["--set", f"{key}={_yaml(value)}"]
+        words += [_flag(key), str(value)] if key in config.everyday else ["--set", f"{key}={_yaml(value)}"]
     return shlex.join(words)
 
 

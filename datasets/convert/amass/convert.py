@@ -15,12 +15,19 @@ from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
-from motionloom.datasets.convert.amass.index import INDEX_FPS, IndexRow, clip_key, read_index, thinning
 from motionloom.datasets.convert.amass.smpl_npz import MotionHeader, read_motion, read_motion_header
-from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
-from motionloom.datasets.convert.captions.options import CaptionConfig, Listing, settle_captions
+from motionloom.datasets.convert.captions.humanml_index import (
+    INDEX_FPS,
+    HumanmlConfig,
+    IndexRow,
+    clip_key,
+    index_clips,
+    read_index,
+    thinning,
+)
+from motionloom.datasets.convert.captions.options import Listing, settle_captions
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import (
     canonical_smpl75,
@@ -33,7 +40,6 @@ from motionloom.datasets.convert.common.files import check_id, inside
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
-from motionloom.datasets.convert.common.splits import hash_split, original_of
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
@@ -51,7 +57,7 @@ FINGERS_MOVE = 1e-3
 _MODEL_OPTIONS = {"neutral": "body_model", "female": "body_model_female", "male": "body_model_male"}
 
 
-class AmassConfig(CaptionConfig, ReleaseConfig):
+class AmassConfig(HumanmlConfig, ReleaseConfig):
     """AMASS, or any folder tree of SMPL, SMPL-H or SMPL-X clips in .npz files (`SUBSET/subject/clip.npz`)."""
 
     layouts = ("body133", "wholebody313", "h3d263", "tomato623", "smpl75")
@@ -69,28 +75,10 @@ class AmassConfig(CaptionConfig, ReleaseConfig):
     """The same, for female clips."""
     body_model_male: Path | None = None
     """The same, for male clips."""
-    humanml_index: Path | None = None
-    """HumanML3D's `index.csv`: convert its clips (cut, and named by its numbers) instead of whole files."""
-    humanml_texts: Path | None = None
-    """HumanML3D's folder of texts, for the clips of `humanml_index`."""
-    mirror: bool = False
-    """With `humanml_index`: also the mirrored clips (`M...`), which have texts of their own there."""
     up: Literal["z", "y"] = "z"
     """The axis that points up in the files; AMASS's is z."""
     source_fps: float | None = Field(default=None, ge=1, le=10_000)
     """Overrides the files' frame rate, for collections that state a wrong one or none."""
-
-    @model_validator(mode="after")
-    def _consistent(self) -> AmassConfig:
-        if self.humanml_index is None and (self.mirror or self.humanml_texts is not None):
-            raise ValueError("mirror and humanml_texts need humanml_index")
-        if self.humanml_index is not None and self.captions is not None:
-            raise ValueError("captions and humanml_index exclude each other; the index has humanml_texts")
-        return self
-
-    @property
-    def has_captions(self) -> bool:
-        return self.captions is not None or self.humanml_texts is not None
 
 
 class Amass(Release[AmassConfig]):
@@ -149,28 +137,22 @@ class Amass(Release[AmassConfig]):
             first = by_key.setdefault(clip_key(label), label)
             if first is not label:
                 draft.leave_out(label, f"the same clip as {first}")
-        used: set[str] = set()
-        for row in read_index(index):
-            file = by_key.get(clip_key(row.source))
-            used.add(file or "")
-            both = self.config.mirror and file is not None
-            for clip_id, original in [(row.id, None), (f"M{row.id}", row.id)][: 1 + both]:
-                self.rows[clip_id] = row
-                # Stretches of one file may overlap: without split files they stay together.
-                split = (self.listed or {}).get(row.id) or (self.listed or {}).get(f"M{row.id}")
-                yield Entry(
-                    clip_id, file or row.source, split=split or hash_split(clip_key(row.source)),
-                    mirror_of=original,
-                )  # fmt: skip
+        found = [(row, by_key.get(clip_key(row.source))) for row in read_index(index)]
+        for one in index_clips(self.config, found, self.listed):
+            self.rows[one.id] = one.row
+            yield Entry(one.id, one.file or one.row.source, split=one.split, mirror_of=one.mirror_of)
+        used = {file for _, file in found}
         for label in by_key.values():
             if label not in used:
                 draft.leave_out(label, "in no row of the index")
 
     def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
         """Return the splits of the index's clips; those of whole files go with the captions."""
-        listed = super().split_lists(draft) if self.config.humanml_index is not None else None
-        mirrors = self.config.mirror
-        return listed and {key: split for key, split in listed.items() if mirrors or not original_of(key)}
+        if self.config.humanml_index is None:
+            return None
+        listed, notes = self.config.index_splits()
+        draft.notes += notes
+        return listed
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         header = self.headers[label] = read_motion_header(path, label)
@@ -198,24 +180,17 @@ class Amass(Release[AmassConfig]):
         self, clip_id: str, fps: float, draft: ConversionPlan[ReleaseClip]
     ) -> tuple[tuple[Caption, ...], str]:
         """Captions of a clip of the index, in its own seconds, and why it must be left out."""
-        folder = self.config.humanml_texts
-        if folder is None or not (path := folder / f"{clip_id}.txt").is_file():
-            return (), ""
-        try:
-            captions, wrong = read_humanml_captions(path, seconds=None, name=path.name)
-        except UserError as error:
-            return (), str(error)
-        draft.notes += [f"{path.name}: {problem}" for problem in wrong]
+        captions, broken = self.config.index_texts(clip_id, None, draft.notes)
         # The texts count seconds as frames / 20; a file thinned to 20.83 frames a second is a little shorter.
         scale = INDEX_FPS * thinning(fps) / fps
         if abs(scale - 1.0) > 1e-6:
-            captions = [
+            captions = tuple(
                 caption.model_copy(
                     update={"start": caption.start * scale, "end": caption.end and caption.end * scale}
                 )
                 for caption in captions
-            ]
-        return tuple(captions), ""
+            )
+        return captions, broken
 
     def _body_problem(self, header: MotionHeader) -> str:
         """Return the reason that parameters do not fit layout or body models; empty when they do."""

@@ -8,14 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
-from motionloom.datasets.convert.bvh.plan import (
-    BvhClip,
-    BvhConfig,
-    JointMaps,
-    load_maps,
-    plan_bvh,
-    read_motion,
-)
+from motionloom.datasets.base.licences import strictest
+from motionloom.datasets.convert.bvh.plan import BvhClip, BvhConfig, JointMaps, load_maps, plan_bvh
 from motionloom.datasets.convert.bvh.settle import added_frames
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.features import features_of
@@ -24,6 +18,7 @@ from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.bvh.joint_map import JointMap, metres, skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion
+from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
 from motionloom.datasets.schema import UserError
@@ -49,48 +44,48 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         return plan
 
     def depends_on(self, clip: BvhClip) -> list[object]:
-        return [clip.id, self._content(clip), [caption.dump() for caption in clip.texts]]
+        cut = [] if clip.span is None else [*clip.span, clip.fps, clip.mirror_of]
+        return [clip.id, self._content(clip), [caption.dump() for caption in clip.texts], *cut]
 
     def _content(self, clip: BvhClip) -> str:
         """Digest of a clip's file and of how its joints are read."""
         used = self.maps.get(clip.found.skeleton)
         made_from = [clip.found.sha256, used.read_as() if used else None]
-        cut = self.config.cut(clip.label())
+        cut = self.config.cut(clip.found.path)
         return sha256_of_json(made_from if cut == slice(None) else [*made_from, cut.start, cut.stop])
 
     def licence(self, plan: ConversionPlan[BvhClip]) -> str:
-        return self.config.licence or ""
+        return self.config.licence or ("" if self.config.humanml_index is None else strictest(plan.licences))
 
     def convert(self, clip: BvhClip) -> Sample:
-        motion = self.encode(clip.label(), clip.read())
+        motion = self.encode(clip)
         hands = self.layout.num_joints > BODY_JOINTS and self.config.fingers != "missing"
-        return Sample(meta=self.meta(clip, motion, hands=hands), motion=motion, texts=list(clip.texts))
+        meta = self.meta(clip, motion, hands=hands, licence=clip.licence, mirror_of=clip.mirror_of)
+        return Sample(meta=meta, motion=motion, texts=list(clip.texts))
 
     def joints(self, clip: BvhClip) -> SourceJoints:
         """The joints as the map reads them."""
-        motion = self._motion(clip.read(), clip.label())
+        motion = self._motion(clip)
         joint_map = self._map_of(motion)
-        joints = self._world(motion, joint_map)
-        up = joint_map.up or self.config.up
-        return SourceJoints(joints, self.config.source_fps or motion.fps, mapped=True, up=up)
+        joints = self._world(clip, motion, joint_map)
+        return SourceJoints(joints, clip.fps, mapped=True, up=joint_map.up or self.config.up)
 
-    def encode(self, label: str, data: bytes) -> NDArray[np.float32]:
-        """Features [T', D] of one file; `label` names it in errors."""
-        config = self.config
-        motion = self._motion(data, label)
+    def encode(self, clip: BvhClip) -> NDArray[np.float32]:
+        """Features [T', D] of a clip."""
+        config, motion = self.config, self._motion(clip)
         joint_map = self._map_of(motion)
-        joints = self._world(motion, joint_map)
+        joints = self._world(clip, motion, joint_map)
         try:
             if len(self.layout.skeleton) > joints.shape[1]:
                 joints = with_resting_hands(joints)
-            return features_of(
-                joints, config.source_fps or motion.fps, self.layout, same_bones=config.retarget
-            )
+            if clip.mirror_of is not None:
+                joints = mirror(joints, self.layout.skeleton)
+            return features_of(joints, clip.fps, self.layout, same_bones=config.retarget)
         except UserError as error:
             unit, up = joint_map.unit or config.unit, joint_map.up or config.up
-            raise UserError(f"{label}: {error} (read with unit '{unit}', up '{up}')") from None
+            raise UserError(f"{clip.label()}: {error} (read with unit '{unit}', up '{up}')") from None
 
-    def _world(self, motion: BvhMotion, joint_map: JointMap) -> NDArray[np.float64]:
+    def _world(self, clip: BvhClip, motion: BvhMotion, joint_map: JointMap) -> NDArray[np.float64]:
         """Joints [T, N, 3] in metres, Y up, without an added first frame.
 
         Where the unit is settled by the skeleton's first clips and makes no person of this one's figure, but
@@ -105,11 +100,16 @@ class Bvh(Converter[BvhConfig, BvhClip]):
             own = named_unit(height / metres(unit))
             if own is not None and not PERSON_METRES[0] <= height <= PERSON_METRES[1]:
                 joints *= metres(own) / metres(unit)
-        return joints[added_frames(joints) :]
+        added = added_frames(joints)
+        if clip.span is None:
+            return joints[added:]
+        # The index counts the recording's own frames: one is the writer's, those after it are only blended.
+        first, last = clip.span
+        return joints[min(added, 1) :][max(first, added - 1) : last]
 
-    def _motion(self, data: bytes, label: str) -> BvhMotion:
-        motion = read_motion(data, label)
-        return replace(motion, values=motion.values[self.config.cut(label)])
+    def _motion(self, clip: BvhClip) -> BvhMotion:
+        motion = clip.read()
+        return replace(motion, values=motion.values[self.config.cut(clip.found.path)])
 
     def _map_of(self, motion: BvhMotion) -> JointMap:
         try:

@@ -19,7 +19,14 @@ from pydantic import Field
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
-from motionloom.datasets.convert.captions.options import CaptionConfig, settle_captions
+from motionloom.datasets.convert.captions.humanml_index import (
+    ORIGINALS,
+    HumanmlConfig,
+    find_originals,
+    index_clips,
+    settle_index,
+)
+from motionloom.datasets.convert.captions.options import settle_captions
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.facts import Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
@@ -82,7 +89,9 @@ def choose_maps(
     maps: dict[str, JointMap] = {}
     doubts: dict[str, str] = {}
     misfits: dict[str, str] = {}
-    skeletons = {clip.found.skeleton: clip.label() for _, clip in reversed(plan.items) if clip.found.skeleton}
+    skeletons = {
+        clip.found.skeleton: clip.found.path for _, clip in reversed(plan.items) if clip.found.skeleton
+    }
     # The user's own maps come first: what a person wrote down is never overruled by a guess.
     for key, label in skeletons.items():
         for one in own_maps:
@@ -157,8 +166,7 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
         key = clip.found.skeleton
         if key in skeletons and len(found.get(key, ())) < _MEASURED:
             with suppress(UserError):  # told when it is converted; the next clip may be whole
-                motion = read_motion(clip.read(), clip.label())
-                found[key].append(motion)
+                found[key].append(clip.read())
     return found
 
 
@@ -194,11 +202,11 @@ def _cure(key: str, target: Skeleton, folder: Path | None) -> str:
     return f"complete {where} and give the command again, elsewhere with --set joint_map={MAPS_FOLDER}"
 
 
-class BvhConfig(CaptionConfig):
+class BvhConfig(HumanmlConfig):
     """Options of the BVH converter."""
 
     layouts = ("body133", "wholebody313", "wholebody363", "h3d263", "tomato623")
-    everyday: ClassVar[tuple[str, ...]] = ("captions", "licence")
+    everyday: ClassVar[tuple[str, ...]] = ("captions", "licence", "humanml_index", "humanml_texts")
 
     source: Path
     """A folder of .bvh or .amc files, or one such file."""
@@ -207,7 +215,8 @@ class BvhConfig(CaptionConfig):
     own skeleton (docs/sources.md). Where none fits, and with `auto`, the map is guessed from the names."""
     name: str = "bvh"
     licence: str | None = None
-    """Licence of the clips, kept in every sample; needed for a conversion, not for its plan."""
+    """Licence of the clips, kept in every sample; needed for a conversion, not for its plan. HumanML3D's
+    originals have their own; it then says which of them are converted."""
     layout: str = "body133"
     """Feature layout of the shards: body133, h3d263, or one with hands and a face."""
     fps: float = Field(default=20.0, gt=0, le=240)
@@ -259,6 +268,10 @@ class BvhClip:
     """Frames of the file that are used."""
     fps: float
     about: Facts
+    licence: str | None = None
+    span: tuple[int, int] | None = None
+    """Frames [first, last) of the recording, an added pose in front of it apart; None: all."""
+    mirror_of: str | None = None
 
     @property
     def subset(self) -> str:
@@ -267,16 +280,20 @@ class BvhClip:
         return folders[0] if folders else ""
 
     @property
+    def seconds(self) -> float:
+        return self.frames / self.fps
+
+    @property
     def facts(self) -> dict[str, Fact]:
-        seconds = self.frames / self.fps
-        return {"subset": self.subset, "seconds": seconds, "fps": self.fps, **self.about}
+        return {"subset": self.subset, "seconds": self.seconds, "fps": self.fps, **self.about}
 
     def label(self) -> str:
-        return self.found.path
+        return self.found.path if self.span is None else f"{self.found.path} ({self.id})"
 
-    def read(self) -> bytes:
-        """Return its file, for `read_motion`."""
-        return read_file(self.folder / self.found.path, self.label())
+    def read(self) -> BvhMotion:
+        """Return the motion of its file."""
+        path = self.found.path
+        return read_motion(read_file(self.folder / path, path), path)
 
 
 def plan_bvh(
@@ -287,14 +304,18 @@ def plan_bvh(
     scan = scan_files(
         folder, names, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
-    draft = _decide(config, folder, scan, stated)
+    if config.humanml_index is None:
+        draft = _decide(config, folder, scan, stated)
+    else:
+        draft = ConversionPlan[BvhClip](config, stated=stated)
+        _decide_by_index(config, config.humanml_index, folder, scan, draft)
     maps = choose_maps(config, own_maps, draft, scan.joints, settings.maps)
     draft.limit(lambda clip: clip.id)
     layout = config.motion_layout()
     draft.finish(
         found=len(names),
         frames=lambda clip: frames_after(clip.frames, clip.fps, layout),
-        licence=lambda clip: config.licence or "not stated yet",
+        licence=lambda clip: clip.licence or "not stated yet",
     )
     return draft, maps
 
@@ -346,8 +367,39 @@ def _decide(config: BvhConfig, folder: Path, scan: Scan, stated: str) -> Convers
         )
         texts = listing.texts_of(clip.path)
         split, about = listing.split_of(clip.path), config.about(clip.path)
-        planned = BvhClip(folder, clip, clip_id, split, texts, frames, fps, about)
+        planned = BvhClip(folder, clip, clip_id, split, texts, frames, fps, about, config.licence)
         keep = config.uncaptioned == "keep"
         draft.take(planned, reason, captioned=bool(texts), wanted=config.has_captions, keep=keep)
     settle_captions(config, draft, listing)
     return draft
+
+
+def _decide_by_index(
+    config: BvhConfig, index: Path, folder: Path, scan: Scan, draft: ConversionPlan[BvhClip]
+) -> None:
+    """Plan the clips that HumanML3D's index cuts from the free originals."""
+    files = {file.path: file for file in scan.files.values()}
+    for file in files.values():
+        if file.problem:
+            draft.fail(file.path, UserError(file.problem))
+    found = find_originals(config, index, files, draft)
+    listed, notes = config.index_splits()
+    draft.notes += notes
+    apart: list[str] = []
+    for one in index_clips(config, found, listed):
+        file, row = files[one.file or ""], one.row
+        if file.problem:
+            continue
+        fps = config.source_fps or row.true_fps(file.fps)
+        first, last, wrong = row.span(file.frames, fps)
+        texts, broken = config.index_texts(one.id, (last - first) / fps, draft.notes)
+        clip = BvhClip(
+            folder, file, one.id, one.split, texts, last - first, fps, {"subset": row.subset},
+            ORIGINALS[row.subset], (first, last), one.mirror_of,
+        )  # fmt: skip
+        apart += [f"{clip.label()}: {wrong}"] if wrong else []
+        unlisted = listed is not None and one.id not in listed
+        reason = wrong or broken or ("in no split file" if unlisted else config.length_problem(clip.seconds))
+        keep, wanted = config.uncaptioned == "keep", config.has_captions
+        draft.take(clip, reason, captioned=bool(texts), wanted=wanted, keep=keep)
+    settle_index(config, draft, apart)

@@ -3,7 +3,8 @@
 Choices:
 - A line is read from the right, because captions may hold `#`. When the tokens hold one too (`#/SYM`), the
   split that makes every token `word/POS` is taken.
-- `nan` is 0.0, as in the published loaders, and 0.0#0.0 means the whole clip (`end` None).
+- `nan` is 0.0, as in the published loaders, and 0.0#0.0, as any segment without length, means the whole clip
+  (`end` None).
 - A segment that is wrong or reaches more than half a second past the clip is reported and left out: which
   frames it describes is unknown. Less than that is rounding, and the end is the clip's.
 """
@@ -52,9 +53,9 @@ def parse_caption(line: str, *, seconds: float | None, source: str = "humanml3d"
     cleaned = clean_caption(text)
     if not usable_caption(text):
         raise UserError(f"no usable caption ('{cleaned[:60]}')" if cleaned else "the caption is empty")
-    if start == 0.0 and end == 0.0:
+    if start == end:
         return Caption(text=cleaned, source=source, tokens=tokens)
-    if end <= start:
+    if end < start:
         raise UserError(f"the segment ends at {end:g} s, not after its start at {start:g} s")
     if seconds is not None:
         if start >= seconds or end > seconds + END_TOLERANCE:

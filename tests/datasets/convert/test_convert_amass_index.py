@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from motionloom.datasets.convert.amass.index import IndexRow, clip_key, read_index
+from motionloom.datasets.convert.captions.humanml_index import IndexRow, clip_key, read_index
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import decode

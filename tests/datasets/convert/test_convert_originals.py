@@ -1,0 +1,239 @@
+"""HumanML3D's clips cut from the free originals, against a slow reading of the files and cuts by hand."""
+
+from __future__ import annotations
+
+import math
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from amass_clips import features, meta_of, reasons
+from bvh_clips import SKELETON, write_clip, write_map
+from numpy.typing import NDArray
+
+from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.captions.humanml_index import ORIGINALS, IndexRow
+from motionloom.datasets.convert.common.conversion import Conversion, run_conversion
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.bvh.asf import read_amc
+from motionloom.datasets.motion.canonical import canonicalize, mirror, resample
+from motionloom.datasets.motion.features.codec import decode
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
+
+FILES = {
+    "cmu/133/133_24.bvh": (120.0, 10.0),
+    "cmu/60/60_01.bvh": (120.0, 5.0),  # captured at 60: ten seconds
+    "cmu/18/18_11.bvh": (120.0, 10.0),
+    "mocapdata/hamada/accident-12-twist foot-hamada.bvh": (60.0, 10.0),
+    "ACCAD/Female1General_bvh/A1 - Stand.bvh": (30.0, 4.0),
+    "hdm05/HDM_bd_02-01_01_120.bvh": (120.0, 9.0),
+    "stray.bvh": (30.0, 4.0),
+}
+"""Names as the originals have them, with the rate in the header, and seconds by it."""
+ROWS = """CMU/133/133_24_poses,20,120,000010
+CMU/133/133_24_poses,100,200,000011
+CMU/60/60_01_poses,40,180,000012
+CMU/18_19_rory/18_11_poses,0,60,000013
+CMU/01/01_01_poses,0,60,000014
+Eyes_Japan_Dataset/hamada/accident-12-twist foot-hamada_poses,10,130,000020
+ACCAD/Female1General_c3d/A1 - Stand_poses,0,80,000030
+MPI_HDM05/bd/HDM_bd_02-01_01_120_poses,20,100,000040
+KIT/3/walk_poses,0,60,000050"""
+SECONDS = {  # by hand: frames are twentieths, counted after 3 s in two of the collections
+    "000010": (1.0, 5.95), "000011": (5.0, 9.95), "000012": (2.0, 8.95), "000020": (3.5, 9.45),
+    "000030": (0.0, 3.95), "000040": (4.0, 7.95),
+}  # fmt: skip
+LAYOUT = MotionLayout.named("body133", fps=20.0)
+
+
+@pytest.fixture
+def tree(tmp_path: Path) -> Path:
+    """Originals, HumanML3D's index, texts and split files."""
+    for number, (name, (fps, seconds)) in enumerate(FILES.items()):
+        path = tmp_path / "mocap" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_clip(path, number, round(fps * seconds) + 1, fps)
+    write_map(tmp_path / "map.json")
+    write_index(tmp_path, ROWS.splitlines())
+    (tmp_path / "texts").mkdir()
+    for clip_id in SECONDS:
+        for side, prefix in (("left", ""), ("right", "M")):
+            lines = f"a person waves the {side} arm#a/DET arm/NOUN#0.0#0.0\nand stands#stand/VERB#1.0#nan\n"
+            lines = lines.replace("1.0#nan", "1.0#1.0") + "it ends#end/VERB#nan#2.0\n"
+            (tmp_path / "texts" / f"{prefix}{clip_id}.txt").write_text(lines)
+    named = [f"{prefix}{clip_id}" for clip_id in SECONDS for prefix in ("", "M")]
+    (tmp_path / "train.txt").write_text("\n".join(name for name in named if not name.endswith("11")))
+    (tmp_path / "test.txt").write_text("000011\nM000011\n")
+    return tmp_path
+
+
+def write_index(folder: Path, rows: list[str]) -> None:
+    lines = [f"./pose_data/{row.replace('_poses,', '_poses.npy,')}.npy" for row in rows]
+    (folder / "index.csv").write_text("\n".join(["source_path,start_frame,end_frame,new_name", *lines]))
+
+
+def planned(tree: Path, **options: Any) -> Conversion[Any]:
+    given = {"joint_map": tree / "map.json", "unit": "cm", "up": "y", "humanml_texts": tree / "texts"}
+    given |= {"source": tree / "mocap", "humanml_index": tree / "index.csv", "mirror": True}
+    return prepare(BvhConfig(**(given | options)))
+
+
+def turned(axis: str, degrees: float) -> NDArray[np.float64]:
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    rows = {"X": [[1, 0, 0], [0, c, -s], [0, s, c]], "Y": [[c, 0, s], [0, 1, 0], [-s, 0, c]]}
+    return np.array(rows.get(axis, [[c, -s, 0], [s, c, 0], [0, 0, 1]]))
+
+
+def slow_bvh(text: str) -> list[dict[str, NDArray[np.float64]]]:
+    """Places of all joints in every frame, by walking through the text as the format says."""
+    tree, lines = text.split("MOTION")
+    frames = []
+    for row in lines.strip().splitlines()[2:]:
+        numbers, above = iter(map(float, row.split())), [(np.zeros(3), np.eye(3))]
+        frame: dict[str, NDArray[np.float64]] = {}
+        name, offset = "", np.zeros(3)
+        for words in map(str.split, tree.strip().splitlines()):
+            if words[0] in ("ROOT", "JOINT", "End"):
+                name = "" if words[0] == "End" else words[1]
+            elif words[0] == "OFFSET":
+                offset = np.array(list(map(float, words[1:])))
+                place, turn = above[-1][0] + above[-1][1] @ offset, above[-1][1]
+                above.append((place, turn))
+            elif words[0] == "CHANNELS":
+                place, turn = above.pop()
+                for channel in words[2:]:
+                    value = next(numbers)
+                    if channel.endswith("position"):
+                        place = place + value * np.eye(3)["XYZ".index(channel[0])]
+                    else:
+                        turn = turn @ turned(channel[0], value)
+                above.append((place, turn))
+                frame[name] = place
+            elif words[0] == "}":
+                above.pop()
+        frames.append(frame)
+    return frames
+
+
+def by_hand(path: Path, fps: float, seconds: tuple[float, float]) -> NDArray[np.float64]:
+    """Joints [T, 22, 3] in metres between two times, both included."""
+    frames = slow_bvh(path.read_text())[round(seconds[0] * fps) : round(seconds[1] * fps) + 1]
+    return np.array([[frame[joint] for joint in SKELETON.joints] for frame in frames]) / 100
+
+
+def test_clips_are_cut_named_split_and_mirrored(tree: Path) -> None:
+    conversion = planned(tree)
+    manifest = run_conversion(conversion, tree / "out", progress=False)
+    made, wanted = features(tree / "out"), [clip_id for clip_id in SECONDS if clip_id != "000040"]
+    assert sorted(made) == sorted(f"{side}{clip_id}" for clip_id in wanted for side in ("", "M"))
+    places = dict(zip(SECONDS, [*FILES][:1] + [*FILES][:2] + [*FILES][3:], strict=False))
+    read = {clip.id: clip for _, clip in conversion.plan.items}
+    for clip_id in wanted:
+        place, fps = places[clip_id], 60.0 if clip_id == "000012" else FILES[places[clip_id]][0]
+        joints = by_hand(tree / "mocap" / place, fps, SECONDS[clip_id])
+        found = conversion.converter.joints(read[clip_id])
+        np.testing.assert_allclose(found.joints, joints, atol=1e-6, rtol=0)
+        assert found.fps == pytest.approx(fps, rel=1e-5)
+        for side, shown in (("", joints), ("M", mirror(joints, LAYOUT.skeleton))):
+            expected = canonicalize(resample(shown, fps, 20.0))
+            got = decode(made[f"{side}{clip_id}"], LAYOUT)
+            assert abs(len(got) - len(expected)) <= 1  # the header rounds the length of a frame
+            np.testing.assert_allclose(got, expected[: len(got)], atol=2e-5)
+        meta, texts = meta_of(tree / "out", f"M{clip_id}")
+        assert meta.mirror_of == clip_id and meta.split == ("test" if clip_id == "000011" else "train")
+        assert meta.licence == ORIGINALS[{"1": "CMU", "2": "Eyes_Japan_Dataset", "3": "ACCAD"}[clip_id[4]]]
+        spans = [(text.text, text.start, text.end) for text in texts]
+        assert spans == [
+            ("a person waves the right arm", 0, None), ("and stands", 0, None), ("it ends", 0, 2)
+        ]  # fmt: skip
+    left = reasons(manifest)
+    assert "two people" in left["CMU/18_19_rory/18_11_poses.npy"]
+    assert "not in the source" in left["CMU/01/01_01_poses.npy"] and "no row" in left["stray.bvh"]
+    assert not any("KIT" in name for name in left)
+    assert manifest.licence == "CC-BY-2.1-JP AND CC-BY-3.0"
+    assert manifest.licences == {"CC-BY-2.1-JP": 2, "CC-BY-3.0": 2, "CMU-mocap": 6}
+
+
+def test_share_alike_is_a_set_of_its_own(tree: Path) -> None:
+    plan = planned(tree).plan
+    assert any(note.startswith("MPI_HDM05: 1 clips under CC-BY-SA-3.0") for note in plan.notes)
+    conversion = planned(tree, licence="CC-BY-SA-3.0")
+    plan, path = conversion.plan, tree / "mocap" / [*FILES][5]
+    assert [clip.id for _, clip in plan.items] == ["000040", "M000040"]
+    assert plan.licences == {"CC-BY-SA-3.0": 2}
+    found = conversion.converter.joints(plan.items[0][1]).joints
+    np.testing.assert_allclose(found, by_hand(path, 120.0, SECONDS["000040"]), atol=1e-6, rtol=0)
+    with pytest.raises(UserError, match="CC-BY-SA-3"):
+        planned(tree, licence="unknown")
+
+
+def test_a_pose_in_front_shifts_no_cut(tree: Path) -> None:
+    """A writer's T-pose before the first frame is none of the index's frames."""
+    before = planned(tree)
+    path = tree / "mocap" / next(iter(FILES))
+    first = before.converter.joints(next(clip for _, clip in before.plan.items if clip.id == "000010"))
+    head, rows = path.read_text().split("Frame Time: ")
+    step, *values = rows.splitlines()
+    pose = " ".join(["300.0 95.0 0.0", *["0.0"] * (len(values[0].split()) - 3)])
+    head = head.replace(f"Frames: {len(values)}", f"Frames: {len(values) + 1}")
+    path.write_text("\n".join([f"{head}Frame Time: {step}", pose, *values]) + "\n")
+    after = planned(tree)
+    same = after.converter.joints(next(clip for _, clip in after.plan.items if clip.id == "000010"))
+    np.testing.assert_array_equal(same.joints, first.joints)
+
+
+def test_names_and_lengths_that_do_not_agree_stop(tree: Path) -> None:
+    rows = [*ROWS.splitlines(), "CMU/133/133_24_poses,100,206,000015"]
+    write_index(tree, rows)
+    assert "2 clips" in planned(tree).plan.stop  # and the mirrored one
+    with pytest.raises(UserError, match=r"133_24\.bvh \(000015\): the index ends 0\.25 s after"):
+        run_conversion(planned(tree), tree / "out", progress=False)
+    assert not (tree / "out").exists()
+    left = planned(tree, uncaptioned="drop").plan
+    assert not left.stop and "000015" not in {clip.id for _, clip in left.items}
+    (tree / "texts/000010.txt").unlink()
+    write_index(tree, ROWS.splitlines())
+    assert "no words for 1 of" in planned(tree).plan.stop
+
+
+def test_originals_and_amass_are_cut_alike() -> None:
+    """Where AMASS's rate is a multiple of 20 both ways of counting give the same frames."""
+    random = np.random.default_rng(0)
+    for _ in range(2000):
+        subset = str(random.choice(["CMU", "Eyes_Japan_Dataset", "MPI_HDM05", "ACCAD", "TotalCapture"]))
+        fps, start = float(random.choice([20, 60, 100, 120, 200])), int(random.integers(0, 90))
+        row = IndexRow("1", f"{subset}/a/b.npy", start, start + int(random.integers(-1, 120)))
+        frames = int(random.integers(1, 1500))
+        first, last, problem = row.span(frames, fps)
+        if not problem:
+            assert (first, last) == row.cut(frames, fps)
+        elif row.end > row.start and "after the" in problem:
+            assert row.cut(frames, fps)[1] <= frames  # AMASS's own files are cut short instead
+        else:
+            assert row.cut(frames, fps) == (0, 0)
+
+
+def test_real_trials_of_cmu(shared: Path, tmp_path: Path) -> None:
+    """The public AMC and BVH files of two trials: the same clip from both, and AMC's frames by hand."""
+    with tarfile.open(shared / "data/real/cmu/amc.tar.xz") as archive:
+        for name in ("amc/01.asf", "amc/01_01.amc"):
+            archive.extract(name, tmp_path, filter="data")
+    with tarfile.open(shared / "data/real/cmu/bvh_mb.tar.xz") as archive:
+        archive.extract("bvh_mb/01_01.bvh", tmp_path, filter="data")
+    write_index(tmp_path, ["CMU/01/01_01_poses,50,250,002510"])
+    clips = {}
+    for kind in ("amc", "bvh_mb"):
+        config = BvhConfig(source=tmp_path / kind, humanml_index=tmp_path / "index.csv", uncaptioned="keep")
+        conversion = prepare(config)
+        [(_, clip)] = conversion.plan.items
+        clips[kind] = conversion.converter.joints(clip).joints
+        assert len(clips[kind]) == 199 * 6 + 1
+    asf, amc = ((tmp_path / "amc" / name).read_bytes() for name in ("01.asf", "01_01.amc"))
+    whole = read_amc(asf, amc, name="01_01")
+    hips = whole.values[300 : 300 + 1195, :3] / 100
+    np.testing.assert_allclose(clips["amc"][:, 0], hips, atol=1e-6, rtol=0)
+    apart = [motion - motion[:1, :1] for motion in clips.values()]
+    assert np.abs(apart[0][:, 0] - apart[1][:, 0]).max() < 0.02  # two writers' skeletons, the same way
