@@ -27,7 +27,7 @@ from motionloom.datasets.audio.sound import read_sound
 from motionloom.datasets.check.clip import odd_value, require_sensible
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
-from motionloom.datasets.convert.bvh.plan import read_motion as read_mocap
+from motionloom.datasets.convert.bvh.read import read_motion as read_mocap
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import load_array, read_array_header
 from motionloom.datasets.convert.common.features import require_human

@@ -18,6 +18,7 @@ from pydantic import Field
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
+from motionloom.datasets.convert.bvh.read import read_header, read_motion
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.captions.humanml_index import (
     ORIGINALS,
@@ -33,17 +34,8 @@ from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.scan import FoundFile, Scan, list_files, read_file, scan_files
-from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_amc, skeleton_of
-from motionloom.datasets.motion.bvh.joint_map import (
-    JointMap,
-    UnfinishedMapError,
-    Unit,
-    Up,
-    metres,
-    skeleton_key,
-)
-from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
-from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
+from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, metres
+from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import Caption, Split, UserError
 
@@ -302,7 +294,7 @@ def plan_bvh(
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
     folder, names = config.files()
     scan = scan_files(
-        folder, names, _header, keep=settings.scan, workers=settings.workers, progress=settings.progress
+        folder, names, read_header, keep=settings.scan, workers=settings.workers, progress=settings.progress
     )
     if config.humanml_index is None:
         draft = _decide(config, folder, scan, stated)
@@ -318,27 +310,6 @@ def plan_bvh(
         licence=lambda clip: clip.licence or "not stated yet",
     )
     return draft, maps
-
-
-def read_motion(data: bytes, label: str) -> BvhMotion:
-    """The motion of a BVH file, or of an AMC file behind its skeleton."""
-    asf, joined, amc = data.partition(JOINED)
-    return read_amc(asf, amc, name=label) if joined else read_bvh(data, name=label)
-
-
-def _header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
-    asf, joined, amc = data.partition(JOINED)
-    if joined:
-        found, parents = skeleton_of(asf, label)
-        return count_frames(amc, label), FPS, skeleton_key(found, parents), found
-    text, where = load_text(data, label)
-    section = find_motion(text, where)
-    require_all_frames(text, section, where)
-    key, names = "", tuple[str, ...]()
-    with suppress(UserError):  # a broken hierarchy is reported when the clip is converted
-        joints = parse_hierarchy(text[: section.start], where)
-        key, names = skeleton_key(joints.names, joints.parents), tuple(joints.names)
-    return section.frames, section.fps, key, names
 
 
 def _decide(config: BvhConfig, folder: Path, scan: Scan, stated: str) -> ConversionPlan[BvhClip]:
