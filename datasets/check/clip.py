@@ -107,11 +107,6 @@ def read_member(file: BinaryIO, clip: TarClip, name: str) -> bytes:
     return file.read(size)
 
 
-def read_motion(file: BinaryIO, path: Path, clip: TarClip) -> NDArray[np.floating]:
-    """`motion.npy` of a clip of an open shard, as stored."""
-    return npy_from_bytes(read_member(file, clip, "motion.npy"), f"{path}: '{clip.key}.motion.npy'")
-
-
 def check_clip(
     file: BinaryIO, path: Path, clip: TarClip, shard: ShardInfo, layout: MotionLayout
 ) -> CheckedClip:
@@ -121,7 +116,7 @@ def check_clip(
     wanted = (layout.name, layout.family, layout.fps, layout.skeleton_name, shard.split)
     if stated != wanted:
         raise ValueError(f"meta.json says layout, family, fps, skeleton, split = {stated}, not {wanted}")
-    motion = read_motion(file, path, clip)
+    motion = npy_from_bytes(read_member(file, clip, "motion.npy"), f"{path}: '{clip.key}.motion.npy'")
     if motion.shape != (meta.frames, layout.dim) or not len(motion):
         raise ValueError(f"motion.npy is {list(motion.shape)}, wanted {[meta.frames, layout.dim]}")
     require_finite("motion.npy", motion)

@@ -11,7 +11,7 @@ same motion twice in one split, a licence the manifest does not know, no trainin
 
 Clips that the manifest excludes must be readable; what else is odd about them does not count.
 
-One shard's directory and one clip are in memory at a time, and about 400 bytes for every clip.
+One shard's directory and one clip are in memory at a time, and about 600 bytes for every clip.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from motionloom.datasets.shards.index import (
     load_index,
 )
 from motionloom.datasets.shards.reader import load_manifest, manifest_layout
-from motionloom.datasets.shards.tar import scan_tar
+from motionloom.datasets.shards.tar import TarClip, scan_tar
 
 _MOST_FOLDERS = 64
 """Folders of the source that are judged by themselves."""
@@ -115,15 +115,15 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
     for number, shard in enumerate(track(manifest.shards, "checking shards", disable=not progress)):
         indexed = _indexed_present(root / shard.name)
         try:
-            for row, key, clip in _checked_clips(root / shard.name, shard, layout, findings):
-                where = f"{shard.name}: '{key}'"
+            for row, place, clip in _checked_clips(root / shard.name, shard, layout, findings):
+                where = f"{shard.name}: '{place.key}'"
                 if row < len(indexed) and indexed[row] != clip.meta.present:
                     findings.error("index", where, "has_hands or has_face is not what the index says")
                 frames += clip.meta.frames
                 if clip.meta.id in manifest.excluded:
                     continue
                 joints = joints_of(clip.motion, layout)
-                table.add(number, row, clip.meta, joints)
+                table.add(number, place, clip.meta, joints)
                 figures.add(clip.meta, joints)
                 for kind, message in clip.oddities:
                     findings.warn(kind, where, message)
@@ -159,8 +159,8 @@ def _stray_files(root: Path, manifest: Manifest, findings: Findings) -> None:
 
 def _checked_clips(
     path: Path, shard: ShardInfo, layout: MotionLayout, findings: Findings
-) -> Iterator[tuple[int, str, CheckedClip]]:
-    """(row, key, clip) of every sound clip of one shard; what is wrong on the way goes to `findings`."""
+) -> Iterator[tuple[int, TarClip, CheckedClip]]:
+    """(row, place, clip) of every sound clip of one shard; what is wrong on the way goes to `findings`."""
     try:
         require_intact(LocalShard(path, shard))
     except UserError as error:
@@ -180,7 +180,7 @@ def _checked_clips(
                 findings.error("clip", f"{shard.name}: '{clip.key}'", message)
                 continue
             frames += checked.meta.frames
-            yield row, clip.key, checked
+            yield row, clip, checked
     if frames != shard.frames:
         findings.error("shard", shard.name, f"{frames} sound frames, the manifest says {shard.frames}")
 

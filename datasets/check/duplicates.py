@@ -14,21 +14,19 @@ What counts:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.check.clip import read_motion
 from motionloom.datasets.check.findings import Findings
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import ClipMeta, ShardInfo
-from motionloom.datasets.shards.tar import scan_tar
+from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
 
 SAME_METRES = 0.005
 """Mean distance of joints below which two motions are the same recording."""
@@ -51,7 +49,9 @@ class _Seen(NamedTuple):
     family: str
     """Id of the clip that it mirrors, else its own."""
     shard: int
-    row: int
+    key: str
+    motion: tuple[int, int]
+    """Byte in the shard where `motion.npy` starts, and its size: a shard's directory takes long to read."""
 
 
 class ClipTable:
@@ -61,14 +61,14 @@ class ClipTable:
         self.root, self.shards, self.layout = root, shards, layout
         self._clips: list[_Seen] = []
         self._signatures: list[NDArray[np.float32]] = []
-        self._scan = lru_cache(maxsize=8)(lambda shard: scan_tar(root / shards[shard].name))
 
     def __len__(self) -> int:
         return len(self._clips)
 
-    def add(self, shard: int, row: int, meta: ClipMeta, joints: NDArray[np.floating]) -> None:
-        """Remember clip number `row` of shard number `shard`, with joints [T, N, 3]."""
-        self._clips.append(_Seen(meta.id, meta.mirror_of or meta.id, shard, row))
+    def add(self, shard: int, clip: TarClip, meta: ClipMeta, joints: NDArray[np.floating]) -> None:
+        """Remember a clip of shard number `shard`, with joints [T, N, 3]."""
+        motion = clip.members["motion.npy"]
+        self._clips.append(_Seen(meta.id, meta.mirror_of or meta.id, shard, clip.key, motion))
         self._signatures.append(signature(joints))
 
     def report(self, findings: Findings) -> None:
@@ -126,12 +126,14 @@ class ClipTable:
         return self.shards[clip.shard].split
 
     def _where(self, clip: _Seen) -> str:
-        return f"{self.shards[clip.shard].name}: '{self._scan(clip.shard)[clip.row].key}'"
+        return f"{self.shards[clip.shard].name}: '{clip.key}'"
 
     def _motion(self, clip: _Seen) -> NDArray[np.floating]:
         path = self.root / self.shards[clip.shard].name
         with path.open("rb") as file:
-            return read_motion(file, path, self._scan(clip.shard)[clip.row])
+            start, size = clip.motion
+            file.seek(start)
+            return npy_from_bytes(file.read(size), f"{path}: '{clip.key}.motion.npy'")
 
 
 def signature(joints: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -242,6 +242,10 @@ class ShardDataset:
             raise UserError(f"{self._where(i, 'audio.flac')}: not readable sound ({error})") from None
         return signal, int(rate)
 
+    def let_go(self) -> None:
+        """Unmap the shards: for who reads all clips once, whose memory they would fill."""
+        self._access.maps.clear()
+
     def _captions(self, i: int, member: str) -> list[Caption]:
         raw = self._member(i, member)
         return captions_from_json(raw, self._where(i, member)) if raw else []

@@ -261,7 +261,8 @@ def _check_dataset(root: Path, console: Console) -> tuple[int, int, dict[str, ob
         findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
         for group in grouped(findings):
             if group.count > _ALIKE:
-                say(console, f"{title}{group}; each of them: --json")
+                first, others = group.members[0], f"(and {group.count - 1:,} more like it; each: --json)"
+                say(console, f"{title}{first.source}: {first.reason} {others}")
                 continue
             for finding in group.members:
                 say(console, f"{title}{finding.source}: {finding.reason}")

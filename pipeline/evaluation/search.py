@@ -41,7 +41,8 @@ from motionloom.pipeline.store.weights import MODEL_FILES
 
 INDEX_FILE = "search.npz"
 _VERSION = 2
-_BATCH = 256
+_BATCH = 32
+"""Clips that are read and embedded at a time: more are no faster on a processor, and take its memory."""
 MISFIT = 0.5
 """Share of other captions that fit a motion better than its own from which its own are suspect: above a half,
 the captions of a random clip would do as well."""
@@ -109,8 +110,7 @@ class Search:
         places = tuple(Place(split, clip) for split, part in splits.items() for clip in range(len(part)))
         vectors = _stored(root / INDEX_FILE, made_from, (len(places), tma.net.config.latent))
         if vectors is None:
-            embedded = np.concatenate(list(_embedded(splits, places, tma, progress)))
-            half = unit(embedded).astype(np.float16)
+            half = np.concatenate(list(_embedded(splits, places, tma, progress)))
             with atomic_file(root / INDEX_FILE) as file:
                 key = np.frombuffer(made_from.encode(), np.uint8)
                 np.savez(file, allow_pickle=False, made_from=key, vectors=half)
@@ -200,7 +200,9 @@ def features_for(tma: LoadedTma, joints: NDArray[np.floating], fps: float) -> tu
     return encode(joints, layout.without_face()), present
 
 
-def _embedded(splits: Splits, places: Sequence[Place], tma: LoadedTma, progress: bool) -> Iterator[Vectors]:
+def _embedded(
+    splits: Splits, places: Sequence[Place], tma: LoadedTma, progress: bool
+) -> Iterator[NDArray[np.float16]]:
     with Meter("embedding clips", len(places), shown=progress) as meter:
         for start in range(0, len(places), _BATCH):
             motions, present = [], []
@@ -213,8 +215,11 @@ def _embedded(splits: Splits, places: Sequence[Place], tma: LoadedTma, progress:
                     motion, held = features_for(tma, floored_joints(dataset, clip), dataset.layout.fps)
                 motions.append(motion)
                 present.append(held)
-            yield np.asarray(embed_motions(tma, motions, present))
+            yield unit(np.asarray(embed_motions(tma, motions, present))).astype(np.float16)
             meter.advance(len(motions))
+            del motion, motions
+            for dataset in splits.values():
+                dataset.let_go()
 
 
 def _stored(path: Path, made_from: str, shape: tuple[int, int]) -> Vectors | None:

@@ -6,6 +6,7 @@ import gzip
 import io
 import re
 import tarfile
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.runs.api import run_recipe
 
 LAYOUT = MotionLayout.named("body133")
@@ -95,6 +97,25 @@ def test_the_same_motion_twice(tmp_path: Path) -> None:
     assert report.warning_kinds == {"same motion": 1}
     (error,) = report.errors
     assert all(part in str(error) for part in ("'c'", "'train'", "'test'"))
+
+
+def test_many_recordings_in_two_splits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A shard's directory is read once for its clips and once for its index, whatever is compared; and many
+    findings are one sentence that shows the first of them.
+    """
+    motions = [features(seed) * np.float32(1 + 1e-6 * copy) for copy in range(2) for seed in range(7)]
+    halves: list[Split] = ["train"] * 7 + ["test"] * 7
+    pairs = enumerate(zip(halves, motions, strict=True))
+    made = [Made(f"c{at:02d}", split, motion) for at, (split, motion) in pairs]
+    report_on(tmp_path, *made)
+    read, whole = Counter[str](), tarfile.open
+    monkeypatch.setattr(tarfile, "open", lambda p, **how: (read.update([Path(p).name]), whole(p, **how))[1])
+    assert app(["data", "check", str(tmp_path)], standalone_mode=False) == 1
+    assert set(read.values()) == {2} and len(read) == 2
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "same recording" in line]
+    assert "…" not in line and "6 more" in line and "'train'" in line
 
 
 def test_a_mirror_image_that_does_not_say_so(tmp_path: Path) -> None:
