@@ -200,12 +200,14 @@ def launch(
         bool, typer.Option("--dry-run", help="Print the plan and what would be submitted; write nothing.")
     ] = False,
 ) -> None:
-    """Run a recipe on SLURM: its stages in jobs, each with the machines that it needs.
+    """Run a recipe on SLURM: a job per branch of its stages, each with the machines that it can use.
 
-    A conversion at its beginning becomes an array of jobs. Jobs are queued again when they are preempted or
-    their time limit is near, and go on from where they were.
+    With --cluster parts=8 a conversion is an array of eight jobs. Jobs are queued again when they are
+    preempted or their time limit is near, and go on from where they were.
 
     Example: `motionloom launch humantomato-paper --nodes 2 --cluster partition=gpu --dry-run`
+
+    Example: `motionloom launch bvh-body --set data.source=mocap --cluster parts=8 --dry-run`
     """
     from motionloom.pipeline.runs.slurm import launch_recipe
 

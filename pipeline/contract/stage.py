@@ -227,6 +227,8 @@ class StageKind(ABC, Generic[C]):
     """Columns of its training log that the report draws."""
     shares: bool = False
     """Whether all processes of a run take part by `share` before the first of them runs the stage."""
+    parts: bool = False
+    """Whether `run` can make the part `hardware.part` alone, beside others; of a kind without inputs."""
 
     def gives(self, config: C) -> frozenset[str]:
         """`offers`, where the config does not say otherwise."""

@@ -45,6 +45,8 @@ class Hardware(Config):
     each core that is left, up to four; on a CPU none."""
     convert_workers: int = Field(2, ge=1)
     """Processes that convert or synthesise shards."""
+    part: str | None = Field(None, pattern=r"^[1-9]\d*/[1-9]\d*$", exclude=True)
+    """Part of every conversion that is made, such as 3/8, and nothing else; a run without it joins all."""
     threads: int = Field(0, ge=0)
     """CPU threads per process; 0 takes one for networks below ten million parameters, else torch's choice."""
     stall_seconds: int = Field(600, ge=0)

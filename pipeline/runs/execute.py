@@ -17,6 +17,7 @@ from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache, StageContext, StageKind
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
+from motionloom.pipeline.runs.continuation import Started
 from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, require_fit
 from motionloom.pipeline.runs.recipe import Recipe
@@ -36,6 +37,8 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     only take part in trainings and in stages that share their work, and return after the last one.
     """
     todo = [row for row in plan if row.action in {"run", "resume"}]
+    if recipe.hardware.part is not None:
+        return _execute_part(recipe, run, plan, todo, console)
     joint = [row for row in todo if row.stage.kind.trains or row.stage.kind.shares]
     require_fit((row.stage for row in todo), recipe.hardware)
     if joint:
@@ -71,6 +74,31 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 console.print(f"    finished in {seconds:.1f} s")
         if leads:
             (run / REQUEST_FILE).unlink(missing_ok=True)
+    return [row.stage.name for row in todo]
+
+
+def _execute_part(
+    recipe: Recipe, run: Path, plan: Sequence[PlannedStage], todo: Sequence[PlannedStage], console: Console
+) -> list[str]:
+    """Make one part of each conversion, which a run without a part then joins and finishes."""
+    for row in todo:
+        if not row.stage.kind.parts:
+            raise UserError(
+                f"hardware.part is {recipe.hardware.part}, and stage '{row.stage.name}' cannot be made in "
+                f"parts; name stages that convert with --until"
+            )
+    with _locks(run, recipe, todo, shared=True):
+        _begin(recipe, run, plan)
+        for row in todo:
+            folder = stage_folder(run, row.stage.name)
+            console.print(
+                f"[bold]{row.stage.name}[/], part {recipe.hardware.part} ({row.stage.kind.summary})"
+            )
+            with file_lock(run / LOCK_FILE):  # the first of the parts prepares the folder for all
+                before = Started.find(folder)
+                if before is None or before.fingerprint != row.fingerprint:
+                    _prepare(folder, row)
+            row.stage.kind.run(context_of(recipe, run, row.stage, folder, console, Team()))
     return [row.stage.name for row in todo]
 
 
@@ -187,8 +215,11 @@ def _begin(recipe: Recipe, run: Path, plan: Sequence[PlannedStage]) -> None:
 
 
 @contextmanager
-def _locks(run: Path, recipe: Recipe, todo: Sequence[PlannedStage]) -> Iterator[None]:
-    """Hold each stage that is to be made, and with other readers those that they are made from.
+def _locks(
+    run: Path, recipe: Recipe, todo: Sequence[PlannedStage], *, shared: bool = False
+) -> Iterator[None]:
+    """Hold each stage that is to be made, `shared` with other parts of it, and with other readers those that
+    they are made from.
 
     Jobs that share no stage thus work in one run folder at once. Locks end with their process, even a killed
     one.
@@ -200,7 +231,9 @@ def _locks(run: Path, recipe: Recipe, todo: Sequence[PlannedStage]) -> Iterator[
     read = {above.name for row in todo for above in recipe.above(row.stage)} - made
     with ExitStack() as stack:
         for name in sorted(made | read):
-            if not stack.enter_context(file_lock(run / LOCKS / name, wait=False, shared=name in read)):
+            if not stack.enter_context(
+                file_lock(run / LOCKS / name, wait=False, shared=shared or name in read)
+            ):
                 raise UserError(
                     f"{run}: another motionloom process is working on this run's stage '{name}'; wait for "
                     f"it or stop it"

@@ -54,6 +54,8 @@ class SlurmOptions(Config):
     """Memory for each process that trains."""
     light_cpus: int = Field(8, ge=1)
     """CPU cores, and processes of a conversion, in a group of one process."""
+    parts: int = Field(1, ge=1)
+    """Jobs, of an array, that make a part of every conversion each."""
     light_memory_gb: float = Field(32, gt=0)
     """Memory of a group of one process."""
     warn_seconds: int = Field(120, ge=60)
@@ -127,6 +129,8 @@ class Group:
     machines: Machines
     settings: tuple[str, ...]
     """Settings of `hardware`, as `--set` takes them."""
+    parts: int = 1
+    """Jobs of the array that it is, each for one part of its conversions."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,7 @@ class LaunchPlan:
         for group in self.groups:
             at = group.machines
             each = f"{at.processes} processes, {at.gpus} GPUs, {at.cpus} cores"
-            stages = ", ".join(group.stages)
+            stages = ", ".join(group.stages) + (f" in {group.parts} parts" if group.parts > 1 else "")
             after = f", after {', '.join(group.after)}" if group.after else ""
             out.append(f"{group.name}: {stages}; {at.nodes} x ({each}), at most {at.minutes} min{after}")
         return out
@@ -196,13 +200,20 @@ def make_launch_plan(
     jobs = _jobs(recipe, options, nodes, gpus_per_node)
     names: dict[str, str] = {}  # stage -> its group
     waits: dict[str, set[str]] = {}  # group -> all groups before it
-    for number, job in enumerate(jobs, 1):
+    for job in jobs:
+        machines, settings = _machines(options, job, gpus_per_node), _settings(options, job, gpus_per_node)
+        first = ()
+        if options.parts > 1 and (cut := tuple(stage.name for stage in job.stages if stage.kind.parts)):
+            # The group behind it finds the parts made, and joins them.
+            name = f"{len(groups) + 1}-parts"
+            groups.append(Group(name, cut, cut, (), machines, settings, options.parts))
+            waits[name], first = set(), (name,)
         stages = tuple(stage.name for stage in job.stages)
         trained = [stage.name for stage in job.stages if stage.kind.trains]
-        name = f"{number}-{_word((trained or stages)[0], 20)}"
+        name = f"{len(groups) + 1}-{_word((trained or stages)[0], 20)}"
         # `--until` takes all that its stages need, so the last ones name the whole group.
         read = {source for stage in job.stages for source in stage.inputs.values()}
-        direct = {names[source] for source in read if source in names}
+        direct = {*first, *(names[source] for source in read if source in names)}
         implied = {group for one in direct for group in waits[one]}
         waits[name] = direct | implied
         names |= dict.fromkeys(stages, name)
@@ -212,8 +223,8 @@ def make_launch_plan(
                 stages=stages,
                 last=tuple(stage for stage in stages if stage not in read),
                 after=tuple(group for group in waits if group in direct - implied),
-                machines=_machines(options, job, gpus_per_node),
-                settings=_settings(options, job, gpus_per_node),
+                machines=machines,
+                settings=settings,
             )
         )
     for group in groups:

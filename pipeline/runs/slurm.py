@@ -3,6 +3,8 @@
 - `--dependency=afterok` with `--kill-on-invalid-dep`: a group starts when those before have succeeded, and
   is cancelled when that can no longer happen. A job that is queued again keeps its id, so what waits for it
   goes on waiting.
+- A conversion in parts is an array of jobs, and the group behind it joins them: a part that is queued again,
+  or given again with all of them, keeps the shards that it has finished.
 - Preemption and broken nodes queue a job again (`--requeue`). A time limit would not: the batch script is
   warned before it, passes the warning on, and queues itself again once the command has ended. A training
   saves the step that it is at, so none is made twice. A node that breaks costs at most
@@ -85,13 +87,15 @@ done
 # {saved}: a training is saved. 138: the warning ended a command that has nothing to save.
 # A job that was cancelled is not RUNNING any more; queued again it would come back.
 again=
-state=$(squeue --noheader --jobs="$SLURM_JOB_ID" --format=%T 2> /dev/null) || state=
+job=$SLURM_JOB_ID
+[ -z "${{SLURM_ARRAY_TASK_ID:-}}" ] || job=${{SLURM_ARRAY_JOB_ID}}_$SLURM_ARRAY_TASK_ID  # not the whole array
+state=$(squeue --noheader --jobs="$job" --format=%T 2> /dev/null) || state=
 if [ -n "$warned" ] && [ "${{state:-RUNNING}}" = RUNNING ]; then
   if [ "$code" -eq {saved} ] || [ "$code" -eq 138 ]; then again="the time limit is near"; fi
 elif [ "$code" -eq {saved} ] && [ "$state" = RUNNING ]; then
   again="asked to end"  # the grace time of a preemption
 fi
-if [ -n "$again" ] && scontrol requeue "$SLURM_JOB_ID"; then
+if [ -n "$again" ] && scontrol requeue "$job"; then
   echo "$again: queued again, goes on from there"
   trap - TERM
   sleep 3600  # SLURM ends this try
@@ -236,7 +240,8 @@ def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> lis
 def _text(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, cwd: Path) -> str:
     lines = ["#!/bin/bash", *(_directive(*one) for one in _options(plan, group, options, folder, cwd))]
     lines += [_SIGNALS.format(requeues=options.requeues).rstrip()]
-    lines += [f"{shlex.join(_command(plan, group, folder))} &"]
+    part = f' --set hardware.part="$SLURM_ARRAY_TASK_ID/{group.parts}"' if group.parts > 1 else ""
+    lines += [f"{shlex.join(_command(plan, group, folder))}{part} &"]
     lines += [_WAIT.format(saved=SAVED).rstrip()]
     return "\n".join(lines) + "\n"
 
@@ -246,9 +251,11 @@ def _options(
 ) -> list[tuple[str, str | None]]:
     machines = group.machines
     partition = options.partition if machines.gpus else options.light_partition or options.partition
-    log = f"{str(folder / group.name).replace('%', '%%')}-%j.log"
+    array = f"1-{group.parts}" if group.parts > 1 else None
+    log = f"{str(folder / group.name).replace('%', '%%')}-{'%A_%a' if array else '%j'}.log"
     options_of_job: list[tuple[str, str | None]] = [
         ("job-name", plan.job(group)),
+        ("array", array),
         ("partition", partition),
         ("account", options.account),
         ("nodes", str(machines.nodes)),

@@ -15,6 +15,7 @@ from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter
 from motionloom.datasets.convert.registry import converters, prepare
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.options import Part
 from motionloom.pipeline.contract.stage import StageConfig, StageContext, register
 from motionloom.pipeline.stages.data.data import DataStage, say_shards
 from motionloom.pipeline.store.data import SHARDS
@@ -34,6 +35,8 @@ def _stage_config(kind: type[AnyConverter]) -> type[StageConfig]:
 class ConvertStage(DataStage):
     """Shards converted from a source."""
 
+    parts = True
+
     def __init__(self, converter: type[AnyConverter]) -> None:
         summary = f"shards from {converter.title}"
         super().__init__(converter.name, summary, _stage_config(converter), self.convert)
@@ -48,7 +51,7 @@ class ConvertStage(DataStage):
     def convert(self, context: StageContext) -> None:
         """Convert the source into the stage's folder."""
         out = context.folder / SHARDS
-        workers = context.hardware.convert_workers
+        workers, part = context.hardware.convert_workers, context.hardware.part
         shown = not context.console.quiet
         conversion = prepare(context.config, kind=self.converter, out=out, workers=workers, progress=shown)
         manifest = run_conversion(
@@ -56,6 +59,7 @@ class ConvertStage(DataStage):
             out,
             workers=workers,
             progress=shown,
+            part=None if part is None else Part.parse(part),
             say=lambda line: context.console.print(f"    {line}", markup=False, soft_wrap=True),
         )
         say_shards(context, manifest)
