@@ -7,11 +7,13 @@ import importlib.util
 import io
 import re
 import shlex
+import subprocess
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jsonschema
 import pytest
 import typer
 import yaml
@@ -246,3 +248,75 @@ def test_the_examples_of_engines_run_our_command_on_their_machines(name: str) ->
     given = parsed(words[words.index("motionloom") :])
     hardware = load_recipe(given["recipe"], given["sets"]).hardware
     assert (hardware.nodes, hardware.devices) == (trainer["numNodes"] if trainer else data["num_nodes"], 8)
+
+
+def documents(name: str) -> list[dict[str, Any]]:
+    return list(yaml.safe_load_all((ROOT / "docs" / f"{name}.yaml").read_text()))
+
+
+def jobs_of_kubernetes() -> Iterator[tuple[int, str]]:
+    for one in documents("convert-job"):
+        yield (
+            one["spec"].get("completions", 1),
+            one["spec"]["template"]["spec"]["containers"][0]["command"][-1],
+        )
+
+
+def tasks_of_skypilot() -> Iterator[tuple[int, str]]:
+    for one in documents("convert-sky")[1:]:
+        yield one.get("num_nodes", 1), one["run"]
+
+
+@pytest.mark.parametrize("engine", [jobs_of_kubernetes, tasks_of_skypilot])
+def test_engines_make_every_part_once_and_join_them(engine: Callable[[], Iterator[tuple[int, str]]]) -> None:
+    """As a shell reads them, with an `echo` for a program."""
+    (count, convert), (once, join) = engine()
+    parts = []
+    for number in range(count):
+        ranks = {"JOB_COMPLETION_INDEX": str(number), "SKYPILOT_NODE_RANK": str(number)}
+        words = said(convert, ranks | {"SKYPILOT_NUM_NODES": str(count)})
+        parts.append(str(parsed(words)["part"]))
+    assert parts == [f"{number}/{count}" for number in range(1, 9)] and once == 1
+    assert parsed(said(join, {}))["out"] == Path(words[5])
+
+
+def said(script: str, environment: dict[str, str]) -> list[str]:
+    echo = (
+        script.replace("exec ", "")
+        .replace("cd /motionloom", "true")
+        .replace("motionloom data", "echo motionloom data")
+    )
+    shown = subprocess.run(["sh", "-c", echo], env=environment, capture_output=True, text=True, check=True)
+    return shown.stdout.split()
+
+
+def test_kubernetes_knows_every_key() -> None:
+    """By the types of its Python client, which are made of the published schema."""
+    client = pytest.importorskip("kubernetes.client")
+
+    def check(value: Any, kind: str) -> Any:
+        if inner := re.fullmatch(r"[Ll]ist\[(.+)\]", kind):
+            return [check(one, inner[1]) for one in value]
+        if inner := re.fullmatch(r"[Dd]ict[\[(]str, (.+)[\])]", kind):
+            return {key: check(one, inner[1]) for key, one in value.items()}
+        model = getattr(client, kind, None)
+        if model is None:
+            assert type(value).__name__ == kind or kind == "object", (value, kind)
+            return value
+        names = {key: name for name, key in model.attribute_map.items()}
+        return model(
+            **{names[key]: check(one, model.openapi_types[names[key]]) for key, one in value.items()}
+        )
+
+    for job in documents("convert-job"):
+        assert check(job, "V1Job").spec.template.spec.volumes
+    with pytest.raises(KeyError):
+        check({"spec": {"completion": 8}}, "V1Job")
+
+
+@pytest.mark.parametrize("name", ["convert-sky", "skypilot"])
+def test_skypilot_knows_every_key(name: str) -> None:
+    schemas = pytest.importorskip("sky.utils.schemas")
+    for task in documents(name):
+        jsonschema.validate(task, schemas.get_task_schema())
+        jsonschema.validate(task.get("resources", {}), schemas.get_resources_schema())

@@ -43,12 +43,12 @@ SPLITS = ("train", "train", "train", "train", "val", "test")
 TRAINED = ("tokenizer", "evaluate")
 """What is made anew under preemption."""
 
-GROUPS = ("1-data", "2-tokenizer")
+GROUPS = ("1-parts", "2-data", "3-tokenizer")
 """What a launch makes of it."""
 
 ASKED = (
     "partition=main", "light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=1", "memory_gb_per_gpu=1",
-    "clips_per_gpu=4",
+    "clips_per_gpu=4", "parts=2",
 )  # fmt: skip
 
 

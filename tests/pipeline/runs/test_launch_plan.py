@@ -15,9 +15,9 @@ from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.resolve import shipped_recipes
 
 
-def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1) -> LaunchPlan:
+def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1, parts: int = 1) -> LaunchPlan:
     return make_launch_plan(
-        load_recipe(name, overrides), SlurmOptions(), shipped=str(name), overrides=overrides,
+        load_recipe(name, overrides), SlurmOptions(parts=parts), shipped=str(name), overrides=overrides,
         out=Path("/runs/x"), nodes=nodes, gpus_per_node=gpus,
     )  # fmt: skip
 
@@ -88,6 +88,14 @@ def test_a_training_that_goes_on_is_named_to_its_own_group() -> None:
     told = [plan.command(group, "r.yaml", ["motionloom"]) for group in plan.groups]
     assert [words[words.index("--go-on") + 1] for words in told if "--go-on" in words] == ["gpt"]
     assert "gpt" in plan.groups[next(i for i, words in enumerate(told) if "--go-on" in words)].stages
+
+
+def test_a_conversion_in_parts_is_joined_by_the_group_behind_it() -> None:
+    parts, data, train, *_ = plan_of("bvh-body", parts=8).groups
+    assert (parts.stages, parts.after, parts.parts) == (("data",), (), 8)
+    assert (data.stages, data.after, data.parts) == (("data", "stats", "text"), ("1-parts",), 1)
+    assert train.after == ("2-data",)
+    assert not any(group.parts > 1 for group in plan_of("humantomato-paper", parts=8).groups)
 
 
 def test_without_gpus_all_is_for_cpus() -> None:

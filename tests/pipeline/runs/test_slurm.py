@@ -76,6 +76,12 @@ def test_scripts_ask_for_a_task_a_gpu(tmp_path: Path) -> None:
     ]
 
 
+def test_parts_are_an_array(tmp_path: Path) -> None:
+    parts, data, *_ = scripts(tmp_path, "bvh-body", "parts=8")
+    assert asked(parts)["array"] == "1-8" and asked(parts)["output"].endswith("1-parts-%A_%a.log")
+    assert "array" not in asked(data) and "hardware.part" not in data.text
+
+
 def fake_sbatch(folder: Path, monkeypatch: pytest.MonkeyPatch, refuse: str = "") -> Path:
     """Programs that write down how they were called; sbatch refuses scripts of that name."""
     folder.mkdir()
@@ -149,14 +155,16 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..
     """Starts a script of one process as SLURM would, with a command and a `scontrol` of ours."""
     jobs: list[subprocess.Popen[str]] = []
 
-    def start(command: str, scontrol: str = "exit 1", restarts: int = 0) -> subprocess.Popen[str]:
+    def start(
+        command: str, scontrol: str = "exit 1", restarts: int = 0, **more: str
+    ) -> subprocess.Popen[str]:
         monkeypatch.setattr(slurm, "PROGRAM", ("sh", "-c", command, "motionloom"))
         path, program = tmp_path / "job.sbatch", tmp_path / "scontrol"
-        path.write_text(scripts(tmp_path, "humantomato-tiny")[0].text)
+        path.write_text(scripts(tmp_path, "bvh-body", "parts=8")[0 if more else 1].text)
         program.write_text(f'#!/bin/sh\necho "$@" > asked; {scontrol}\n')
         program.chmod(0o755)
         env = {"PATH": f"{tmp_path}:{os.environ['PATH']}", "SLURM_JOB_ID": "7"}
-        env["SLURM_RESTART_COUNT"] = str(restarts)
+        env |= {"SLURM_RESTART_COUNT": str(restarts), **more}
         jobs.append(
             subprocess.Popen(["bash", str(path)], env=env, text=True, cwd=tmp_path, start_new_session=True)
         )
@@ -205,6 +213,17 @@ def test_a_warning_reaches_the_command(
     if code is None:
         time.sleep(0.1)
         assert started.poll() is None  # it waits for SLURM to end it
+
+
+def test_a_part_alone_is_queued_again(job: Callable[..., Any], tmp_path: Path) -> None:
+    """It knows its own number, and the array's id is that of all parts."""
+    command = "trap 'exit 75' USR1; echo $@ > given; while :; do sleep 0.02; done"
+    started = job(command, "exit 0", SLURM_ARRAY_JOB_ID="5", SLURM_ARRAY_TASK_ID="3")
+    given, again = tmp_path / "given", tmp_path / "asked"
+    wait_until(given.exists)
+    assert given.read_text().split()[-2:] == ["--set", "hardware.part=3/8"]
+    started.send_signal(signal.SIGUSR1)
+    wait_until(lambda: again.exists() and again.read_text() == "requeue 5_3\n")
 
 
 def test_the_end_of_a_job_reaches_the_command(job: Callable[..., Any], tmp_path: Path) -> None:
