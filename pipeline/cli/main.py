@@ -202,8 +202,7 @@ def launch(
 ) -> None:
     """Run a recipe on SLURM: a job per branch of its stages, each with the machines that it can use.
 
-    With --cluster parts=8 a conversion is an array of eight jobs. Jobs are queued again when they are
-    preempted or their time limit is near, and go on from where they were.
+    A conversion may be an array (parts). Jobs that are preempted or near their time limit are queued again.
 
     Example: `motionloom launch humantomato-paper --nodes 2 --cluster partition=gpu --dry-run`
 
