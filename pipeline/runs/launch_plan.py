@@ -202,7 +202,7 @@ def make_launch_plan(
     waits: dict[str, set[str]] = {}  # group -> all groups before it
     for job in jobs:
         machines, settings = _machines(options, job, gpus_per_node), _settings(options, job, gpus_per_node)
-        first = ()
+        first: tuple[str, ...] = ()
         if options.parts > 1 and (cut := tuple(stage.name for stage in job.stages if stage.kind.parts)):
             # The group behind it finds the parts made, and joins them.
             name = f"{len(groups) + 1}-parts"
