@@ -36,7 +36,7 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.inputs import Sources, as_stages
-from motionloom.pipeline.runs.resolve import TRAINED, Tree, find_recipe, resolve
+from motionloom.pipeline.runs.resolve import PUBLISHED, TRAINED, Tree, find_recipe, resolve
 from motionloom.pipeline.store.run_folder import STAGE_NAME, place_from
 from motionloom.pipeline.store.yaml import dump_yaml
 from motionloom.pipeline.training.config import TrainedStageConfig
@@ -222,7 +222,7 @@ def recipe_schema() -> Tree:
     schema = RecipeFile.model_json_schema()
     definitions: Tree = schema.setdefault("$defs", {})
     branches, kinds = [], stage_kinds()
-    defaults: Tree = {TRAINED: _fields(TrainedStageConfig, definitions)}
+    defaults: Tree = {TRAINED: _fields(TrainedStageConfig, definitions), PUBLISHED: {"type": "boolean"}}
     for name, kind in kinds.items():
         stage = _fields(kind.config, definitions)
         defaults[name] = dict(stage)

@@ -14,7 +14,8 @@
 The later layer wins: what is extended, the file itself, `--set`. Mappings merge key by key, lists are
 replaced whole; a stage of another kind replaces the old one whole, and `null` removes it. Then each stage's
 entry goes over what the `start` model says of it and over the `defaults` of its kind, and those over
-`trained`, which concerns all stages that train.
+`trained`, which concerns all stages that train. `published: true` puts between the two the settings by which
+the baselines were published (`pipeline/baselines/published.yaml`), for which `trained` is not meant.
 
 With `start`, a stage without a `kind` is trained on from the model's stage of that name: same kind, same
 settings but for `optim` and `train`. What the recipe does not train is the model's own: its statistics, its
@@ -47,6 +48,8 @@ START = "start"
 """Key of a recipe, and the role in which a stage takes the network that it goes on from."""
 TRAINED = "trained"
 """The defaults of every stage that trains."""
+PUBLISHED = "published"
+"""The defaults by which baselines take their published settings."""
 
 _DEEPEST = 4
 _TOP = ("name", "description", "seed", "data_seed", "hardware", START, "defaults", "stages")
@@ -64,6 +67,13 @@ def shipped_recipes() -> dict[str, Path]:
     recipes = {f"{path.parent.name}-{path.stem}": path for path in folder.glob("*/*.yaml")}
     recipes |= {path.stem: path for path in folder.glob("*.yaml")}
     return dict(sorted(recipes.items()))
+
+
+def published_settings() -> dict[str, Tree]:
+    """Settings of the baselines' papers and code by kind: `stage`, `judged`, `text`, `ours`."""
+    folder = Path(str(resources.files("motionloom.pipeline.baselines")))
+    table: dict[str, Tree] = read_yaml(folder / "published.yaml")
+    return table
 
 
 def find_recipe(name_or_path: str) -> Path:
@@ -94,6 +104,7 @@ def resolve(path: Path, overrides: Sequence[str], where: str) -> Tree:
     name, stages, defaults = data.pop(START, None), data.get("stages"), data.pop("defaults", None) or {}
     if not isinstance(defaults, dict):
         raise UserError(f"{where}: defaults must map kinds of stages to settings")
+    published = published_settings() if defaults.pop(PUBLISHED, False) is True else {}
     for key, fields in defaults.items():
         _require_default(key, fields, where)
     if not isinstance(stages, dict):
@@ -112,6 +123,7 @@ def resolve(path: Path, overrides: Sequence[str], where: str) -> Tree:
             raise UserError(f"{where}: stages.{key} says no kind{hint}")
         shared: Tree = {}
         for concerning in _defaults_of(entry):
+            shared = merge(shared, published.get(concerning, {}).get("stage", {}))
             shared = merge(shared, defaults.get(concerning, {}))
         stages[key] = merge(shared, entry)
     _require_used(defaults.keys() - inherited, stages, where)
