@@ -40,6 +40,8 @@ MANIFEST_FILE, INDEX_FILE = "manifest.json", "index.npz"
 """In the folder of a data set, beside its shards."""
 CLEANED_FILE = "cleaned.json"
 """Beside them where somebody has cleaned the set."""
+REMOVED_FILE = "removed.json"
+"""Beside them where clips were removed from the set."""
 
 
 class UserError(Exception):

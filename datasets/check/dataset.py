@@ -27,10 +27,20 @@ from rich.progress import track
 from motionloom.datasets.check.clip import CheckedClip, check_clip
 from motionloom.datasets.check.duplicates import ClipTable
 from motionloom.datasets.check.findings import Findings, Problem
+from motionloom.datasets.convert.common.removed import Removed
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.plausibility import PlausibilityStats, measure
-from motionloom.datasets.schema import INDEX_FILE, SPLITS, ClipMeta, Manifest, ShardInfo, Split, UserError
+from motionloom.datasets.schema import (
+    INDEX_FILE,
+    REMOVED_FILE,
+    SPLITS,
+    ClipMeta,
+    Manifest,
+    ShardInfo,
+    Split,
+    UserError,
+)
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import (
     ShardIndex,
@@ -112,6 +122,7 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
     table = ClipTable(root, manifest.shards, layout)
     figures = Figures(layout)
     widths: dict[int, str] = {}
+    removed = Removed.of(root)
     for number, shard in enumerate(track(manifest.shards, "checking shards", disable=not progress)):
         indexed = _indexed_present(root / shard.name)
         try:
@@ -120,6 +131,8 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
                 if row < len(indexed) and indexed[row] != clip.meta.present:
                     findings.error("index", where, "has_hands or has_face is not what the index says")
                 frames += clip.meta.frames
+                if removed.has(clip.meta.id, clip.meta.source):
+                    findings.error("removed", where, f"in {REMOVED_FILE}; give data remove again")
                 if clip.meta.id in manifest.excluded:
                     continue
                 joints = joints_of(clip.motion, layout)

@@ -15,7 +15,8 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion
 from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter, Converter, PlanSettings
 from motionloom.datasets.convert.common.earlier import moved_clips
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.convert.common.removed import Removed
+from motionloom.datasets.schema import REMOVED_FILE, UserError
 
 _HELPERS = ("captions", "common", "sets")
 
@@ -83,4 +84,7 @@ def prepare(
     converter, folder = kind(config), maps or out
     scan = None if out is None else out / SCAN_FILE
     plan = converter.plan(PlanSettings(workers, progress, scan, folder))
-    return Conversion(converter, plan, "" if folder is None else moved_clips(folder, plan))
+    if folder is None:
+        return Conversion(converter, plan)
+    plan.leave_removed(Removed.of(folder).has, REMOVED_FILE)
+    return Conversion(converter, plan, moved_clips(folder, plan))

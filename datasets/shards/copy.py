@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.schema import CLEANED_FILE, INDEX_FILE, MANIFEST_FILE, Manifest, UserError
+from motionloom.datasets.schema import (
+    CLEANED_FILE,
+    INDEX_FILE,
+    MANIFEST_FILE,
+    REMOVED_FILE,
+    Manifest,
+    UserError,
+)
 from motionloom.datasets.shards.index import index_path
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE
 from motionloom.datasets.shards.reader import read_manifest
@@ -38,7 +45,8 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
     sums = {shard.name: shard.sha256 for shard in manifest.shards}
     # Without the others of these a data set can be read; `data convert` and `data clean` go on with them.
     needed = {*sums, INDEX_FILE, MANIFEST_FILE}
-    names = [*sums, *map(_index_name, sums), LEFT_OUT_FILE, CLEANED_FILE, INDEX_FILE, MANIFEST_FILE]
+    others = (LEFT_OUT_FILE, CLEANED_FILE, REMOVED_FILE, INDEX_FILE, MANIFEST_FILE)
+    names = [*sums, *map(_index_name, sums), *others]
     sent = kept = 0
     with tempfile.TemporaryDirectory() as folder, Meter("copying", len(names), shown=progress) as meter:
         for name in names:

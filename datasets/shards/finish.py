@@ -152,7 +152,7 @@ def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
     if len(made_on) > 1:
         kinds = f"{len(made_on)} kinds of processor ({', '.join(sorted(made_on))})"
         note = f"made on {kinds}: the last digits of clips may differ from those of a set made on one"
-        manifest = manifest.model_copy(update={"notes": [*manifest.notes, note]})
+        manifest = manifest.model_copy(update={"notes": list(dict.fromkeys([*manifest.notes, note]))})
     write_json(out / MANIFEST_FILE, manifest.dump())
     for folder in (OLD_FOLDER, PARTS_FOLDER):
         shutil.rmtree(out / folder, ignore_errors=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import platform
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -65,16 +65,20 @@ def plan_shards(
     how: WriteOptions,
     describe: Callable[[T], str],
     depends_on: Callable[[T], object] | None = None,
+    removed: Sequence[tuple[Split, T]] = (),
 ) -> list[ShardTask[T]]:
     """Return the shards with their items in order: known before the first one is converted.
 
     With `depends_on`, what the content of an item is, they are ordered by a hash of their names: when others
-    come and go, those that stay keep their neighbours, so that a shard finds them in few old ones.
+    come and go, those that stay keep their neighbours, so that a shard finds them in few old ones. Items that
+    are `removed` leave their places empty, so that no other goes to another shard.
     """
     tasks: list[ShardTask[T]] = []
     made_from = sha256_of_json(facts.made_from())
     for position, split in enumerate(SPLITS):
         members = [item for item_split, item in items if item_split == split]
+        present = len(members)
+        members += [item for item_split, item in removed if item_split == split]
         names = [describe(item) for item in members]
         if depends_on is None:
             order = permutation(len(members), how.seed, position).tolist()
@@ -84,11 +88,11 @@ def plan_shards(
             content = [depends_on(item) for item in members]
         # A fingerprint hashes all that a shard's bytes depend on: a later run keeps the shards that fit.
         for number, first in enumerate(range(0, len(members), how.clips_per_shard)):
-            chosen = tuple(
-                ShardItem(names[i], sha256_of_json([made_from, split, names[i], content[i]]), members[i])
-                for i in order[first : first + how.clips_per_shard]
-            )
-            fingerprint = sha256_of_json([facts.name, split, number, [item.made_from for item in chosen]])
+            places = order[first : first + how.clips_per_shard]
+            digests = {i: sha256_of_json([made_from, split, names[i], content[i]]) for i in places}
+            chosen = tuple(ShardItem(names[i], digests[i], members[i]) for i in places if i < present)
+            fingerprint = sha256_of_json([facts.name, split, number, list(digests.values())])
+            fingerprint = without(fingerprint, (digests[i] for i in places if i >= present))
             path = out / f"{facts.name}-{split}-{number:06d}.tar"
             tasks.append(
                 ShardTask(
@@ -96,6 +100,12 @@ def plan_shards(
                 )
             )
     return tasks
+
+
+def without(fingerprint: str, removed: Iterable[str]) -> str:
+    """The fingerprint of a shard from which items were removed, by their `made_from`."""
+    whole, *before = fingerprint.split("-")
+    return "-".join([whole, *sorted({*before, *(digest[:16] for digest in removed)})])
 
 
 def write_shard(task: ShardTask[T], convert: Convert[T]) -> Result:

@@ -82,12 +82,13 @@ def dataset_writer(
     *,
     describe: Callable[[T], str] = str,
     depends_on: Callable[[T], object] | None = None,
+    removed: Sequence[tuple[Split, T]] = (),
 ) -> Iterator[DatasetWriter[T]]:
     """Take hold of `out` and look at what is finished there, for work between that and the writing.
 
     `describe` names an item in reports and in the digest that decides whether what an earlier run made of it
     is kept, so it must not change between runs. `depends_on` says what the item's content is, as plain JSON;
-    without it only names and the facts' options are compared.
+    without it only names and the facts' options are compared. `removed` as for `plan_shards`.
     """
     how = how or WriteOptions()
     _check_arguments(facts, how)
@@ -95,7 +96,8 @@ def dataset_writer(
     out.mkdir(parents=True, exist_ok=True)
     with folder_lock(out, shared=how.part is not None), Workers(how.workers) as pool:
         _check_same_dataset(out, facts.name, facts.layout, facts.options)
-        yield DatasetWriter(out, plan_shards(out, items, facts, how, describe, depends_on), facts, how, pool)
+        tasks = plan_shards(out, items, facts, how, describe, depends_on, removed)
+        yield DatasetWriter(out, tasks, facts, how, pool)
 
 
 class DatasetWriter(Generic[T]):
@@ -114,7 +116,8 @@ class DatasetWriter(Generic[T]):
         self._todo = [at for at, result in enumerate(self._results) if result is None]
         self._news = ""
         if self._todo:
-            (out / MANIFEST_FILE).unlink(missing_ok=True)
+            for folder in (out, out / OLD_FOLDER):  # a removal that was killed has no say any more
+                (folder / MANIFEST_FILE).unlink(missing_ok=True)
             if part is None:
                 self._take_over(tasks)
         if part is None:

@@ -100,6 +100,30 @@ def copy(
 
 
 @data_app.command()
+def remove(
+    root: Root,
+    subject: Annotated[
+        list[str] | None, typer.Option(help="All clips of a person or folder; may be repeated.")
+    ] = None,
+    clip: Annotated[list[str] | None, typer.Option("--id", help="One clip; may be repeated.")] = None,
+) -> None:
+    """Clips out of a set for good, without its source; later conversions into the folder keep them out.
+
+    Killed, give it again. Copies of the set and models trained on it stay as they are.
+
+    Example: `motionloom data remove shards --subject anna`
+    """
+    from motionloom.datasets.convert.common.removed import remove
+
+    made = remove(root, ids=clip or (), subjects=subject or ())
+    say(
+        make_console(),
+        f"{root}: {made.clips:,} clips removed; {made.shards:,} shards written again; removed.json keeps "
+        f"them out of later conversions",
+    )
+
+
+@data_app.command()
 def check(
     paths: Annotated[
         list[Path],

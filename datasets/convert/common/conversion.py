@@ -73,8 +73,9 @@ class Conversion(Generic[C]):
 
     def share(self, part: Part) -> dict[str, int]:
         """Numbers of shards and clips that a part would make."""
+        plan, how = self.plan, WriteOptions()
         tasks = plan_shards(
-            Path(), self.plan.items, self.facts(), WriteOptions(), _label, self.converter.depends_on
+            Path(), plan.items, self.facts(), how, _label, self.converter.depends_on, plan.removed
         )
         own = [task for at, task in enumerate(tasks) if part.has(at)]
         return {"shards": len(own), "clips": sum(len(task.items) for task in own)}
@@ -112,7 +113,7 @@ def run_conversion(
         raise UserError(f"{plan.name}: say under which licence the clips are: --set licence=CC-BY-4.0")
     depends_on = conversion.converter.depends_on
     with dataset_writer(
-        out, plan.items, conversion.facts(), how, describe=_label, depends_on=depends_on
+        out, plan.items, conversion.facts(), how, describe=_label, depends_on=depends_on, removed=plan.removed
     ) as writer:
         for line in filter(None, (writer.progress_line, conversion.moved)):
             say(line)

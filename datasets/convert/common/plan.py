@@ -90,6 +90,10 @@ class ConversionPlan(Generic[C]):
     """Label of the first clip with each id."""
     known: set[str] = field(default_factory=set)
     """Names of the facts that `config.where` may ask for."""
+    removed: list[tuple[Split, C]] = field(default_factory=list)
+    """Clips that `data remove` took out of the set: no sample is made of them, nor are they named."""
+    totals: Callable[[], None] = lambda: None
+    """Counts frames and licences of `items`, once it is finished."""
 
     @property
     def name(self) -> str:
@@ -155,11 +159,29 @@ class ConversionPlan(Generic[C]):
         if self.stated:
             self.notes.append(f"{self.stated}; found here: {self.clips:,} clips, {self.hours:,.1f} hours")
         self.found, self.notes = found, grouped_notes(self.notes)
-        self.frames = dict.fromkeys(SPLITS, 0)
-        for split, clip in self.items:
-            self.frames[split] += frames(clip)
-        self.licences = dict(sorted(Counter(licence(clip) for _, clip in self.items).items()))
+
+        def totals() -> None:
+            self.frames = dict.fromkeys(SPLITS, 0)
+            for split, clip in self.items:
+                self.frames[split] += frames(clip)
+            self.licences = dict(sorted(Counter(licence(clip) for _, clip in self.items).items()))
+
+        self.totals = totals
+        totals()
         return self
+
+    def leave_removed(self, gone: Callable[[str, str], bool], record: str) -> None:
+        """Take out what is removed, by id and label, and all that names it; `record` is named in the note."""
+        self.removed = [item for item in self.items if gone(item[1].id, item[1].label())]
+        if self.removed:
+            self.notes.append(f"{len(self.removed):,} clips stay out, as they were removed ({record})")
+        names = {clip.label() for _, clip in self.removed}
+        self.items = [item for item in self.items if item[1].label() not in names]
+        for drops in (self.missing, self.dropped, self.rejected, self.broken):
+            names.update(one.source for one in drops if gone("", one.source))
+            drops[:] = [one for one in drops if one.source not in names]
+        self.notes = [note for note in self.notes if not any(name in note for name in names)]
+        self.totals()
 
     def counts(self) -> dict[Split, int]:
         return {split: sum(s == split for s, _ in self.items) for split in SPLITS}

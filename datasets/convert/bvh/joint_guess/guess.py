@@ -100,7 +100,7 @@ class JointGuess:
 
     def text(self, skeleton: str) -> str:
         """The map file, for files of `skeleton` alone."""
-        note = f"guessed from {self.source}: {self.summary()}"
+        note = f"guessed: {self.summary()}"
         if not self.certain:
             todo = "Fill in the rows that say null" if self.open_rows else "Correct the rows"
             note += f". NOT CERTAIN: {self.doubts()}. {todo}"
