@@ -79,8 +79,8 @@ def published_settings() -> dict[str, Tree]:
 def find_recipe(name_or_path: str) -> Path:
     """A recipe file by path, or a shipped recipe by name; `FOLDER/SIZE` is a name too."""
     path = Path(name_or_path)
+    require_local(path)
     if path.suffix in {".yaml", ".yml"}:
-        require_local(path)
         if not path.is_file():
             raise UserError(f"{path}: no such recipe file")
         return path
