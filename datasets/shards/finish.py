@@ -24,6 +24,7 @@ from motionloom.datasets.schema import (
     ShardInfo,
     Split,
     UserError,
+    require_local,
 )
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
@@ -70,6 +71,7 @@ def join_parts(out: Path) -> Manifest:
 
     `UserError` for parts that are missing, unfinished, or made of other sources or with other settings.
     """
+    require_local(out)
     if not out.is_dir():
         raise UserError(f"{out}: no such folder")
     with folder_lock(out):
@@ -102,28 +104,21 @@ def _require_one_plan(out: Path, records: Mapping[Part, Planned]) -> Planned:
     (one, planned), *others = records.items()
     for part, other in others:
         if other.fingerprints != planned.fingerprints:
-            changed = differences(_settings(planned), _settings(other))
-            told = "; ".join(changed) or "its files, captions or joint maps are others"
+            changed = differences(planned.manifest, other.manifest)
             raise UserError(
-                f"{out}: part {part} is not of the same source and settings as part {one} ({told}): "
-                f"give one of them again, or delete its record in {out / PARTS_FOLDER}"
+                f"{out}: part {part} is not of the same source and settings as part {one} "
+                f"({changed or 'its files, captions or joint maps are others'}): give one of them again, or "
+                f"delete its record in {out / PARTS_FOLDER}"
             )
     return planned
 
 
-def _settings(planned: Planned) -> dict[str, object]:
-    manifest = planned.manifest
-    named = {"name": manifest.name, "layout": manifest.layout, "fps": manifest.fps}
-    return {**manifest.options, **named}
-
-
-def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
+def differences(before: Manifest, now: Manifest) -> str:
     """Options that differ, at most three of them, as `fps 20.0 -> 10.0`; the source is no option."""
-    keys = [
-        key for key in sorted({*before, *now}) if key != SOURCE_CHECKSUM and before.get(key) != now.get(key)
-    ]
-    told = [_difference(key, before.get(key), now.get(key)) for key in keys[:3]]
-    return [*told, f"and {len(keys) - 3} more"] if len(keys) > 3 else told
+    old, new = (one.dump()["options"] | {"layout": one.layout, "fps": one.fps} for one in (before, now))
+    keys = [key for key in sorted({*old, *new} - {SOURCE_CHECKSUM}) if old.get(key) != new.get(key)]
+    told = [_difference(key, old.get(key), new.get(key)) for key in keys[:3]]
+    return "; ".join([*told, f"and {len(keys) - 3} more"] if len(keys) > 3 else told)
 
 
 def _difference(key: str, before: object, now: object) -> str:

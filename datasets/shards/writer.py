@@ -25,8 +25,15 @@ from typing import Generic, TypeVar
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import MANIFEST_FILE, Manifest, Split, UserError, require_local
+from motionloom.datasets.schema import (
+    MANIFEST_FILE,
+    Manifest,
+    Split,
+    UserError,
+    parse_json,
+    read_plain,
+    require_local,
+)
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.finish import (
     OLD_FOLDER,
@@ -95,7 +102,6 @@ def dataset_writer(
     require_local(out)
     out.mkdir(parents=True, exist_ok=True)
     with folder_lock(out, shared=how.part is not None), Workers(how.workers) as pool:
-        _check_same_dataset(out, facts.name, facts.layout, facts.options)
         tasks = plan_shards(out, items, facts, how, describe, depends_on, removed)
         yield DatasetWriter(out, tasks, facts, how, pool)
 
@@ -109,6 +115,7 @@ class DatasetWriter(Generic[T]):
         self.out, self._pool = out, pool
         self._how, self._name = how, facts.name
         self._planned = _planned(tasks, facts)
+        _require_same(out, self._planned.manifest)
         part = how.part
         self._tasks = tasks if part is None else [task for at, task in enumerate(tasks) if part.has(at)]
         with ThreadPoolExecutor(pool.count) as threads:  # hashing runs outside the interpreter's lock
@@ -245,23 +252,17 @@ def _check_arguments(facts: DatasetFacts, how: WriteOptions) -> None:
         raise UserError(f"converter options must be plain JSON values: {error}") from None
 
 
-def _check_same_dataset(out: Path, name: str, layout: MotionLayout, options: dict[str, object]) -> None:
+def _require_same(out: Path, now: Manifest) -> None:
     """Never write over another dataset, or over a finished one that was made with other options."""
+    path = out / MANIFEST_FILE
     try:
-        manifest = json.loads((out / MANIFEST_FILE).read_bytes())
-        name_before, before = manifest.get("name"), dict(manifest.get("options") or {})
-    except FileNotFoundError:
+        before = Manifest.parse(parse_json(read_plain(path), str(path)), str(path))
+    except FileNotFoundError:  # or another part took it away meanwhile
         return
-    except (ValueError, AttributeError, TypeError):
-        raise UserError(f"{out / MANIFEST_FILE}: not a manifest; choose another folder") from None
-    if name_before != name:
-        raise UserError(f"{out} holds dataset '{name_before}', not '{name}'; choose another folder")
-    before |= {"layout": manifest.get("layout"), "fps": manifest.get("fps")}
-    # Options as JSON has them: a tuple that was written comes back as a list.
-    now = {**json.loads(json.dumps(options)), "layout": layout.name, "fps": layout.fps}
-    changed = differences(before, now)
-    if changed:
+    if before.name != now.name:
+        raise UserError(f"{out} holds dataset '{before.name}', not '{now.name}'; choose another folder")
+    if changed := differences(before, now):
         raise UserError(
-            f"{out} holds this dataset, finished with other options ({'; '.join(changed)}); choose another "
-            f"folder, or delete this one to make it anew"
+            f"{out} holds this dataset, finished with other options ({changed}); choose another folder, or "
+            f"delete this one to make it anew"
         )

@@ -158,7 +158,8 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
         key = clip.found.skeleton
         if key in skeletons and len(found.get(key, ())) < _MEASURED:
             with suppress(UserError):  # told when it is converted; the next clip may be whole
-                found[key].append(clip.read())
+                motion = clip.read()
+                found[key].append(motion)  # no entry for a skeleton of which no file can be read
     return found
 
 
