@@ -15,15 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    PlainSerializer,
-    SerializerFunctionWrapHandler,
-    ValidationError,
-    model_serializer,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
 
 SCHEMA_VERSION = 3
 
@@ -275,11 +267,6 @@ class Manifest(Config):
     notes: list[str] = []
     excluded: dict[str, str] = {}
     """Ids of clips that readers skip, and why: what `motionloom data clean` was told to leave out."""
-
-    @model_serializer(mode="wrap")
-    def _without_no_excluded(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Sets of which nothing is excluded are written as they always were."""
-        return {name: value for name, value in handler(self).items() if name != "excluded" or value}
 
 
 class Decisions(Config):

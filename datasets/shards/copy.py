@@ -27,6 +27,8 @@ from motionloom.datasets.shards.left_out import LEFT_OUT_FILE
 from motionloom.datasets.shards.reader import read_manifest
 from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store, persist
 
+_BESIDE = (LEFT_OUT_FILE, CLEANED_FILE, REMOVED_FILE)
+
 
 class Copied(NamedTuple):
     """Files that a copy sent, and those that lay at the target already."""
@@ -62,14 +64,14 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
 
 
 def _make_way(there: Store, manifest: Manifest, digest: str) -> None:
-    """Take the manifest of an older state away, and first the shards that it alone has."""
+    """Take the manifest of an older state away, and first what it alone may have."""
     if _digest(there, MANIFEST_FILE) in (None, digest):
         return
     old, _ = read_manifest(there)
     if old.name != manifest.name:
         raise UserError(f"{there.place}: holds data set '{old.name}', not '{manifest.name}'; name another")
     gone = sorted({shard.name for shard in old.shards} - {shard.name for shard in manifest.shards})
-    for name in (*map(_index_name, gone), *gone, MANIFEST_FILE):
+    for name in (*map(_index_name, gone), *gone, *_BESIDE, MANIFEST_FILE):
         if _digest(there, name) is not None:
             persist(there.where(name), partial(there.system().rm_file, there.where(name)))
 

@@ -193,7 +193,7 @@ def _connect(scheme: str, pid: int, settings: tuple[tuple[str, str], ...]) -> An
             )
             system.retries = 1
             return system
-        if scheme == "hf":  # the library repeats what may pass, and knows for how long the hub asks to wait
+        if scheme == "hf":  # its own repetitions stay: it knows for how long the hub asks to wait
             return fsspec.filesystem("hf", skip_instance_cache=True)
         import aiohttp
 
@@ -215,7 +215,9 @@ ATTEMPTS = 8
 FIRST_PAUSE, LONGEST_PAUSE = 0.2, 15.0
 """Seconds between tries: doubled each time, at random between half and whole."""
 
-_LIBRARIES = {"aiohttp", "aiobotocore", "botocore", "fsspec", "huggingface_hub", "s3fs", "urllib3"}
+_LIBRARIES = {
+    "aiohttp", "aiobotocore", "botocore", "fsspec", "httpx", "httpx2", "huggingface_hub", "s3fs", "urllib3",
+}  # fmt: skip
 _ABSENT = "no such file on the server"
 
 T = TypeVar("T")

@@ -30,7 +30,7 @@ class Reference(Config):
     """`reference.json` of a data stage whose shards lie elsewhere."""
 
     path: str
-    """Folder with `manifest.json`, or a URL (`s3://`, `https://`, `http://`)."""
+    """Folder with `manifest.json`, or a URL (`s3://`, `hf://`, `https://`, `http://`)."""
     order: Literal["global", "streamed"]
     shards_per_group: int
 

@@ -17,7 +17,7 @@ from motionloom.datasets.shards.cache import CacheConfig
 from motionloom.datasets.shards.left_out import tally
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import manifest_layout, read_manifest
-from motionloom.datasets.shards.store import is_url, open_store
+from motionloom.datasets.shards.store import LocalStore, is_url, open_store
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.contract.stage import (
     RUNTIME,
@@ -86,7 +86,7 @@ class ShardsStageConfig(Reading, StageConfig):
     """Shards that exist already, in a folder or on a server."""
 
     path: str
-    """Folder with `manifest.json`, or a URL (`s3://`, `https://`, `http://`)."""
+    """Folder with `manifest.json`, or a URL (`s3://`, `hf://`, `https://`, `http://`)."""
     layout: str | None = None
     """Refuse shards of another layout. Dry runs go by it while the shards are not there yet."""
     verify: bool = True
@@ -97,9 +97,8 @@ class ShardsStageConfig(Reading, StageConfig):
     @property
     def place(self) -> str:
         """A URL as it is, a folder resolved."""
-        if is_url(self.path) or self.path.startswith("file:"):
-            return self.path
-        return str(Path(self.path).expanduser().resolve())
+        store = open_store(self.path)
+        return str(store.root.expanduser().resolve()) if isinstance(store, LocalStore) else store.place
 
     def found_layout(self) -> MotionLayout:
         """Layout of the shards as they are, or, while there are none, as they are meant to be."""

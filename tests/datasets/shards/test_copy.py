@@ -16,6 +16,7 @@ import pytest
 from fsspec.implementations.local import LocalFileSystem
 
 from motionloom.datasets.check.dataset import check
+from motionloom.datasets.convert.common.removed import remove
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards import store
 from motionloom.datasets.shards.copy import copy_dataset
@@ -103,15 +104,27 @@ def test_killed_in_the_middle_and_given_again(aws: Any, data: Path, tmp_path: Pa
     assert files(tmp_path / "k") == files(data)
 
 
-def test_a_later_state_takes_the_place_of_an_older_one(made: ModuleType, data: Path, tmp_path: Path) -> None:
-    made.write(tmp_path / "less", count=20, options={"size": 20})
-    there = tmp_path / "there"
-    copy_dataset(str(data), str(there))
-    copy_dataset(str(tmp_path / "less"), str(there))
-    assert files(there) == files(tmp_path / "less") and check(there) == []
+def test_a_later_state_takes_the_place_of_an_older_one(
+    aws: Any, made: ModuleType, data: Path, tmp_path: Path
+) -> None:
+    aws.every = 0
+    gone = ShardDataset.open(data, "test").ids[0]
+    for there in ("s3://shards/later", str(tmp_path / "there")):
+        copy_dataset(str(data), there)
+    copies = copy_dataset(str(data), there).kept
+    remove(data, ids=[gone])
+    for there in ("s3://shards/later", str(tmp_path / "there")):
+        assert copy_dataset(str(data), there).kept > copies // 2, "other shards are as they were"
+        assert gone not in ShardDataset.open(there, "test").ids
+    assert files(tmp_path / "there") == files(data) and check(data) == []
+    assert not any(f'"{gone}"'.encode() in content for content in files(tmp_path / "there").values())
+    less = tmp_path / "less"
+    made.write(less, count=20)
+    copy_dataset(str(less), there)
+    assert files(tmp_path / "there") == files(less)
     made.write(tmp_path / "other", count=8, name="other")
     with pytest.raises(UserError, match="holds data set 'made', not 'other'"):
-        copy_dataset(str(tmp_path / "other"), str(there))
+        copy_dataset(str(tmp_path / "other"), there)
     (data / "index.npz").unlink()
     with pytest.raises(UserError, match=r"index\.npz"):
         copy_dataset(str(data), str(tmp_path / "new"))

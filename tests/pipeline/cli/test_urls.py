@@ -16,6 +16,7 @@ from motionloom.datasets.convert.registry import converter_named, names
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.contract.stage import stage_kinds
+from motionloom.pipeline.stages.data.data import ShardsStageConfig
 
 URL = "s3://bucket/x"
 
@@ -94,3 +95,7 @@ def test_a_folder_named_like_a_url_is_reached_by_its_whole_path(
     assert call("data", "synth", folder, "--clips", "2", "--workers", "1").code == 0
     assert call("data", "check", folder).code in (0, 1)
     shutil.rmtree(folder)
+
+
+def test_a_file_url_in_a_recipe_is_its_folder(tmp_path: Path) -> None:
+    assert ShardsStageConfig.parse({"path": f"file://{tmp_path}"}, "recipe").place == str(tmp_path)
