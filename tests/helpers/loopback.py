@@ -136,7 +136,7 @@ class Network:
                 self.wfile.write(content)
                 inner.close()
 
-            do_GET = do_HEAD = do_PUT = do_POST = _forward  # noqa: N815
+            do_GET = do_HEAD = do_PUT = do_POST = do_DELETE = _forward  # noqa: N815
 
             def log_message(self, *_: object) -> None:
                 pass
