@@ -7,12 +7,12 @@ tells whether it has been touched since.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import ShardInfo, UserError
 
 _ADVICE = "copy it back or convert again"
@@ -43,24 +43,24 @@ def state_of(path: Path) -> list[int]:
 
 def require_intact(shard: LocalShard, *, content: bool = True) -> None:
     """Refuse a shard that is missing, has another size or, where `content` is compared, another sha256."""
-    path, info = shard
     try:
-        size = path.stat().st_size
-    except OSError:
-        raise UserError(f"{path}: the shard is missing; {_ADVICE}") from None
-    if size != info.bytes:
-        raise UserError(
-            f"{path}: {size} bytes, the manifest says {info.bytes}: truncated or changed; {_ADVICE}"
-        )
-    if not content:
-        return
-    try:
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
+        fault = fault_of(shard, content=content)
+    except FileNotFoundError:
+        fault = "the shard is missing"
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); {_ADVICE}") from None
-    if digest != info.sha256:
-        raise UserError(f"{path}: the sha256 is not the manifest's: damaged; {_ADVICE}")
+        fault = f"cannot be read ({error.strerror})"
+    if fault:
+        raise UserError(f"{shard.path}: {fault}; {_ADVICE}")
+
+
+def fault_of(shard: LocalShard, *, content: bool = True) -> str:
+    """Return what makes a shard another than the manifest's, in words; empty when nothing does."""
+    size = shard.path.stat().st_size
+    if size != shard.info.bytes:
+        return f"{size} bytes, the manifest says {shard.info.bytes}: truncated or changed"
+    if content and sha256_of(shard.path) != shard.info.sha256:
+        return "the sha256 is not the manifest's: damaged or changed"
+    return ""
 
 
 def problems(

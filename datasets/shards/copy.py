@@ -11,8 +11,9 @@ import hashlib
 import tempfile
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
+from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.schema import (
     CLEANED_FILE,
@@ -45,10 +46,11 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
     manifest, digest = read_manifest(here)
     _make_way(there, manifest, digest)
     sums = {shard.name: shard.sha256 for shard in manifest.shards}
-    # Without the others of these a data set can be read; `data convert` and `data clean` go on with them.
+    # Without the others of these a data set can be read; `data convert` and `data clean` go on with them. Who
+    # was removed is nothing to publish, though it is hashed: names can be tried.
     needed = {*sums, INDEX_FILE, MANIFEST_FILE}
-    others = (LEFT_OUT_FILE, CLEANED_FILE, REMOVED_FILE, INDEX_FILE, MANIFEST_FILE)
-    names = [*sums, *map(_index_name, sums), *others]
+    beside = [name for name in _BESIDE if name != REMOVED_FILE or not there.place.startswith("hf:")]
+    names = [*sums, *map(_index_name, sums), *beside, INDEX_FILE, MANIFEST_FILE]
     sent = kept = 0
     with tempfile.TemporaryDirectory() as folder, Meter("copying", len(names), shown=progress) as meter:
         for name in names:
@@ -87,8 +89,7 @@ def _carry(here: Store, there: Store, name: str, wanted: str | None, folder: Pat
             raise MissingFileError(f"{source}: no such file")
     else:
         persist(source, lambda: here.system().get_file(source, str(path)))
-    with path.open("rb") as file:
-        found = hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
+    found = sha256_of(path)
     if wanted not in (None, found):
         raise UserError(f"{source}: the sha256 is not the manifest's: damaged; nothing of it is copied")
     if wanted is None and _digest(there, name) == found:

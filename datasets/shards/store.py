@@ -21,6 +21,7 @@ from urllib.parse import unquote, urlsplit
 
 from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError, read_plain
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
+from motionloom.datasets.shards.checksums import LocalShard, fault_of
 
 SCHEMES = ("file", "http", "https", "s3", "hf")
 
@@ -150,12 +151,8 @@ class RemoteStore:
 
         def fetch() -> None:
             self.system().get_file(url, str(path))
-            size = path.stat().st_size
-            if size != shard.bytes:
-                raise OSError(f"{size} bytes, the manifest says {shard.bytes}: truncated or changed")
-            with path.open("rb") as file:
-                if hashlib.file_digest(cast(Any, file), "sha256").hexdigest() != shard.sha256:
-                    raise OSError("the sha256 is not the manifest's: damaged or changed")
+            if fault := fault_of(LocalShard(path, shard)):
+                raise OSError(fault)
 
         persist(url, fetch)
 
