@@ -1,7 +1,8 @@
 """Motion files of a source and what they hold, remembered between runs.
 
-What was found of each file is kept in one JSON file, under a digest of its name, size and time of change: the
-next run, or the next machine, reads only files that changed.
+What was found of each file is kept in one JSON file, under a digest of its name, size, times and inode, and
+those of its skeleton: the next run reads only files that changed. As in git's index, a file that was changed
+just before it was read is read again, for it may have changed once more within one tick of the clock.
 """
 
 from __future__ import annotations
@@ -20,13 +21,16 @@ from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.motion.bvh.asf import JOINED
 from motionloom.datasets.schema import Config, UserError, read_plain
+from motionloom.datasets.shards.checksums import state_of
 
 SUFFIX = (".bvh", ".amc")
 MAX_FILE_BYTES = 1 << 30
 """A motion file beyond this is refused unread: a few hours of text, or a bomb."""
 MAX_SKELETON_BYTES = 1 << 20
 
-_VERSION = 3
+_VERSION = 4
+_RACY_NS = 20_000_000
+"""Longest tick by which file systems of Linux keep times; what changed later is read again the next time."""
 _SAVE_SECONDS = 30.0
 """Seconds of a long scan that a kill may cost."""
 
@@ -55,9 +59,7 @@ def read_file(path: Path, label: str) -> bytes:
         data = read_plain(path, MAX_FILE_BYTES, label)
         if path.suffix.lower() != ".amc":
             return data
-        # `01_02.amc` has the skeleton `01_02.asf`, or that of its subject, `01.asf`.
-        words = path.stem.split("_")
-        skeletons = [path.with_name("_".join(words[:count]) + ".asf") for count in range(len(words), 0, -1)]
+        skeletons = _skeletons(path)
         found = next((one for one in skeletons if one.is_file()), None)
         if found is None:
             names = " or ".join(one.name for one in skeletons[-2:])
@@ -67,6 +69,12 @@ def read_file(path: Path, label: str) -> bytes:
         return read_plain(found, MAX_SKELETON_BYTES, label) + JOINED + data
     except OSError as error:
         raise UserError(f"{label}: cannot read ({error.strerror})") from None
+
+
+def _skeletons(path: Path) -> list[Path]:
+    """Where the skeleton of `01_02.amc` may be: `01_02.asf`, or its subject's `01.asf`; of others nowhere."""
+    words = path.stem.split("_") if path.suffix.lower() == ".amc" else []
+    return [path.with_name("_".join(words[:count]) + ".asf") for count in range(len(words), 0, -1)]
 
 
 class FoundFile(Config):
@@ -88,7 +96,7 @@ class Scan(Config):
     """The motion files of a source."""
 
     files: Mapping[str, FoundFile] = Field(default_factory=dict)
-    """By a digest of name, size and time of change."""
+    """By a digest of name, size, times and inode."""
     joints: Mapping[str, tuple[str, ...]] = Field(default_factory=dict)
     """Names of the joints of each skeleton."""
 
@@ -121,7 +129,8 @@ def scan_files(
 def _scan_files(
     root: Path, names: Sequence[str], header: Header, keep: Path | None, workers: int, progress: bool
 ) -> Scan:
-    keys = {_state(root, name): name for name in names}
+    began, states = time.time_ns(), {name: _states(root / name) for name in names}
+    keys = {sha256_of_json([_VERSION, name, state]): name for name, state in states.items()}
     known = _load(keep)
     kept = {key: known.files[key] for key in keys if key in known.files}
     found, joints, saved = dict(kept), dict(known.joints), time.monotonic()
@@ -134,7 +143,8 @@ def _scan_files(
         found[key] = file
         joints.setdefault(file.skeleton, skeleton)
         # A file that could not be opened may be readable the next time.
-        if file.sha256:
+        changed = max((max(state[1:3]) for state in states[keys[key]] if state), default=0)
+        if file.sha256 and changed < began - _RACY_NS:
             kept[key] = file
         if time.monotonic() - saved > _SAVE_SECONDS:
             _save(keep, Scan(files=kept, joints=joints))
@@ -144,12 +154,8 @@ def _scan_files(
     return Scan(files={key: found[key] for key in keys}, joints=joints)
 
 
-def _state(root: Path, name: str) -> str:
-    try:
-        about = (root / name).stat()
-        return sha256_of_json([_VERSION, name, about.st_size, about.st_mtime_ns])
-    except OSError:
-        return sha256_of_json([_VERSION, name])
+def _states(path: Path) -> list[list[int]]:
+    return [state_of(one) for one in (path, *_skeletons(path))]
 
 
 def _load(path: Path | None) -> Scan:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from bvh_clips import write_clip
 
-from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
 from motionloom.datasets.convert.registry import converter_named, prepare
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.finish import join_parts
@@ -58,7 +58,8 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def bytes_of(root: Path) -> dict[str, str]:
-    found = [path for path in sorted(root.rglob("*")) if path.is_file()]
+    """Of all but what a scan remembers."""
+    found = [path for path in sorted(root.rglob("*")) if path.is_file() and path.name != SCAN_FILE]
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
 
 

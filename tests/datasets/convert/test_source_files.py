@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from motionloom.datasets.convert.captions.humanml_text import parse_caption, read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.convert.common.scan import scan_files
 from motionloom.datasets.schema import Caption, UserError
 
 
@@ -144,3 +147,34 @@ def test_inside_keeps_names_in_their_folder(tmp_path: Path) -> None:
     for name in ("out.txt", "up/secret.txt", "loop"):
         with pytest.raises(UserError, match=f"^{name}: .*leaves root/"):
             inside(root, name)
+
+
+def test_a_scan_reads_again_what_may_have_changed(tmp_path: Path) -> None:
+    source, keep = tmp_path / "source", tmp_path / "scan.json"
+    read: list[str] = []
+
+    def header(_: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
+        read.append(label)
+        return 1, 30.0, "one", ("hips",)
+
+    def again() -> list[str]:
+        read.clear()
+        scan_files(source, names, header, keep=keep)
+        return sorted(read)
+
+    source.mkdir()
+    names = ["a.bvh", "b.bvh", "01_01.amc"]
+    for name in (*names, "01.asf"):
+        (source / name).write_text("old")
+    now = time.time_ns()
+    with pytest.MonkeyPatch.context() as patch:  # as if it were read in the tick of the last change
+        patch.setattr("motionloom.datasets.convert.common.scan.time.time_ns", lambda: now)
+        assert again() == again() == sorted(names)
+    time.sleep(0.05)
+    assert again() == sorted(names) and again() == []
+    about = (source / "a.bvh").stat()
+    (source / "new").write_text("new")
+    os.utime(source / "new", ns=(about.st_atime_ns, about.st_mtime_ns))
+    (source / "new").replace(source / "a.bvh")  # size and time of writing are the same
+    (source / "01.asf").write_text("another skeleton")
+    assert again() == ["01_01.amc", "a.bvh"]
