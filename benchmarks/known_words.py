@@ -58,7 +58,7 @@ def main() -> None:
         [truth is not None and all(agrees(truth, motion.joints, None, motion.fps).values())
          for (_, truth), motion in zip(rows, motions, strict=True)]
     )  # fmt: skip
-    unknown = {one.caption for one in bundle.unknown_captions(captions) if not one.read_as}
+    unknown = {one.caption for one in bundle.unknown_captions(captions)}
     flags = {
         PATTERNS: np.array(
             [caption in unknown or bool(bundle.find_mismatches([motion]))
@@ -94,7 +94,6 @@ def others(bundle, model, captions, motions, right: Flags, alarms: int) -> dict[
         for index in np.random.default_rng(0).permutation(train)[:CAPTIONS].tolist()
     }
     source, tma = bundle.generator.prepared["text"], bundle.generator.reranker
-    read = [source.spelled(caption) for caption in captions]
 
     def latents(texts: list[str]) -> NDArray[np.float32]:
         return F.normalize(tma.embed_captions(texts, source), dim=-1).numpy()
@@ -104,15 +103,15 @@ def others(bundle, model, captions, motions, right: Flags, alarms: int) -> dict[
         return np.concatenate([source.encoder.encode(block).sentence for block in blocks])
 
     known = source.known["body"]
-    embedded = sentences(read)
+    embedded = sentences(captions)
     near = (embedded @ known.embeddings.T).max(axis=1)
-    near_read = (latents(read) @ latents(list(known.captions)).T).max(axis=1)
+    near_read = (latents(captions) @ latents(list(known.captions)).T).max(axis=1)
     names = sorted({action for actions in chosen.values() for action in actions})
     wanted = np.array([[name in actions for name in names] for actions in chosen.values()])
     probe = OneVsRestClassifier(LogisticRegression(max_iter=500, C=10.0))
     chances = probe.fit(sentences(list(chosen)), wanted).predict_proba(embedded)
     likely, differs = [], []
-    for text, motion, row in zip(read, motions, chances, strict=True):
+    for text, motion, row in zip(captions, motions, chances, strict=True):
         shown = action_of(motion.joints, motion.fps)
         asked = [names[k] for k in np.flatnonzero(row > 0.5)]
         both = {"action": "then", "parts": [{"action": action} for action in asked]}

@@ -41,7 +41,7 @@ def find_mismatches(
         return []
     found: dict[str, list[str | None]] = {}
     for caption, joints in motions:
-        request = _request(source, source.spelled(caption))
+        request = _request(source, caption)
         # Of less than a second nothing can be told.
         if request is not None and request.candidates and len(joints) >= fps:
             found.setdefault(caption, []).append(find_mismatch(request.candidates, joints, fps))

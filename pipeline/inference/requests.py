@@ -18,7 +18,6 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage
-from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import MODEL_FILES
 
 if TYPE_CHECKING:
@@ -212,9 +211,6 @@ def encode_prompts(
 
     `words` are the prompts' texts, about the body or the face; an empty one is no text.
     """
-    source = generator.prepared.get("text")
-    if isinstance(source, TextSource):
-        words = [source.spelled(text) for text in words]
     rows = [prompt.with_words(text).given for prompt, text in zip(prompts, words, strict=True)]
     out: dict[str, Condition] = {}
     for name, record in MODALITIES.items():

@@ -56,27 +56,21 @@ class KnownTexts(Config):
 
     body: KnownText
     face: KnownText
-    words: tuple[str, ...] = ()
-    """All words of the training's captions."""
     actions: tuple[str, ...] = ()
     """The actions of the training's clips, where these state their truth."""
 
 
 @dataclass(frozen=True)
 class Unknown:
-    """A caption that is far from all captions of the training, or that is read as another."""
+    """A caption that is far from all captions of the training."""
 
     caption: str
     nearest: tuple[str, ...] = ()
     """Captions of the training, nearest first."""
-    read_as: str = ""
-    """The corrected caption, where only its spelling is unknown."""
 
     @property
     def what(self) -> str:
         """The note for people, without the nearest captions."""
-        if self.read_as:
-            return f"'{printable(self.caption)}' is read as '{printable(self.read_as)}'"
         shown = shorten(printable(self.caption), 100, placeholder=" …")
         return (
             f"'{shown}' is unlike all captions that this model was trained on, so the motion may show "
@@ -144,13 +138,7 @@ def distances_to(known: NDArray[np.float32], held_out: NDArray[np.float32]) -> t
     return tuple(np.quantile(nearest, np.linspace(0, 1, _QUANTILES)).round(4).tolist())
 
 
-def save_known(
-    folder: Path,
-    body: KnownCaptions,
-    face: KnownCaptions,
-    words: Sequence[str] = (),
-    actions: Sequence[str] = (),
-) -> None:
+def save_known(folder: Path, body: KnownCaptions, face: KnownCaptions, actions: Sequence[str] = ()) -> None:
     """Write both kinds into `folder`, embeddings in half precision."""
     kinds = {"body": body, "face": face}
     with atomic_path(folder / KNOWN_FILES[1]) as path:
@@ -158,8 +146,7 @@ def save_known(
     texts = {
         name: KnownText(captions=known.captions, distances=known.distances) for name, known in kinds.items()
     }
-    made = KnownTexts(**texts, words=tuple(sorted(words)), actions=tuple(sorted(actions)))
-    write_json(folder / KNOWN_FILES[0], made.dump())
+    write_json(folder / KNOWN_FILES[0], KnownTexts(**texts, actions=tuple(sorted(actions))).dump())
 
 
 def load_known(folder: Path) -> tuple[KnownTexts, dict[str, KnownCaptions]]:

@@ -19,7 +19,6 @@ from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
-from motionloom.datasets.text.vocabulary import Vocabulary, word_counts
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
 from motionloom.pipeline.store.known_captions import (
     KNOWN_FILES,
@@ -134,39 +133,22 @@ class TextSource:
         face: bool = False,
         judge: Callable[[str], bool | None] | None = None,
     ) -> list[Unknown]:
-        """Return those of `captions` that are unlike all that were trained on, or misspelt, each once.
+        """Return those of `captions` that are unlike all that were trained on, each once.
 
         `judge` says of some captions whether they are known; where it returns None, distance decides.
         """
         known = self.known.get("face" if face else "body")
-        read = {caption: self.spelled(caption) for caption in captions}
-        if known is None or not read:
+        different = list(dict.fromkeys(captions))
+        if known is None or not different:
             return []
         out = []
-        vectors = self._sentences.encode(list(read.values())).sentence
-        for (caption, spelled), vector in zip(read.items(), vectors, strict=True):
-            is_known = judge(spelled) if judge is not None else None
+        for caption, vector in zip(different, self._sentences.encode(different).sentence, strict=True):
+            is_known = judge(caption) if judge is not None else None
             if is_known is None:
                 is_known = not known.is_far(vector)
             if not is_known:
                 out.append(Unknown(caption, known.nearest(vector)))
-            elif spelled != caption:
-                out.append(Unknown(caption, read_as=spelled))
         return out
-
-    def spelled(self, caption: str) -> str:
-        """Return a caption as it is read: misspelt words of the training set right."""
-        return self._vocabulary.spelled(caption)
-
-    @cached_property
-    def _vocabulary(self) -> Vocabulary:
-        def pieces(words: Sequence[str]) -> NDArray[np.int64]:
-            mask = self._sentences.encode(words).mask
-            counts: NDArray[np.int64] = mask.sum(axis=1, dtype=np.int64) - 2  # [CLS] and [SEP]
-            return counts
-
-        captions = [caption for known in self.known.values() for caption in known.captions]
-        return Vocabulary(frozenset(self._known[0].words), word_counts(captions), pieces)
 
     @cached_property
     def _sentences(self) -> TextEncoder:

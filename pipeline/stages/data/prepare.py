@@ -13,7 +13,6 @@ from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.schema import Split, UserError
 from motionloom.datasets.text.build import build_text_cache
-from motionloom.datasets.text.vocabulary import word_counts
 from motionloom.pipeline.contract.stage import (
     CPU,
     RUNTIME,
@@ -158,8 +157,7 @@ class TextStage(StageKind[TextConfig]):
                 )
                 for face in (False, True)
             )
-            words = word_counts(said["train", False] | said["train", True])
-            save_known(context.folder, body, face_captions, tuple(words), tuple(actions))
+            save_known(context.folder, body, face_captions, tuple(actions))
 
     def preview(self, config: TextConfig, given: Inputs) -> TextPreview:
         return TextPreview.of(config.encoder)

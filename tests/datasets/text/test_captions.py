@@ -1,51 +1,10 @@
-"""Misspelt words corrected by those of the training; captions made tidy, names refused; named emotions."""
+"""Captions made tidy, names refused; named emotions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from motionloom.datasets.text.clean import clean_caption, emotion_of, usable_caption
-from motionloom.datasets.text.encoder import load_text_encoder
-from motionloom.datasets.text.vocabulary import Vocabulary, one_slip, word_counts
-
-TRAINED = ("A boy bends the knee twice.", "someone kicks with the left leg, and waves")
-
-
-def vocabulary(captions: tuple[str, ...], counted: tuple[str, ...] = ()) -> Vocabulary:
-    encoder = load_text_encoder("minilm")
-
-    def pieces(words: Sequence[str]) -> NDArray[np.int64]:
-        return encoder.encode(words).mask.sum(axis=1, dtype=np.int64) - 2
-
-    return Vocabulary(frozenset(word_counts(captions)), word_counts(counted), pieces)
-
-
-@pytest.mark.parametrize(
-    ("said", "read"),
-    [
-        ("Somone kiks twicee", "someone kicks twice"),
-        ("the lfet leg wavess", "the left leg waves"),
-        ("wades and kids", "wades and kids"),  # words that are English are other words, however near
-        ("no kick, 7 waves", "no kick, 7 waves"),
-        ("she never doesn't", "she never doesn't"),
-    ],
-)
-def test_a_misspelt_word_is_read_as_the_one_that_is_meant(said: str, read: str) -> None:
-    assert vocabulary(TRAINED).spelled(said) == read
-
-
-def test_of_two_slips_the_word_that_training_had_more_often_is_meant() -> None:
-    for word in ("knck", "kock", "kiick", "kcik", "kick"):
-        assert one_slip(word, "kick"), word
-    assert not one_slip("tick", "kick") and not one_slip("sat", "sit")
-    captions = ("race ahead", "raise the arm", "raise a hand")
-    assert vocabulary(captions).spelled("rase the arm") == "race the arm"
-    assert vocabulary(captions, captions).spelled("rase the arm") == "raise the arm"
-    assert Vocabulary(frozenset(), {}, lambda _: pytest.fail("cut")).spelled("a vilin") == "a vilin"
 
 
 @pytest.mark.parametrize(

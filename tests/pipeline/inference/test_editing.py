@@ -51,7 +51,7 @@ def editor(name: str = "wholebody363", face: bool = False) -> Bundle:
     # Statistics of somebody who stands: an untrained network then strays from that by centimetres.
     rest = canonicalize(np.repeat(layout.skeleton.rest_joints[None], 9, axis=0))
     stats = FeatureStats(encode(rest, layout)[0], np.full(layout.dim, 0.02, np.float32), layout)
-    given = {"stats": stats, "text": SimpleNamespace(encoder=FixedEncoder(), spelled=lambda text: text)}
+    given = {"stats": stats, "text": SimpleNamespace(encoder=FixedEncoder())}
     config = InBetweenConfig(dim=16, ff=16, layers=1, heads=2)
     made: list[Any] = []
     for part in ("bodyhand", "face") if face else ("all",):
