@@ -46,7 +46,7 @@ from motionloom.pipeline.evaluation.latent_metrics import LatentRow, recalls
 from motionloom.pipeline.evaluation.truth import Truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.store.networks import embed_motions
+from motionloom.pipeline.store.evaluator import embed_motions
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.store.yaml import dump_yaml
 

@@ -41,7 +41,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.truth import Truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.store.networks import embed_motions
+from motionloom.pipeline.store.evaluator import embed_motions
 
 TABLES = Path(__file__).with_name("wordings.json")
 CAPTIONS = 4

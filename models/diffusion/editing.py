@@ -51,7 +51,7 @@ class KnownMotion:
     """A motion of which a part is known."""
 
     motion: Tensor
-    """[T, D], normalised; any values where nothing is known, unless there is a `likeness`."""
+    """[T, D], normalised; any values where nothing is known."""
     mask: Tensor
     """bool [T, D]."""
     places: Places | None = None
@@ -79,7 +79,6 @@ class Filling:
         overlap: Frames that neighbouring windows share.
         guidance: Classifier-free guidance of the captions; 1 is off.
         strength: Gradient steps towards places and pins in each denoising step; a fraction is a shorter one.
-        likeness: Of free values to `known.motion`, 0 to 1: denoising begins from it, noised.
     """
 
     def __init__(
@@ -93,11 +92,9 @@ class Filling:
         overlap: int,
         guidance: float = 1.0,
         strength: float = 1.0,
-        likeness: float = 0.0,
     ) -> None:
         self.net, self.known, self.recovery = net, known, recovery
-        self.guidance, self.strength, self.likeness = guidance, strength, likeness
-        self.noiser = net.config.schedule.noiser()
+        self.guidance, self.strength = guidance, strength
         frames = len(known.motion)
         self.size = min(window, frames)
         overlap = min(overlap, self.size // 2)
@@ -125,13 +122,8 @@ class Filling:
         known, schedule = self.known, self.net.config.schedule
         noise = [torch.Generator().manual_seed(seed) for seed in seeds]
         x = torch.stack([torch.randn(known.motion.shape, generator=one) for one in noise]).to(known.motion)
-        # A likeness leaves out the first steps: the motion is noised as far as the next step expects.
-        skip = min(round(self.likeness * steps), steps - 1)
-        if skip:
-            begin = schedule.sampler(sampler, steps).timesteps[skip].expand(len(x)).to(x.device)
-            x = self.noiser.add_noise(known.motion.expand_as(x), x, begin).to(x)
         with evaluating(self.net):
-            filled = schedule.denoise(self._predict, x, noise, sampler, steps, skip=skip)
+            filled = schedule.denoise(self._predict, x, noise, sampler, steps)
         return self._with_known(self._smoothed(filled))
 
     def _observed(self, start: int) -> Tensor:

@@ -156,16 +156,14 @@ class ScheduleConfig(Config):
         noise: list[torch.Generator],
         kind: Sampler,
         steps: int,
-        skip: int = 0,
     ) -> Tensor:
         """Motions [n, T, D] from standard normal x [n, T, D]; steps that draw do so from `noise`.
 
-        `predict` says what the network predicts of noisy motions [n, T, D] at a time step. With the first
-        `skip` steps left out, x is motion that is noised as far as the next of them wants.
+        `predict` says what the network predicts of noisy motions [n, T, D] at a time step.
         """
         scheduler = self.sampler(kind, steps)
-        x = x if skip else x * scheduler.init_noise_sigma
-        for step in scheduler.timesteps[skip:]:
+        x = x * scheduler.init_noise_sigma
+        for step in scheduler.timesteps:
             found = predict(scheduler.scale_model_input(x, step), step)
             stepped: Tensor = scheduler.step(found.to(x.dtype), step, x, generator=noise).prev_sample
             x = stepped

@@ -135,8 +135,6 @@ class EditTask(Config):
     them to `exact` alone."""
     exact: bool = True
     """Meet path and pins at the end by moving the motion around them as little as needed."""
-    likeness: float = Field(0.0, ge=0, lt=1)
-    """How much of the clip is left in what is free: 0 is made anew, towards 1 it stays near the clip."""
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from motionloom.pipeline.evaluation.latent_metrics import Latents
 from motionloom.pipeline.evaluation.truth import Truth
-from motionloom.pipeline.store.evaluator import LoadedEvaluator
-from motionloom.pipeline.store.networks import LoadedTma, embed_motions
+from motionloom.pipeline.store.evaluator import LoadedEvaluator, embed_motions
+from motionloom.pipeline.store.networks import LoadedTma
 
 
 @dataclass(frozen=True)

@@ -169,13 +169,10 @@ def judged_figures(
     """
     size = min(size, len(words))
     facts = {**protocol, "candidates": size}
-    if role != "tma":
-        title = f"R-Precision by {whose} (higher is better; the score: lower)"
-        out = _precision(role, title, latents, facts, size, seed)
-    else:
-        # Clips are those drawn, as in the paper, so two of a batch may have one caption.
-        title = "TMA-R-Precision (higher is better; the score: lower)"
-        out = _precision(role, title, latents, facts, size, seed)
+    # Clips are those drawn, as in the paper, so two of a batch may have one caption.
+    title = "TMA-R-Precision" if role == "tma" else f"R-Precision by {whose}"
+    out = _precision(role, f"{title} (higher is better; the score: lower)", latents, facts, size, seed)
+    if role == "tma":
         first = sorted({caption: row for row, caption in reversed(list(enumerate(words)))}.values())
         if 1 < len(first) < len(words):
             some = latents.of(first)

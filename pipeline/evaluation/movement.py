@@ -61,13 +61,9 @@ def features_of(joints: Joints, fps: float, feature_fps: float = FEATURE_FPS) ->
 
 def all_features(motions: Iterable[Joints], fps: float, feature_fps: float = FEATURE_FPS) -> Features:
     """Features [n, F] of n motions."""
-    return stacked([features_of(joints, fps, feature_fps) for joints in motions])
-
-
-def stacked(features: Sequence[Features]) -> Features:
-    """Features [F] of each motion as [n, F]."""
+    each = [features_of(joints, fps, feature_fps) for joints in motions]
     return {
-        kind: np.stack([one[kind] for one in features]) if features else np.zeros((0, width))
+        kind: np.stack([one[kind] for one in each]) if each else np.zeros((0, width))
         for kind, width in WIDTHS.items()
     }
 

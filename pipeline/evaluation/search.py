@@ -35,7 +35,8 @@ from motionloom.pipeline.contract.stage import ALIGNMENT, StageCache
 from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
 from motionloom.pipeline.launch.hardware import choose_device
-from motionloom.pipeline.store.networks import LoadedTma, embed_motions
+from motionloom.pipeline.store.evaluator import embed_motions
+from motionloom.pipeline.store.networks import LoadedTma
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 from motionloom.pipeline.store.weights import MODEL_FILES
 

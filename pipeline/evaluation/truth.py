@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,10 @@ from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.store.networks import TrainedTokenizer
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.inference.bundle import Bundle
+    from motionloom.pipeline.inference.motion import GeneratedMotion
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,21 @@ def recorded_seconds(truths: Sequence[Truth], generator: MotionGenerator) -> lis
     if generator.max_frames is not None:
         frames = [min(count, generator.max_frames) for count in frames]
     return [count / generator.layout.fps for count in frames]
+
+
+def perform(
+    bundle: Bundle, truths: Sequence[Truth], *, seconds: float | None = None, **drawn: Any
+) -> list[GeneratedMotion]:
+    """Motions for the captions of clips, each as long as its clip where neither `seconds` nor the model says
+    more; `drawn` is for `Bundle.generate`.
+    """
+    maker = bundle.generator
+    return bundle.generate(
+        [truth.caption for truth in truths],
+        face=[truth.face_caption for truth in truths],
+        seconds=recorded_seconds(truths, maker) if seconds is None and not maker.decides_length else seconds,
+        **drawn,
+    )
 
 
 def truth_of(
@@ -167,6 +187,12 @@ def spread(dataset: ClipDataset, count: int | None) -> list[int]:
     chosen = drawn(dataset, None)
     captions = [_main_caption(dataset, index, int(dataset.frames[index])).text for index in chosen]
     return different_first(chosen, captions)[:count]
+
+
+def spread_truths(dataset: ClipDataset, count: int) -> list[Truth]:
+    """The clips of `spread` with their captions; none where no clip has one."""
+    chosen = spread(dataset, count) if count and has_caption(dataset).any() else []
+    return [truth_of(dataset, clip) for clip in chosen]
 
 
 def different_first(clips: Sequence[int], names: Sequence[str]) -> list[int]:

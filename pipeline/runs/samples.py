@@ -19,7 +19,7 @@ import torch
 from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.dances import dance_to, dances_for
 from motionloom.pipeline.evaluation.estimate import row_estimates
-from motionloom.pipeline.evaluation.truth import recorded_seconds, spread, truth_of
+from motionloom.pipeline.evaluation.truth import perform, spread_truths
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.outputs import page_note, write_motions
 from motionloom.pipeline.inference.writers import default_formats
@@ -43,17 +43,12 @@ def draw_samples(run: Path, stage: str) -> Path:
     with run_at(run, f"{stage}:{NEWEST}") as folder:
         artifact, bundle = Artifact.find(stage_folder(folder, stage)), Bundle.from_run(folder)
         assert artifact is not None and artifact.step is not None
-        maker = bundle.generator
         data = next(one for one in bundle.main.upstream() if one.gives("data"))
         clips = bundle.stage_cache.get(data).held_out()
         fps = clips.layout.fps
-        if "text" in maker.modalities:
-            metrics, truths = metrics_of("captions"), [truth_of(clips, i) for i in spread(clips, _COUNT)]
-            made = bundle.generate(
-                [truth.caption for truth in truths],
-                face=[truth.face_caption for truth in truths],
-                seconds=None if maker.decides_length else recorded_seconds(truths, maker),
-            )
+        if "text" in bundle.generator.modalities:
+            metrics, truths = metrics_of("captions"), spread_truths(clips, _COUNT)
+            made = perform(bundle, truths)
             real = [Performance(one.joints, one.joints, fps, one.face, one.truth) for one in truths]
         else:
             metrics, dances = metrics_of("dances"), dances_for(bundle, clips, _COUNT, seconds=_DANCE_SECONDS)

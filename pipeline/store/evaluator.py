@@ -1,4 +1,4 @@
-"""A trained evaluator as later stages use it: its motions' statistics, and what reads its captions."""
+"""A trained evaluator as later stages use it, what reads its captions, and motions embedded by any judge."""
 
 from __future__ import annotations
 
@@ -6,15 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import PRESENT_ALL, UserError
 from motionloom.datasets.text.cache import key_of
 from motionloom.models.evaluator.network import PART, Evaluator
-from motionloom.pipeline.store.networks import device_of
+from motionloom.pipeline.store.networks import LoadedTma, device_of
 from motionloom.pipeline.store.text import TextSource
 
 _BATCH = 256
@@ -112,3 +114,33 @@ class LoadedEvaluator:
 
 def _said(layout: MotionLayout) -> str:
     return f"{layout.name} at {layout.fps:g} fps (family {layout.family})"
+
+
+def embed_motions(
+    judge: LoadedTma | LoadedEvaluator,
+    motions: Sequence[NDArray[np.float32]],
+    present: Sequence[int] | None = None,
+    batch: int = 64,
+) -> Tensor:
+    """Latents [n, Z] of body-hand features, by TMA or an evaluator; longer motions are cut at its length.
+
+    `present` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
+    """
+    columns = judge.layout.part(judge.part)
+    mean, std = judge.stats.mean[columns], judge.stats.std[columns]
+    order = np.argsort([len(m) for m in motions], kind="stable")
+    masks = judge.layout.present_columns[:, columns][
+        [PRESENT_ALL] * len(motions) if present is None else present
+    ]
+    out: dict[int, Tensor] = {}
+    for start in range(0, len(order), batch):
+        rows = order[start : start + batch].tolist()
+        cut = [(motions[i][: judge.max_frames] - mean) / std for i in rows]
+        length = torch.tensor([len(m) for m in cut])
+        motion = torch.zeros(len(cut), int(length.max()), len(columns))
+        for row, values in enumerate(cut):
+            motion[row, : len(values)] = torch.from_numpy(values.astype(np.float32))
+        near = torch.from_numpy(masks[rows])
+        for i, latent in zip(rows, judge.embed_motion(motion, length, near).cpu(), strict=True):
+            out[i] = latent
+    return torch.stack([out[i] for i in range(len(motions))])

@@ -1,10 +1,12 @@
-"""Two trainings that must have ended alike: bit for bit, in their weights, checkpoints and logs."""
+"""Two trainings that must have ended alike: bit for bit, or on two ranks as on one within a bound."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -41,3 +43,39 @@ def assert_same_stage(one: Path, two: Path, first: StageModule, second: StageMod
     assert_equal(first.state_dict(), second.state_dict())
     assert_equal(newest(one), newest(two))
     assert read_training_log(one) == read_training_log(two)
+
+
+def assert_kills_change_nothing(
+    train: Callable[..., StageModule], folder: Path, deaths: Sequence[int], reached: int, **settings: Any
+) -> None:
+    """A training killed at `deaths`, with its newest checkpoint at `reached`, ends as an undisturbed one."""
+    whole = train(folder / "whole", **settings)
+    for step in deaths:
+        with pytest.raises(ConnectionResetError):
+            train(folder / "killed", dies_at=step, **settings)
+    assert newest(folder / "killed")["global_step"] == reached
+    again = train(folder / "killed", **settings)
+    assert_same_stage(folder / "whole", folder / "killed", whole, again)
+
+
+def _meant(name: str, value: Tensor) -> Tensor:
+    """Without the keys' biases: they change no softmax, so their gradients are rounding, which Adam makes
+    whole steps of.
+    """
+    if not name.endswith("qkv.bias"):
+        return value
+    query, _, values = value.chunk(3)
+    return torch.cat([query, values])
+
+
+def assert_ranks_equal_one(one: StageModule, folder: Path, pair: Path, name: str, bound: float) -> None:
+    """Weights ("NAME-RANK.pt") and log (NAME) of two ranks in `pair`, and of one process in `folder`."""
+    first, second = (torch.load(pair / f"{name}-{rank}.pt", weights_only=True) for rank in range(2))
+    assert_equal(first, second)
+    for key, value in one.state_dict().items():
+        near, far = _meant(key, first[key]), _meant(key, value)
+        torch.testing.assert_close(near, far, rtol=bound, atol=bound, msg=lambda m, k=key: f"{k}: {m}")
+    rows = [read_training_log(where) for where in (folder, pair / name)]
+    assert [sorted(row) for row in rows[0]] == [sorted(row) for row in rows[1]]
+    for row, other in zip(*rows, strict=True):
+        assert other == pytest.approx(row, rel=1e-5, abs=1e-5)

@@ -53,11 +53,10 @@ def require_work(frames: EditFrames) -> None:
             "everything of the clip is kept, so there is nothing to make: keep less of it, or give seconds "
             "or lead for more"
         )
-    asked = frames.pins or np.isfinite(frames.path).any() or frames.task.likeness
-    if not (frames.pieces.any() or asked):
+    if not (frames.pieces.any() or frames.pins or np.isfinite(frames.path).any()):
         raise UserError(
-            "nothing of the clip is kept and nothing else is asked: say what to keep, draw a path, pin a "
-            "joint, or set likeness"
+            "nothing of the clip is kept and nothing else is asked: say what to keep, draw a path, or pin a "
+            "joint"
         )
 
 

@@ -112,7 +112,6 @@ class DiffusionMotion(DenoisedMotion):
             overlap=self.window // 4,
             guidance=guidance,
             strength=frames.task.strength,
-            likeness=frames.task.likeness,
         )
         made = filling(seeds, *self.denoising(sampling)).cpu()
         # What is kept is taken from where it came from: normalising there and back rounds.

@@ -26,7 +26,8 @@ from motionloom.pipeline.contract.generation import (
 )
 from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
 from motionloom.pipeline.inference.generators.base import OfTokens
-from motionloom.pipeline.store.networks import LoadedGpt, LoadedTma, MotionJudge, device_of, embed_motions
+from motionloom.pipeline.store.evaluator import embed_motions
+from motionloom.pipeline.store.networks import LoadedGpt, LoadedTma, device_of
 
 T = TypeVar("T")
 
@@ -151,7 +152,7 @@ def repeated(values: Sequence[T], count: int) -> list[T]:
 
 
 def nearest_candidates(
-    reranker: MotionJudge, text: Tensor, motions: Sequence[NDArray[np.float32]]
+    reranker: LoadedTma, text: Tensor, motions: Sequence[NDArray[np.float32]]
 ) -> list[NDArray[np.float32]]:
     """Each text's motion whose latent has the greatest cosine to the text's; [T, C] each.
 

@@ -18,7 +18,7 @@ from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
 from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.judges import Judge
-from motionloom.pipeline.evaluation.movement import features_of
+from motionloom.pipeline.evaluation.movement import all_features
 from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors, read_basis
 from motionloom.pipeline.evaluation.reference_baselines import NearestClip
 from motionloom.pipeline.evaluation.truth import (
@@ -33,8 +33,8 @@ from motionloom.pipeline.evaluation.truth import (
 )
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.stages.results.evaluation import Evaluation, bundle_driven_by
-from motionloom.pipeline.store.evaluator import LoadedEvaluator
-from motionloom.pipeline.store.networks import TrainedTokenizer, embed_motions
+from motionloom.pipeline.store.evaluator import LoadedEvaluator, embed_motions
+from motionloom.pipeline.store.networks import TrainedTokenizer
 
 _RECONSTRUCTED, _GENERATED = 16, 64
 """Clips at a time, at most."""
@@ -234,8 +234,8 @@ class EvaluationUnits(Evaluation):
             for t, m in zip(truths, motions, strict=True)
         ]
         out = as_table([measure_clip(metrics_of("captions"), one) for one in made_for], CLIP)
-        moves = [features_of(m.joints, fps) for m in motions]
-        out |= {MOVEMENT + kind: np.stack([move[kind] for move in moves]) for kind in moves[0]}
+        moves = all_features((m.joints for m in motions), fps)
+        out |= {MOVEMENT + kind: rows for kind, rows in moves.items()}
         if draw == 0:
             out |= {f"{MOTION}{number:03d}": m.joints for number, m in enumerate(motions)}
         for role, judge in self.performed_by.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from pydantic import Field
 
@@ -18,7 +19,7 @@ from motionloom.pipeline.contract.stage import (
     register,
 )
 from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_for, with_music
-from motionloom.pipeline.evaluation.truth import has_caption, recorded_seconds, spread, truth_of
+from motionloom.pipeline.evaluation.truth import perform, spread_truths
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions
 from motionloom.pipeline.inference.writers import WRITERS, Format, default_formats
@@ -89,27 +90,20 @@ class GenerateStage(StageKind):
 
 def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[str]]:
     """Motions for the captions of the config, or of held-out clips, and what they do not show of these."""
-
     config: GenerateConfig = context.config
     bundle = bundle_driven_by("text", context.every("generators"), context.stage_cache)
-    captions, faces = config.captions, config.captions
-    seconds: float | list[float] | None = config.seconds
+    how: dict[str, Any] = {"seconds": config.seconds, "seed": context.seed, "sampling": config.sampling}
     if bundle is None:
-        if captions:
+        if config.captions:
             raise UserError(
                 f"stage '{context.name}': captions are given and no generator is conditioned on text"
             )
         return [], []
-    if not captions:
-        dataset = context.given["data"].held_out(prefer="test")
-        chosen = spread(dataset, config.count) if config.count and has_caption(dataset).any() else []
-        truths = [truth_of(dataset, i) for i in chosen]
-        captions, faces = [t.caption for t in truths], [t.face_caption for t in truths]
-        if seconds is None and not bundle.generator.decides_length:
-            seconds = recorded_seconds(truths, bundle.generator)
-    if not captions:
-        return [], []
-    made = bundle.generate(captions, face=faces, seconds=seconds, seed=context.seed, sampling=config.sampling)
+    if config.captions:
+        made = bundle.generate(config.captions, face=config.captions, **how)
+    else:
+        truths = spread_truths(context.given["data"].held_out(prefer="test"), config.count)
+        made = perform(bundle, truths, **how) if truths else []
     return made, bundle.find_mismatches(made)
 
 

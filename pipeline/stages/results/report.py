@@ -32,15 +32,7 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.evaluation.cases import Clips
 from motionloom.pipeline.evaluation.dances import dance_to, dances_of, seed_frames, with_music
-from motionloom.pipeline.evaluation.truth import (
-    Truth,
-    has_caption,
-    reconstruct_all,
-    recorded_seconds,
-    spread,
-    truth_at,
-    truth_of,
-)
+from motionloom.pipeline.evaluation.truth import Truth, perform, reconstruct_all, spread_truths, truth_at
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import shown
@@ -161,20 +153,11 @@ def _logged(stages: Sequence[CompletedStage], state: RunState) -> list[Completed
 def _captioned(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
     """Clips with captions, and motions made from them where a generator is conditioned on text."""
     config: ReportConfig = context.config
-    chosen = spread(dataset, config.count) if config.count and has_caption(dataset).any() else []
-    if not chosen:
-        return []
-    truths = [truth_of(dataset, i) for i in chosen]
-    bundle = _bundle(context, "text")
+    truths = spread_truths(dataset, config.count)
+    bundle = _bundle(context, "text") if truths else None
     generated: Sequence[GeneratedMotion | None] = [None] * len(truths)
     if bundle is not None:
-        generated = bundle.generate(
-            [t.caption for t in truths],
-            face=[t.face_caption for t in truths],
-            seconds=None if bundle.generator.decides_length else recorded_seconds(truths, bundle.generator),
-            seed=context.seed,
-            sampling=config.sampling,
-        )
+        generated = perform(bundle, truths, seed=context.seed, sampling=config.sampling)
     out = []
     for number, (truth, made) in enumerate(zip(truths, generated, strict=True), start=1):
         same = truth.face_caption == truth.caption

@@ -152,22 +152,6 @@ def test_known_values_are_kept_and_errors_fall_with_strength(kind: type[TextDeno
     assert misses[2] < 0.7 * misses[0]
 
 
-class Echo(InBetweener):
-    """Takes noisy motion for clean."""
-
-    def forward(self, noisy: torch.Tensor, *more: object, **named: object) -> torch.Tensor:
-        return noisy
-
-
-def test_likeness_stays_near_and_seeds_differ() -> None:
-    net, given = Echo(TINY, len(COLUMNS), 4), task(pinned=False)
-    still = KnownMotion(given.motion[:1].expand(FRAMES, -1), given.mask)  # so that smoothing leaves it alone
-    made = [filled(net, still, steps=10, likeness=one) for one in (0.0, 0.5, 0.9)]
-    assert not torch.equal(made[0][0], made[0][1])
-    away = [float((one[0] - still.motion).norm()) for one in made]
-    assert away[0] > away[1] > away[2]
-
-
 class Aside(InBetweener):
     """Makes what is given, all of it off by 1."""
 

@@ -217,6 +217,3 @@ def test_corrupted_inputs_keep_their_targets() -> None:
     module.eval()
     module.losses_of("tokens", batch, {})
     assert seen["inputs"] is None
-
-
-# ---- what is learnt

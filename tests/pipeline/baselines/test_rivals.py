@@ -14,6 +14,7 @@ from safetensors.numpy import load_file
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.inference.generators.vae import between
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.runs.api import run_recipe
 
@@ -35,6 +36,8 @@ KINDS = {
     "motiondiffuse": f"made: {{kind: motiondiffuse, max_frames: 40, net: {{{SIZES}, caption: {{{SIZES}}}}}}}",
     "mld": f"motion_vae: {VAE}\n  made: {{kind: latent_diffusion, max_frames: 40, net: {{{SIZES}}}}}",
     "motionclip": "made: {kind: motionclip, net: {latent: 384, ff: 16, layers: 1, heads: 2}}",
+    "temos": "made: {kind: tma, net: {latent: 8, ff: 16, layers: 1, heads: 2, frame_stride: 4}, "
+    "loss: {contrastive: 0}}",
 }
 
 
@@ -63,15 +66,23 @@ def test_a_stopped_training_goes_on_exactly_and_its_export_generates(
     made = []
     for place in ("whole", "model"):
         model = MotionModel.from_pretrained(tmp_path / place, device="cpu")
-        sampling = {} if kind == "motionclip" else {"denoising_steps": 3, "sampler": "ddim"}
+        sampling = {} if kind in ("motionclip", "temos") else {"denoising_steps": 3, "sampler": "ddim"}
         made.append(model.generate(["a person walks"] * 2, seconds=[0.5, 1.2], sampling=sampling))
         assert [motion.features.shape for motion in made[-1]] == [(10, 313), (24, 313)]
-        with pytest.raises(UserError, match="give --seconds"):
+        with pytest.raises(UserError, match=r"give --seconds.*lengths: recorded"):
             model.generate(["a person walks"])
     np.testing.assert_array_equal(made[0][1].features, made[1][1].features)
     if kind in ("motiondiffuse", "mld"):
         with pytest.raises(UserError, match=r"0\.05 to 2\.0 s"):
             model.generate(["a person walks"], seconds=2.1)
+
+
+def test_frames_between_are_on_the_line() -> None:
+    values = np.array([[0.0], [4.0], [2.0]], dtype=np.float32)
+    assert between(values, 9, 4)[:, 0].tolist() == [0, 1, 2, 3, 4, 3.5, 3, 2.5, 2]
+    assert between(values, 11, 4)[:, 0].tolist()[-3:] == [2, 2, 2]
+    assert between(values, 6, 4)[:, 0].tolist() == [0, 1, 2, 3, 4, 4], "of 6 frames the third is never read"
+    assert between(values, 3, 1) is not values and between(values, 2, 1)[:, 0].tolist() == [0, 4]
 
 
 FITTING = (

@@ -119,7 +119,7 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "unknown format": (["generate", "nowhere", "a person walks", "-f", "npz,bhv"], "'bvh'"),
     "edit what is not there": (["edit", "nowhere", "walk.bvh", "--keep", ":1"], "nowhere: no such folder"),
     "a stretch": (["edit", "nowhere", "walk.bvh", "--keep", "x"], "--keep x: write it as START:END=PARTS"),
-    "an unknown setting": (["edit", "nowhere", "walk.bvh", "--set", "likenes=0.5"], "'likeness'"),
+    "an unknown setting": (["edit", "nowhere", "walk.bvh", "--set", "strengt=0.5"], "'strength'"),
     "a setting of nothing": (["generate", "nowhere", "a person walks", "--set", "colour=1"], "temperature"),
     "a task of nothing": (["edit", "nowhere", "walk.bvh", "--task", "no.yaml"], "no.yaml: cannot be read"),
     "convert nothing": ([*CONVERT, "--set", "joint_map=map.json"], "map.json: "),

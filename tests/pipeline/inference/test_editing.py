@@ -200,7 +200,7 @@ def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:
 
 REFUSED: list[tuple[dict[str, object], str]] = [
     ({"keep": [{}]}, "keep"),
-    ({}, "likeness"),
+    ({}, "nothing else"),
     ({"keep": [{"start": 9.0}]}, "keep.0: .*9 s.*3.00 s"),
     ({"keep": ENDS, "pins": [{"at": 1.5, "joint": "tail", "position": [0, 1, 0]}]}, "pins: .*'tail'"),
     ({"keep": ENDS, "pins": [{"at": 0.5, "joint": "head", "position": [0, 1, 0]}]}, "pins: head .*0.5 s"),

@@ -291,7 +291,7 @@ def test_the_draw_of_the_greatest_cosine_is_kept() -> None:
     """Not the one of the greatest product; draws of one text differ in length."""
     texts = torch.tensor([[0.0, 2.0], [1.0, 1.0]])
     drawn = [still(9, 9), still(0, 0.1, frames=8), still(1, 0), still(9, 0), still(0.2, 0.2), still(0, 9)]
-    first, second = nearest_candidates(FirstColumns(), texts, drawn)
+    first, second = nearest_candidates(FirstColumns(), texts, drawn)  # type: ignore[arg-type]
     assert first is drawn[1] and second is drawn[4]
 
 

@@ -22,7 +22,7 @@ from motionloom.pipeline.evaluation.latent_metrics import Latents, judged_figure
 from motionloom.pipeline.evaluation.reconstruction import FINGERS, published_errors
 from motionloom.pipeline.evaluation.truth import drawn, truth_of
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.store.networks import embed_motions
+from motionloom.pipeline.store.evaluator import embed_motions
 
 RECIPE = """
 extends: t2m-gpt-tiny

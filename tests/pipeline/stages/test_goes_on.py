@@ -16,7 +16,13 @@ from typing import Any
 import pytest
 import torch
 from rich.console import Console
-from same_stage import assert_equal, assert_same_stage, newest
+from same_stage import (
+    assert_equal,
+    assert_kills_change_nothing,
+    assert_ranks_equal_one,
+    assert_same_stage,
+    newest,
+)
 from tiny_adversaries import Duel, train
 from two_ranks import run_two_ranks
 
@@ -36,13 +42,7 @@ FULL: dict[str, Any] = {"ema": 0.9, "accumulate": 2}
 
 @pytest.mark.parametrize("settings", [FULL, {**FULL, "precision": "bf16-mixed", "accumulate": 1}])
 def test_killed_twice_equals_undisturbed(settings: dict[str, Any], tmp_path: Path) -> None:
-    whole = train(tmp_path / "whole", **settings)
-    for step in (9, 20):
-        with pytest.raises(ConnectionResetError):
-            train(tmp_path / "killed", dies_at=step, **settings)
-    assert newest(tmp_path / "killed")["global_step"] == 18
-    again = train(tmp_path / "killed", **settings)
-    assert_same_stage(tmp_path / "whole", tmp_path / "killed", whole, again)
+    assert_kills_change_nothing(train, tmp_path, (9, 20), 18, **settings)
 
 
 def test_killed_behind_the_last_step_hands_over_the_average(tmp_path: Path) -> None:
@@ -178,14 +178,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("name", list(PAIRS))
 def test_two_ranks_equal_one_with_two_optimizers(name: str, pair: Path, tmp_path: Path) -> None:
     one = train(tmp_path, module={"dropout": 0.0}, **PAIRS[name])
-    first, second = (torch.load(pair / f"{name}-{rank}.pt", weights_only=True) for rank in range(2))
-    assert_equal(first, second)
-    for key, value in one.state_dict().items():
-        torch.testing.assert_close(first[key], value, rtol=BOUNDS[name], atol=BOUNDS[name])
-    rows = [read_training_log(folder) for folder in (tmp_path, pair / name)]
-    assert json.dumps([sorted(r) for r in rows[0]]) == json.dumps([sorted(r) for r in rows[1]])
-    for row, other in zip(*rows, strict=True):
-        assert other == pytest.approx(row, rel=1e-5, abs=1e-6)
+    assert_ranks_equal_one(one, tmp_path, pair, name, BOUNDS[name])
 
 
 @pytest.mark.timeout(240)

@@ -30,7 +30,7 @@ from motionloom.datasets.shards.options import WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.pipeline.evaluation.figures import MODEL, FigureFile
-from motionloom.pipeline.store.networks import embed_motions
+from motionloom.pipeline.store.evaluator import embed_motions
 from motionloom.pipeline.store.published_evaluator import load_published
 
 SCRIPT = Path(__file__).parents[3] / "docs" / "guo_evaluator.py"

@@ -8,30 +8,20 @@ from __future__ import annotations
 
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from same_stage import assert_equal, newest
-from torch import Tensor
+from same_stage import assert_kills_change_nothing, assert_ranks_equal_one
 from two_ranks import run_two_ranks
 from ude_training import NAMES, train
-
-from motionloom.pipeline.store.training_log import read_training_log
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_killed_twice_equals_undisturbed(name: str, tmp_path: Path) -> None:
     """With dropout, z, dropped conditions and drawn tokens; the first kill is before the critic begins."""
-    whole = train(name, tmp_path / "whole", dropout=0.2)
-    for step in (3, 9):
-        with pytest.raises(ConnectionResetError):
-            train(name, tmp_path / "killed", dies_at=step, dropout=0.2)
-    assert newest(tmp_path / "killed")["global_step"] == 8
-    again = train(name, tmp_path / "killed", dropout=0.2)
-    assert_equal(again.state_dict(), whole.state_dict())
-    assert_equal(newest(tmp_path / "killed"), newest(tmp_path / "whole"))
-    assert read_training_log(tmp_path / "killed") == read_training_log(tmp_path / "whole")
+    assert_kills_change_nothing(partial(train, name), tmp_path, (3, 9), 8, dropout=0.2)
 
 
 # ---- two ranks
@@ -58,32 +48,12 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def meant(name: str, value: Tensor) -> Tensor:
-    """Without the keys' biases: they change no softmax, so their gradients are rounding, which Adam makes
-    whole steps of.
-    """
-    if not name.endswith("qkv.bias"):
-        return value
-    query, _, values = value.chunk(3)
-    return torch.cat([query, values])
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize("name", list(PAIRS))
 def test_two_ranks_equal_one(name: str, pair: Path, tmp_path: Path) -> None:
     one = train(name, tmp_path, dtype=PAIRS[name])
-    first, second = (torch.load(pair / f"{name}-{rank}.pt", weights_only=True) for rank in range(2))
-    assert_equal(first, second)
-    for key, value in one.state_dict().items():
-        torch.testing.assert_close(
-            *(meant(key, weight) for weight in (first[key], value)),
-            rtol=BOUND, atol=BOUND, msg=lambda m, k=key: f"{k}: {m}",
-        )  # fmt: skip
-    rows = [read_training_log(folder) for folder in (tmp_path, pair / name)]
-    assert [sorted(row) for row in rows[0]] == [sorted(row) for row in rows[1]]
-    for row, other in zip(*rows, strict=True):
-        assert other == pytest.approx(row, rel=1e-5, abs=1e-5)
+    assert_ranks_equal_one(one, tmp_path, pair, name, BOUND)
 
 
 if __name__ == "__main__":
