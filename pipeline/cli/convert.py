@@ -106,7 +106,9 @@ def _command(name: str) -> Any:
     ]
     for key in config.everyday:
         option = typer.Option(_flag(key), help=_help(config, key))
-        parameters.append(_parameter(key, Annotated[config.model_fields[key].annotation, option], None))
+        kind: Any = config.model_fields[key].annotation
+        kind = list[str] | None if typing.get_origin(kind) is tuple else kind  # given again for each
+        parameters.append(_parameter(key, Annotated[kind, option], None))
     parameters += [_parameter(key, kind, default) for key, (kind, default) in _RUN_OPTIONS.items()]
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -246,7 +248,11 @@ def proposed(
         value = changes.get(key, getattr(config, key))
         if key == "source" or value is None or value == field.get_default(call_default_factory=True):
             continue
-        words += [_flag(key), str(value)] if key in config.everyday else ["--set", f"{key}={_yaml(value)}"]
+        if key in config.everyday:
+            for one in value if isinstance(value, tuple) else (value,):
+                words += [_flag(key), str(one)]
+        else:
+            words += ["--set", f"{key}={_yaml(value)}"]
     return shlex.join(words)
 
 

@@ -168,7 +168,7 @@ class HumanmlConfig(CaptionConfig):
     def _consistent(self) -> HumanmlConfig:
         if self.humanml_index is None and (self.mirror or self.humanml_texts is not None):
             raise ValueError("mirror and humanml_texts need humanml_index")
-        if self.humanml_index is not None and self.captions is not None:
+        if self.humanml_index is not None and self.captions:
             raise ValueError("captions and humanml_index exclude each other; the index has humanml_texts")
         return self
 

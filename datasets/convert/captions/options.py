@@ -11,10 +11,13 @@ import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import BeforeValidator
 
 from motionloom.datasets.base.files import sha256_of, sha256_of_json
-from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, read_captions
+from motionloom.datasets.convert.captions.collect import Captions, caption_files, holds_captions
+from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, place_of
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.convert.common.splits import SplitRule, hash_split, read_split_files
@@ -128,7 +131,7 @@ def list_clips(
             unused.append(row)
             if not row.catalogue:
                 missing[row.file or row.id] = row.id
-        elif path in found and row.catalogue:
+        elif path in found and (row.catalogue or row.origin != found[path].origin):
             found[path] = joined(found[path], replace(row, id=found[path].id, file=None))
         elif path in found:
             raise UserError(f"{row.where}: '{row.id}' and '{found[path].id}' both mean {path}")
@@ -170,12 +173,19 @@ _SHOWN = 3
 """Names that a sentence lists."""
 
 
+def _listed(given: object) -> object:
+    """One place as several; `~` is the home folder."""
+    places = given if isinstance(given, list | tuple) else [] if given is None else [given]
+    return [Path(place).expanduser() if isinstance(place, str | Path) else place for place in places]
+
+
 class CaptionConfig(ConvertConfig):
     """Options of converters that take captions in any form."""
 
-    captions: Path | None = None
-    """Captions by the clips' names: JSON lines, JSON, CSV, TSV, CMU's or KIT-ML's lists, or a folder of .txt
-    files or of such lists (docs/sources.md). Without it clips have no captions.
+    captions: Annotated[tuple[Path, ...], BeforeValidator(_listed)] = ()
+    """Captions by the clips' names: JSON lines, JSON, CSV, TSV, CMU's or KIT-ML's lists, or a folder of these
+    and of .txt files (docs/sources.md); several count together. Columns of other names stand behind the file:
+    `takes.csv:text=Beschreibung,file=Datei`. Without it clips have no captions.
     """
     splits: Path | None = None
     """Folder of train.txt, val.txt, test.txt, or `subjects` for all clips of a person in one split, by a hash
@@ -188,7 +198,7 @@ class CaptionConfig(ConvertConfig):
     @property
     def has_captions(self) -> bool:
         """Whether captions are given."""
-        return self.captions is not None
+        return bool(self.captions)
 
     def options(self) -> dict[str, object]:
         """Return the fields that the output depends on; `stop` counts as `drop`: both write captions."""
@@ -196,19 +206,42 @@ class CaptionConfig(ConvertConfig):
 
     def listing(self, paths: Sequence[str]) -> Listing:
         """Return the captions and splits of motion files, by their paths in the source."""
-        rows = () if self.captions is None else read_captions(self.captions).values()
+        captions = Captions.read(self.captions)
         rule = None if self.splits is None or self.splits.exists() else SplitRule.parse(str(self.splits))
         listed, notes = read_split_files(self.splits) if self.splits and not rule else (None, [])
-        return replace(list_clips(paths, rows, listed, notes), rule=rule)
+        notes += unused_files(self.source, paths, captions)
+        return replace(list_clips(paths, captions.rows.values(), listed, notes), rule=rule)
 
 
-def digest_of(path: Path) -> dict[str, str]:
-    """A file by its name and checksum; a folder by its name and those of its .txt and .json files."""
+def unused_files(source: Path, paths: Sequence[str], captions: Captions) -> list[str]:
+    """Return notes on files in the source that look like captions and are not read, and on tables that were
+    given and hold none.
+    """
+    notes = []
+    if captions.others:
+        notes.append(f"no captions in {_some([path.name for path in captions.others])}")
+    if source.is_dir():
+        texts, tables = caption_files(source)
+        stems = set(map(bare, paths))
+        found = [text for text in texts if text.relative_to(source).as_posix().removesuffix(".txt") in stems]
+        unread = [path for path in [*found, *tables] if str(path.absolute()) not in captions.used]
+        unread = [path for path in unread if path.suffix == ".txt" or holds_captions(path, {})]
+        if unread:
+            names = _some([path.relative_to(source).as_posix() for path in unread])
+            notes.append(
+                f"{len(unread)} files of captions in the source are not used: {names}; add --captions"
+            )
+    return notes
+
+
+def digest_of(given: Path) -> str:
+    """Checksum of a file, or of those in a folder that hold captions or maps; empty for anything else."""
+    path, _ = place_of(given)
     if path.is_dir():
-        files = (p for p in sorted(path.rglob("*")) if p.suffix in (".txt", ".json") and p.is_file())
-        inside = {p.relative_to(path).as_posix(): sha256_of(p) for p in files}
-        return {"file": path.name, "sha256": sha256_of_json(inside)}
-    return {"file": path.name, "sha256": sha256_of(path)}
+        texts, tables = caption_files(path)
+        inside = {file.relative_to(path).as_posix(): sha256_of(file) for file in sorted([*texts, *tables])}
+        return sha256_of_json(inside) if inside else ""
+    return sha256_of(path) if path.is_file() else ""
 
 
 def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: Listing) -> None:
@@ -218,10 +251,11 @@ def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: List
     for name, clip_id in found.missing.items():
         draft.miss(name, f"clip '{clip_id}' is listed, but its file is not in the source")
     draft.notes += found.empty_splits({clip.label(): split for split, clip in draft.items})
-    if config.captions is None:
+    if not config.captions:
         return
     bare_clips, captioned = draft.bare_clips, draft.captioned
-    file, total = config.captions.name, captioned + len(bare_clips)
+    places = [place_of(place)[0] for place in config.captions]
+    file, total = ", ".join(place.name for place in places), captioned + len(bare_clips)
     become = {"stop": "", "drop": " and are left out", "keep": " and are kept"}[config.uncaptioned]
     sentences = [f"{captioned} of {total} clips have captions in {file}"]
     if bare_clips:
@@ -232,7 +266,8 @@ def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: List
     draft.notes.append(draft.captions)
     if bare_clips and config.uncaptioned == "stop":
         draft.stop = (
-            f"{config.captions}: no captions for {len(bare_clips)} of {total} clips ({_some(bare_clips)})"
+            f"{', '.join(map(str, places))}: no captions for {len(bare_clips)} of {total} clips "
+            f"({_some(bare_clips)})"
             + (f"; captions for {_unused(found)}" if found.unused else "")
             + "; add them, or choose --set uncaptioned=drop, which leaves these clips out, or "
             "uncaptioned=keep, which converts them without words"

@@ -1,8 +1,9 @@
 """Captions that people bring for their clips, in any of six forms that are recognised by themselves.
 
-JSON lines begin with `{`, one object by clips' names does too, a JSON list begins with `[`, a folder of .txt
-files is HumanML3D's where a first line has its grammar, and any other file is CSV or TSV with a header
-(docs/sources.md). Every error begins with `FILE:LINE`, and what a record says passes through pydantic.
+JSON lines begin with `{`, one object by clips' names does too, a JSON list begins with `[`, and any other
+file is CSV or TSV with a header (docs/sources.md). A folder may hold all of these, and .txt files, which are
+HumanML3D's where a first line has its grammar. Every error begins with `FILE:LINE`, and what a record says
+passes through pydantic.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from pydantic import AliasChoices, ConfigDict, Field, FiniteFloat
 from motionloom.datasets.convert.captions.humanml_text import parse_caption
 from motionloom.datasets.convert.common.files import check_id, read_text_file
 from motionloom.datasets.convert.common.splits import split_named
-from motionloom.datasets.schema import Caption, Config, Split, UserError, parse_json
+from motionloom.datasets.schema import Caption, Config, Split, UserError, nearest, parse_json
 
 SOURCE = "captions"
 """`source` of captions that state none."""
@@ -35,7 +36,7 @@ _NUMBER = r"\s*(?:nan|[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|[-+]?\.\d+)\s*"
 _HUMANML = re.compile(rf"[^#].*#.*#{_NUMBER}#{_NUMBER}")
 _AMASS = re.compile(r"_(?:poses|stageii)$")
 _DELIMITERS = {",": "a ','", "\t": "a tab", ";": "a ';'"}
-_CATALOGUE = "<catalogue>"
+CATALOGUE = "<catalogue>"
 _RECORD = '{"id": "walk-001", "captions": ["a person walks"]}'
 
 
@@ -52,6 +53,8 @@ class CaptionRow:
     """`FILE:LINE`, or the file and which of its records."""
     catalogue: bool = False
     """Whether it is from a list of a whole collection, of which a source need not have every clip."""
+    origin: str = ""
+    """The file, or the folder of .txt files, that it is from."""
 
 
 class _Given(Config):
@@ -72,26 +75,25 @@ def bare(name: str) -> str:
     return name[: -len(end[0])] if (end := _SUFFIX.search(name)) else name
 
 
-def read_captions(path: Path) -> dict[str, CaptionRow]:
-    """The rows of a file or folder by clip id; `UserError` names file and line of anything malformed."""
-    rows, files = dict[str, CaptionRow](), dict[str, str]()
-    # Two records of one clip are joined if each holds one caption, and a mistake if they hold whole lists.
-    for where, values in _records(path):
-        catalogue = bool(values.pop(_CATALOGUE, False))
-        row, is_list = _row(where, values)
-        row = replace(row, catalogue=catalogue)
-        before = rows.get(row.id)
-        if row.file and files.setdefault(row.file, row.id) != row.id:
-            raise UserError(f"{where}: file '{row.file}' has a record already ('{files[row.file]}')")
-        if before is not None and is_list and not catalogue:
-            raise UserError(f"{where}: clip id '{row.id}' has a record already ({before.where})")
-        rows[row.id] = row if before is None else joined(before, row)
-    if not rows:
-        raise UserError(f"{path}: no captions in it")
-    return rows
+_PLACE = re.compile(r"(.+?):(\w+=.+)")
+_COLUMNS = {"text": TEXT_KEYS, "file": FILE_KEYS, "id": ID_KEYS}
+_OTHER_COLUMNS = ("split", "start", "end")
 
 
-def _row(where: str, values: dict[str, object]) -> tuple[CaptionRow, bool]:
+def place_of(given: Path) -> tuple[Path, dict[str, str]]:
+    """The file or folder of `takes.csv:text=Beschreibung,file=Datei`, and its columns by what they hold."""
+    found = None if given.exists() else _PLACE.fullmatch(str(given))
+    if found is None:
+        return given, {}
+    columns = dict(pair.partition("=")[::2] for pair in found[2].split(","))
+    known = [*_COLUMNS, *_OTHER_COLUMNS]
+    for key in columns:
+        if key not in known:
+            raise UserError(f"{given}: no column is '{key}'{nearest(key, known)}")
+    return Path(found[1]), {key: _word(column) for key, column in columns.items()}
+
+
+def row_of(where: str, values: dict[str, object]) -> tuple[CaptionRow, bool]:
     """The row of a record, and whether it holds all captions of its clip (a list) and not one of them."""
     keys = _text_keys(tuple(values))
     values = {key: value for key, value in values.items() if value is not None and str(value).strip()}
@@ -143,7 +145,8 @@ def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
     """One row of two records of the same clip."""
     for what in ("file", "split"):
         old, new = getattr(before, what), getattr(row, what)
-        if old is not None and new is not None and old != new:
+        apart = what == "file" and before.origin != row.origin  # in each its own way of naming it
+        if old is not None and new is not None and old != new and not apart:
             raise UserError(
                 f"{row.where}: {what} of clip '{row.id}' is '{new}' here and '{old}' at {before.where}"
             )
@@ -152,25 +155,40 @@ def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
         texts=before.texts + tuple(text for text in row.texts if text not in before.texts),
         file=before.file or row.file,
         split=before.split or row.split,
+        catalogue=before.catalogue and row.catalogue,
     )
 
 
-def _records(path: Path) -> Iterator[tuple[str, dict[str, object]]]:
-    """(place, values) of every record of a file or folder."""
-    if path.is_dir():
-        return _of_folder(path)
+Records = Iterator[tuple[str, dict[str, object]]]
+"""(place, values) of every record of a file."""
+
+
+def records_of(path: Path, columns: dict[str, str]) -> Records:
+    """The records of a file, whose columns or keys may have names of the user's own."""
     text = read_text_file(path)
     start = text.lstrip()[:1]
-    if start == "{" and (named := _by_name(path, text)) is not None:
+    if start == "{" and not columns and (named := _by_name(path, text)) is not None:
         return iter(named)
     if start == "[" or (start and path.suffix.lower() == ".json" and start != "{"):
         values = _decode(str(path), text)
         listed = enumerate(values if isinstance(values, list) else [values], start=1)
-        return (_record(f"{path}: record {number}", value) for number, value in listed)
+        return (_record(f"{path}: record {number}", value, columns) for number, value in listed)
     if start not in ("{", ""):
-        return _of_table(path, text)
+        return _of_table(path, text, columns)
     places = ((f"{path}:{n}", line) for n, line in enumerate(text.split("\n"), start=1) if line.strip())
-    return (_record(place, _decode(place, line)) for place, line in places)
+    return (_record(place, _decode(place, line), columns) for place, line in places)
+
+
+def _word(name: str) -> str:
+    """A column's name as it is compared: small letters, `_` for blanks."""
+    return re.sub(r"[\s-]+", "_", name.strip().lower())
+
+
+def _renamed(names: Iterable[str], columns: dict[str, str]) -> list[str]:
+    """The keys that columns stand for: what the user names comes before what has our names."""
+    keys = {column: "caption" if kind == "text" else kind for kind, column in columns.items()}
+    hidden = {key for kind in columns for key in _COLUMNS.get(kind, (kind,))}
+    return [keys.get(_word(name)) or (f"({name})" if name in hidden else name) for name in names]
 
 
 def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | None:
@@ -187,7 +205,7 @@ def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | Non
         return None
     records: list[tuple[str, dict[str, object]]] = []
     for name, value in named.items():
-        where, record = f"{path}: '{name}'", {"id": name, _CATALOGUE: True}
+        where, record = f"{path}: '{name}'", {"id": name, CATALOGUE: True}
         if isinstance(value, dict) and {"path", "annotations"} <= value.keys():
             place, value = str(value["path"]), value["annotations"]
             if place.startswith("M/"):
@@ -202,10 +220,10 @@ def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | Non
     return records
 
 
-def _record(where: str, value: object) -> tuple[str, dict[str, object]]:
+def _record(where: str, value: object, columns: dict[str, str]) -> tuple[str, dict[str, object]]:
     if not isinstance(value, dict):
         raise UserError(f"{where}: no record; expected the likes of {_RECORD}")
-    return where, value
+    return where, dict(zip(_renamed(value, columns), value.values(), strict=True)) if columns else value
 
 
 def _decode(where: str, text: str) -> object:
@@ -219,22 +237,11 @@ def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
     return found
 
 
-def _of_folder(folder: Path) -> Iterator[tuple[str, dict[str, object]]]:
-    """A record for each file, named by its path without `.txt`.
+def text_records(folder: Path, paths: Iterable[Path]) -> Records:
+    """A record for each .txt file, named by its path without `.txt`.
 
     The folder is in HumanML3D's grammar when the first line of any file is: then all lines must be.
     """
-    catalogues = [
-        found
-        for path in sorted(folder.glob("*.json"))
-        for found in _by_name(path, read_text_file(path)) or ()
-    ]
-    if catalogues:
-        yield from catalogues
-        return
-    paths = sorted(p for p in folder.rglob("*.txt") if p.is_file() and not p.name.startswith("."))
-    if not paths:
-        raise UserError(f"{folder}: no .txt file in it; expected one caption a line in FOLDER/CLIP.txt")
     texts = {path: read_text_file(path).split("\n") for path in paths}
     firsts = (next((line for line in lines if line.strip()), "") for lines in texts.values())
     humanml = any(_HUMANML.fullmatch(line) for line in firsts)
@@ -255,11 +262,11 @@ def _humanml(path: Path, lines: Iterable[str]) -> list[Caption]:
     return captions
 
 
-def _of_table(path: Path, text: str) -> Iterator[tuple[str, dict[str, object]]]:
+def _of_table(path: Path, text: str, columns: dict[str, str]) -> Records:
     """The rows by the names of the header, in lower case."""
     lines = text.split("\n")
     first = next(number for number, line in enumerate(lines) if line.strip())
-    delimiter, names = _header(path, lines[first], first + 1)
+    delimiter, names = _header(path, lines[first], first + 1, columns)
     # The reader wants the newlines back: those inside quotes belong to the caption.
     reader = csv.reader((f"{line}\n" for line in lines[first + 1 :]), delimiter=delimiter, strict=True)
     while True:
@@ -280,14 +287,15 @@ def _of_table(path: Path, text: str) -> Iterator[tuple[str, dict[str, object]]]:
         yield place, dict(zip(names, row, strict=True))
 
 
-def _header(path: Path, line: str, number: int) -> tuple[str, list[str]]:
+def _header(path: Path, line: str, number: int, columns: dict[str, str]) -> tuple[str, list[str]]:
     usual = "\t" if path.suffix.lower() in (".tsv", ".tab") else ","
     for delimiter in dict.fromkeys((usual, *_DELIMITERS)):
         try:
             fields = next(csv.reader([line], delimiter=delimiter))
         except csv.Error:
             continue
-        names = [re.sub(r"[\s-]+", "_", field.strip().lower()) for field in fields]
+        words = list(map(_word, fields))
+        names = _renamed(words, columns) if set(columns.values()) <= set(words) else []
         if _text_keys(tuple(names)) and set(names) & {*ID_KEYS, *FILE_KEYS}:
             twice = next((name for name in names if name and names.count(name) > 1), None)
             if twice is not None:
@@ -296,5 +304,5 @@ def _header(path: Path, line: str, number: int) -> tuple[str, list[str]]:
     raise UserError(
         f"{path}:{number}: the first line must name a column for the clip "
         f"({', '.join((*ID_KEYS, *FILE_KEYS))}) and one for the caption ({', '.join(TEXT_KEYS)}), but is "
-        f"'{line.strip()[:60]}'"
+        f"'{line.strip()[:60]}'; others are named behind the file: {path.name}:text=COLUMN,file=COLUMN"
     )

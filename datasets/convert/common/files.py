@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -80,6 +82,29 @@ def inside(root: Path, relative: str, name: str | None = None) -> Path:
     if not safe:
         raise UserError(f"{name}: a link that leaves {root.name}/; copy the file in its place")
     return path
+
+
+def walk_files(root: Path) -> list[str]:
+    """Return the names of all files under a folder, relative to it and sorted. Folders behind links are
+    followed, each folder once: by its own name where it lies under `root` itself, else by the first link.
+    """
+    names: list[str] = []
+    seen: set[tuple[int, int]] = set()
+    folders, links = [""], list[str]()
+    while folders or links:
+        folder = folders.pop() if folders else links.pop(links.index(min(links)))
+        with suppress(OSError):  # one that cannot be read holds nothing that can
+            about = (root / folder).stat()
+            if (about.st_dev, about.st_ino) in seen:
+                continue
+            seen.add((about.st_dev, about.st_ino))
+            for entry in os.scandir(root / folder):
+                name = f"{folder}/{entry.name}" if folder else entry.name
+                if entry.is_dir():
+                    (links if entry.is_symlink() else folders).append(name)
+                elif entry.is_file():
+                    names.append(name)
+    return sorted(names)
 
 
 def read_in_threads(

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from motionloom.datasets.base.files import sha256_of_json, write_json
 from motionloom.datasets.base.lock import file_lock
-from motionloom.datasets.convert.common.files import read_in_threads
+from motionloom.datasets.convert.common.files import read_in_threads, walk_files
 from motionloom.datasets.motion.bvh.asf import JOINED
 from motionloom.datasets.schema import Config, UserError, read_plain
 from motionloom.datasets.shards.checksums import state_of
@@ -41,7 +41,7 @@ def list_files(source: Path) -> tuple[Path, list[str]]:
         root, names = source.parent, [source.name]
     elif source.is_dir():
         root = source
-        names = sorted(p.relative_to(source).as_posix() for p in source.rglob("*") if p.is_file())
+        names = walk_files(source)
     else:
         raise UserError(f"{source}: no such file or folder")
     names = [name for name in names if name.lower().endswith(SUFFIX)]

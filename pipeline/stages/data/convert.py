@@ -8,7 +8,6 @@ from typing import Any
 
 from pydantic import ConfigDict
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.convert.captions.options import digest_of
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
@@ -77,15 +76,13 @@ def source_facts(config: ConvertConfig) -> dict[str, Any]:
         raise UserError(f"{source}: no such folder (the source; set it with --set data.source=FOLDER)")
     listed = sorted(source.rglob("*")) if source.is_dir() else [source]
     files = {p.relative_to(source).as_posix(): p.stat().st_size for p in listed if p.is_file()}
-    steering = {}
+    steering: dict[str, str | list[str]] = {}
     for name in type(config).model_fields:
-        path = getattr(config, name)
-        if name == "source" or not isinstance(path, Path):
-            continue
-        if path.is_file():
-            steering[name] = sha256_of(path)
-        elif path.is_dir() and any(p.suffix in (".txt", ".json") for p in path.rglob("*")):  # texts, maps
-            steering[name] = digest_of(path)["sha256"]
+        value = getattr(config, name)
+        places = [one for one in (value if isinstance(value, tuple) else [value]) if isinstance(one, Path)]
+        digests = list(filter(None, map(digest_of, places))) if name != "source" else []
+        if digests:
+            steering[name] = digests[0] if len(digests) == 1 else digests
     return {"files": files, "steering": steering}
 
 

@@ -21,7 +21,7 @@ from shard_samples import write
 from motionloom.datasets.audio.sound import MAX_RATE, read_sound
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.files import check_file
-from motionloom.datasets.convert.captions.read import read_captions
+from motionloom.datasets.convert.captions.collect import read_captions
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.schema import Manifest, ShardInfo, UserError

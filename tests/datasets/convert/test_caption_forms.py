@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import random
-import re
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -17,8 +15,8 @@ from bvh_clips import write_clip, write_map
 from rich.console import Console
 
 from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.captions.collect import read_captions
 from motionloom.datasets.convert.captions.options import list_clips
-from motionloom.datasets.convert.captions.read import read_captions
 from motionloom.datasets.convert.common.splits import hash_split, read_split_files, subject_of
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.schema import Manifest, UserError
@@ -216,54 +214,6 @@ def test_mirrored_sentences_and_names_that_fit_twice_are_left_alone(tmp_path: Pa
 )
 def test_names_of_files_tell_the_subject(name: str, subject: str) -> None:
     assert subject_of(name) == subject
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_no_clip_moves_when_subjects_come_and_go(seed: int) -> None:
-    """Of random subjects some leave and others come: everyone else stays, all clips of a person together."""
-    draw = random.Random(seed)
-    config = BvhConfig(source=Path("x"), splits=Path(draw.choice(["subjects", "subjects:7", "clips:2"])))
-
-    def splits_of(subjects: list[int]) -> dict[str, str]:
-        paths = [f"{subject:03}_{trial:02}.amc" for subject in subjects for trial in range(1 + subject % 5)]
-        draw.shuffle(paths)
-        listing = config.listing(paths)
-        return {path: listing.split_of(path) for path in paths}
-
-    everyone = list(range(120))
-    before, after = (splits_of(draw.sample(everyone, draw.randint(1, 120))) for _ in range(2))
-    assert {path: after[path] for path in before.keys() & after} == {
-        path: before[path] for path in before.keys() & after
-    }
-    if "subjects" in str(config.splits):
-        assert len({(subject_of(path), split) for path, split in before.items()}) == len(
-            set(map(subject_of, before))
-        )
-
-
-@pytest.mark.parametrize("subjects", [2, 3, 5, 12])
-def test_empty_splits_are_said_with_a_rule_that_fills_them(subjects: int) -> None:
-    names = [f"p{number}/a.bvh" for number in range(subjects)]
-    listing = BvhConfig(source=Path("x"), splits=Path("subjects")).listing(names)
-    notes = listing.empty_splits(dict.fromkeys(names, "train"))
-    found = re.search(r"--set splits=(subjects:\d+)", notes[0])
-    assert "val or test" in notes[0] and (found is not None) is (subjects > 2)
-    if found:
-        again = BvhConfig(source=Path("x"), splits=Path(found[1])).listing(names)
-        splits = {name: again.split_of(name) for name in names}
-        assert set(splits.values()) == {"train", "val", "test"} and not again.empty_splits(splits)
-
-
-def test_clips_that_the_user_moves_are_counted(source: Path, tmp_path: Path) -> None:
-    given = {"source": source, "joint_map": source / "map.json", "licence": "CC0-1.0", "splits": "clips:5"}
-    out, said = tmp_path / "out", io.StringIO()
-    for splits in ("clips:5", "clips:5", "clips:7"):
-        said = io.StringIO()
-        console = Console(file=said, width=200)
-        convert_command("bvh", {**given, "splits": splits}, out, plan=False, workers=1, console=console)
-        assert ("to another split" in said.getvalue()) is (splits == "clips:7")
-    moved = sum(hash_split(name, 5) != hash_split(name, 7) for name in TEXTS)
-    assert f"{moved} clips move to another split" in said.getvalue()
 
 
 def test_nothing_to_read(tmp_path: Path) -> None:

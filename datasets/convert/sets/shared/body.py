@@ -20,6 +20,7 @@ from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_fea
 from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
+from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.converter import PlanSettings
 from motionloom.datasets.convert.common.features import (
     body_of,
@@ -101,6 +102,8 @@ class BodyRelease(Release[Cfg]):
         """Folder that `entry.sound` is relative to."""
         self._cut = 0
         """Clips that end with their sound."""
+        self._longer: list[float] = []
+        """Seconds by which sounds go on after the motion."""
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         header = read_motion_header(path, label)
@@ -123,6 +126,11 @@ class BodyRelease(Release[Cfg]):
         if self._cut:
             gap = self.config.max_music_gap
             plan.notes.append(f"{self._cut} clips end with their sound, at most {gap:g} s early")
+        if self._longer:
+            count, most = len(self._longer), max(self._longer)
+            plan.notes.append(
+                f"the sound of {count} clips goes on after the motion, {most:.1f} s at most; cut"
+            )
         return plan
 
     def with_sound(self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
@@ -151,6 +159,8 @@ class BodyRelease(Release[Cfg]):
             return last, ""
         seconds = self._sounds[entry.sound]
         end = min(last, int(seconds * fps + 1e-6))
+        if entry.last is None and seconds > last / fps + END_TOLERANCE:  # the whole file, no part of it
+            self._longer.append(seconds - last / fps)
         if last - end <= self.config.max_music_gap * fps:
             self._cut += end < last
             return end, ""

@@ -51,7 +51,7 @@ class BvhSetConfig(BvhConfig):
         return "" if stem(path) in self.rows() else "not in the tables of the set"
 
     def listing(self, paths: Sequence[str]) -> Listing:
-        if self.captions is not None:
+        if self.captions:
             return super().listing(paths)
         known, here = self.rows(), {stem(path): path for path in paths}
         rows = [

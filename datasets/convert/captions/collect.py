@@ -1,0 +1,99 @@
+"""Captions of several files and folders at once, and the files of a folder that hold any."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PurePosixPath
+
+from motionloom.datasets.convert.captions.read import (
+    CATALOGUE,
+    CaptionRow,
+    Records,
+    joined,
+    place_of,
+    records_of,
+    row_of,
+    text_records,
+)
+from motionloom.datasets.convert.common.files import walk_files
+from motionloom.datasets.schema import UserError
+
+TABLES = (".csv", ".tsv", ".tab", ".jsonl", ".json")
+
+
+def read_captions(*places: Path) -> dict[str, CaptionRow]:
+    """The rows of files and folders by clip id; `UserError` names file and line of anything malformed."""
+    return Captions.read(places).rows
+
+
+@dataclass(frozen=True)
+class Captions:
+    """Captions of several files and folders; a clip that several name has the captions of all."""
+
+    rows: dict[str, CaptionRow] = field(default_factory=dict)
+    """By clip id."""
+    used: set[str] = field(default_factory=set)
+    """Absolute paths of the files that hold them."""
+    others: list[Path] = field(default_factory=list)
+    """Tables in the folders that hold none."""
+
+    @classmethod
+    def read(cls, places: Iterable[Path]) -> Captions:
+        captions = cls()
+        for place in places:
+            path, columns = place_of(place)
+            if path.is_dir():
+                captions._add_folder(path, columns)
+            else:
+                captions._add(path, records_of(path, columns), [path])
+        return captions
+
+    def _add_folder(self, folder: Path, columns: dict[str, str]) -> None:
+        before = len(self.used)
+        texts, tables = caption_files(folder)
+        if texts:
+            self._add(folder, text_records(folder, texts), texts)
+        for table in tables:
+            if holds_captions(table, columns):
+                self._add(table, records_of(table, columns), [table])
+            else:
+                self.others.append(table)
+        if len(self.used) == before:
+            raise UserError(
+                f"{folder}: no .txt file and no table of captions in it; expected one caption a line in "
+                f"FOLDER/CLIP.txt, or CSV or JSON"
+            )
+
+    def _add(self, origin: Path, records: Records, files: Iterable[Path]) -> None:
+        named: dict[str, str] = {}
+        for where, values in records:
+            catalogue = bool(values.pop(CATALOGUE, False))
+            row, is_list = row_of(where, values)
+            row = replace(row, catalogue=catalogue, origin=str(origin))
+            if row.file and named.setdefault(row.file, row.id) != row.id:
+                raise UserError(f"{where}: file '{row.file}' has a record already ('{named[row.file]}')")
+            named.setdefault("", row.id)
+            before = self.rows.get(row.id)
+            # Records of one clip are joined, but two lists of all its captions in one file are a mistake.
+            if before is not None and before.origin == row.origin and is_list and not catalogue:
+                raise UserError(f"{where}: clip id '{row.id}' has a record already ({before.where})")
+            self.rows[row.id] = row if before is None else joined(before, row)
+        if not named:
+            raise UserError(f"{origin}: no captions in it")
+        self.used.update(str(path.absolute()) for path in files)
+
+
+def caption_files(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The .txt files in a folder, and the files that may hold tables."""
+    paths = [folder / name for name in walk_files(folder) if not PurePosixPath(name).name.startswith(".")]
+    texts = [path for path in paths if path.suffix.lower() == ".txt"]
+    return texts, [path for path in paths if path.suffix.lower() in TABLES]
+
+
+def holds_captions(table: Path, columns: dict[str, str]) -> bool:
+    """Whether the first record of a file is one of captions."""
+    try:
+        return bool(row_of(*next(records_of(table, columns))))
+    except (UserError, StopIteration):
+        return False
