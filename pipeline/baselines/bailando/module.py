@@ -1,14 +1,13 @@
 """Training of Bailando's stages: codes and then the root, the GPT, and the GPT as an actor.
 
 `CrossGptModule` minimises the cross-entropy of upper and lower codes (section 3.2). `ActorCriticModule`
-trains the GPT to keep the beat (section 3.3): it dances to the music of a batch from the first codes of its
-motions, and a code is rewarded where a beat of the music and one of the dance both fall into its frames. The
-critic reads the states that the GPT's halves share, without a gradient to them, and predicts the reward of
-the rest of the dance. The advantage, by which a step's reward exceeds that prediction, weights each code's
-cross-entropy.
+trains the GPT's last layers to keep the beat (section 3.3): it dances to the music of a batch from the first
+codes of its motions, and a code is rewarded where a beat of the music and one of the dance both fall into its
+frames. Windows of the dances are trained on. The critic reads the states that the GPT's halves share, which
+no longer learn, and predicts the reward of the rest of the dance. The advantage, by which a step's reward
+exceeds that prediction, weights the cross-entropy of both codes.
 
-Actor and critic take turns of several steps. Codes are drawn from the actor [ours]: greedy codes would show
-it nothing else.
+Actor and critic take turns of several steps.
 
 Legend: B batch, T frames, L codes, D width.
 """
@@ -167,43 +166,67 @@ class ActorCriticModule(AlternatingModule):
     def optimizer_groups(self) -> list[OptimizerGroup]:
         """The actor, then the critic."""
         net, actor, critic = self.net, self.config.actor_steps, self.config.critic_steps
-        both = actor + critic
+        both, last = actor + critic, (net.gpt.head, net.gpt.out)
         return [
-            _InTurns("actor", (net.gpt,), self.optim_config, run=actor, period=both),
+            _InTurns("actor", last, self.optim_config, run=actor, period=both),
             _InTurns("critic", (net.critic,), self.optim_config, offset=actor, run=critic, period=both),
         ]
 
     def losses_of(self, group: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
-        """A group's loss, and the mean reward of a code."""
+        """A group's loss, and the mean reward of a code. Neither has dropout, as published."""
         gpt = self.net.gpt
+        with evaluating(self.net):
+            if "codes" not in shared:
+                shared |= self._danced(batch)
+            codes, music, reward, heard = (shared[key] for key in ("codes", "music", "reward", "heard"))
+            with torch.no_grad():
+                states = gpt.states(codes[:, :-1], music[:, 1:])
+            error = td_error(reward, self.values(states), self.config.discount)
+            if group == "critic":
+                loss = masked_mean(error.square(), heard[:, None].expand_as(error))
+            else:
+                each = code_errors(gpt.logits(states)[:, :-1], codes[:, 1:-1]).sum(2)
+                loss = masked_mean(each * error.detach(), shared["counts"])
+        return {"loss": loss, "reward": masked_mean(reward, heard[:, None].expand_as(reward))}
+
+    @torch.no_grad()
+    def _danced(self, batch: Batch) -> dict[str, Tensor]:
+        """Windows of dances as long as the clips: "codes" [B, L, 2], "music" [B, L, E], "reward" [B, L - 2]
+        of the codes between the first and the last; "heard" bool [B], who has music; and the codes that the
+        actor learns, "counts" bool [B, L - 2].
+        """
+        gpt, frames, size = self.net.gpt, self.vq.module.config.code_frames, self.net.gpt.config.context + 1
         true, music, heard = codes_of(gpt, self.vq.module, batch)
-        if "codes" not in shared:
-            with evaluating(gpt):
-                codes = gpt.dance(true[:, :1], music, self.config.temperature)
-            shared |= {"codes": codes, "reward": self.rewards(codes, batch["beats"])}
-        codes, reward = shared["codes"], shared["reward"][:, 1:]
-        counts = heard[:, None].expand_as(reward)
-        states = gpt.states(codes[:, :-1], music[:, 1:])
-        error = td_error(reward, self.values(states.detach()), self.config.discount)
-        some = counts[:, :-1]
-        if group == "critic":
-            loss = masked_mean(error.square().mean(2), some)
-        else:
-            each = code_errors(gpt.logits(states), codes[:, 1:])[:, :-1]
-            loss = masked_mean((each * error.detach()).sum(2), some)
-        return {"loss": loss, "reward": masked_mean(reward, counts)}
+        danced = gpt.dance(true[:, :1], music, self.config.temperature)
+        # Each row's window begins anywhere in its clip, so that states far from true codes are trained too.
+        room = batch["length"].to(danced.device) // frames - size
+        begin = (torch.rand(len(danced), device=danced.device) * (room + 1)).long().clamp(min=0)
+        at = begin[:, None] + torch.arange(size, device=danced.device)
+        rows = torch.arange(len(danced), device=danced.device)[:, None]
+        codes = danced[rows, at]
+        # The beats of the rewarded codes' frames.
+        steps = at[:, 1:-1, None] * frames + torch.arange(frames, device=at.device)
+        reward = self.rewards(codes[:, 1:-1], batch["beats"].to(at.device)[rows, steps.flatten(1)])
+        # All codes of a dance's first window, the last of any other: each is learnt with what it can see.
+        counts = (begin == 0)[:, None].expand_as(reward).clone()
+        counts[:, -1] = True
+        return {
+            "codes": codes, "music": music[rows, at], "reward": reward, "heard": heard,
+            "counts": counts & heard[:, None],
+        }  # fmt: skip
 
     def values(self, states: Tensor) -> Tensor:
-        """The critic's, [B, L, 2]."""
+        """The critic's, [B, L]: the sum of both halves'."""
         out: Tensor = self.net.critic(states, tiled_causal(states.shape[1] // 3, states.device))
-        return out
+        return out.sum(2)
 
     def rewards(self, codes: Tensor, beats: Tensor) -> Tensor:
-        """[B, L] of codes [B, L, 2] and frames with a beat of the music [B, T]."""
-        joints = self.vq.module.decode(codes).float().cpu().numpy()
+        """[B, L] of codes [B, L, 2] and their frames with a beat of the music [B, T]."""
+        joints = self.vq.module.decode(codes).float()
+        around = (joints - joints[:, :, :1]).cpu().numpy()
         rows = [
             beat_rewards(one, heard, self.fps, self.vq.module.config.code_frames, self.config.scale)
-            for one, heard in zip(joints, beats.cpu().numpy(), strict=True)
+            for one, heard in zip(around, beats.cpu().numpy(), strict=True)
         ]
         return torch.from_numpy(np.stack(rows)).to(codes.device, torch.float32)
 
@@ -211,7 +234,9 @@ class ActorCriticModule(AlternatingModule):
 def beat_rewards(
     joints: NDArray[np.floating], beats: NDArray[np.bool_], fps: float, code_frames: int, scale: float
 ) -> NDArray[np.float64]:
-    """scale x (both beats - 1/2) of each code [L], of joints [T, N, 3] and frames with a beat [T]."""
+    """scale x (both beats - 1/2) of each code [L], of joints [T, N, 3] from the root and frames with a
+    beat [T].
+    """
     danced = np.zeros(len(joints), dtype=np.bool_)
     danced[np.round(motion_beats(joints, fps) * fps).astype(int)] = True
     both = [frames.reshape(-1, code_frames).any(1) for frames in (danced, beats[: len(joints)])]
@@ -219,11 +244,10 @@ def beat_rewards(
 
 
 def td_error(reward: Tensor, values: Tensor, discount: float) -> Tensor:
-    """Return the codes' advantages, reward above the critic's prediction, [B, L - 1, 2].
+    """Return the codes' advantages, reward above the critic's prediction, [B, L - 1].
 
     Args:
-        reward: [B, L], of the code that follows each state.
-        values: [B, L, 2] of the states. Those that follow get a gradient as well: undiscounted and never
-            told an end, values have no level, and only their differences are learnt.
+        reward: [B, L - 1], of the code that follows each state but the last.
+        values: [B, L] of the states. Those that follow are a target, without a gradient.
     """
-    return reward[:, :-1, None] + discount * values[:, 1:] - values[:, :-1]
+    return reward + discount * values[:, 1:].detach() - values[:, :-1]

@@ -139,8 +139,10 @@ class RewardConfig(Config):
     actor_steps: int = Field(default=5, ge=1)
     critic_steps: int = Field(default=5, ge=1)
     """Steps of a turn."""
-    temperature: float = Field(default=1.0, ge=0)
+    temperature: float = Field(default=0.0, ge=0)
     """Temperature of the codes drawn in training; 0 takes the likeliest."""
+    contexts: int = Field(default=4, ge=1)
+    """Contexts that a clip's dance in training goes on for at most [ours]; pieces whole are published."""
 
 
 class Critic(nn.Module):

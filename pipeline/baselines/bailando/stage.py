@@ -216,6 +216,7 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
     """The GPT taught to keep the beat."""
 
     name = "actor_critic"
+    version = 2  # the last layers learn, from windows of dances
     summary = "Bailando: rewards for the beat"
     trainer = "motionloom.pipeline.baselines.bailando.module:ActorCriticModule"
     config = ActorCriticStageConfig
@@ -258,8 +259,8 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
         data, audio, fps = inputs.data, inputs.audio, inputs.data.layout.fps
         songs = data.held_out(prefer="test") if config.reward_songs == "test" else None
         found = clip_batches(
-            data, JointCrops, {"audio": audio}, seed, clips=window_of(net.gpt, inputs.dance_vq),
-            dataset=songs, balance=MUSIC,
+            data, JointCrops, {"audio": audio}, seed,
+            clips=window_of(net.gpt, inputs.dance_vq, config.reward.contexts), dataset=songs, balance=MUSIC,
         )  # fmt: skip
 
         def train(batch: int, rank: int, world: int) -> Dataset[object]:
@@ -287,10 +288,10 @@ def gpt_in(net: CrossGpt | ActorCritic) -> CrossGpt:
     return net.gpt if isinstance(net, ActorCritic) else net
 
 
-def window_of(gpt: CrossGpt, vq: DanceVq) -> dict[str, int]:
-    """Lengths of a training window: the context, and one code more."""
-    frames = (gpt.config.context + 1) * vq.config.code_frames
-    return {"max_frames": frames, "min_frames": frames}
+def window_of(gpt: CrossGpt, vq: DanceVq, contexts: int = 1) -> dict[str, int]:
+    """Lengths of a training window: the context and one code more, or up to so many contexts."""
+    context, frames = gpt.config.context, vq.config.code_frames
+    return {"max_frames": (contexts * context + 1) * frames, "min_frames": (context + 1) * frames}
 
 
 register(DanceVqStage())

@@ -27,6 +27,7 @@ from motionloom.pipeline.baselines.bailando.network import (
     CrossGptConfig,
     RewardConfig,
     music_of_codes,
+    tiled_causal,
 )
 
 OPTIM = OptimConfig(optimizer="adam", lr=3e-3)
@@ -131,15 +132,51 @@ def test_rewards_and_errors_of_the_critic_against_loops() -> None:
         both = any(frame in danced for frame in frames) and any(beats[frame] for frame in frames)
         assert found[code] == (5.0 if both else -5.0)
     assert set(found) == {-5.0, 5.0}
-    reward, values = torch.randn(2, 4), torch.randn(2, 4, 2, requires_grad=True)
-    error = td_error(reward, values, 0.9)
-    for at in range(3):
-        torch.testing.assert_close(
-            error[:, at], reward[:, at, None] + 0.9 * values[:, at + 1] - values[:, at]
-        )
-    error.sum().backward()
-    slow = torch.tensor([-1.0, -0.1, -0.1, 0.9])[None, :, None].expand(2, 4, 2)
-    torch.testing.assert_close(values.grad, slow)
+
+
+@pytest.mark.parametrize("contexts", [1, 3])
+def test_actor_and_critic_learn_as_published(contexts: int) -> None:
+    """Against the published step, written out: frozen states, one value and one error for both halves."""
+    net, frames = ActorCritic(small_gpt(), 1), 4 * (5 * contexts + 1)
+    module = ActorCriticModule(
+        net, OPTIM, seed=0, max_steps=1, vq=small_vq(), fps=20.0, reward=RewardConfig(discount=0.9)
+    ).train()
+    given = dances(frames=frames)
+    sound, mask = torch.randn(8, frames, 3), torch.ones(8, frames, dtype=torch.bool)
+    given["conditions"]["audio"] = Condition(sound, mask)
+    shared: dict[str, Any] = {}
+    found = {group: module.losses_of(group, given, shared)["loss"] for group in ("actor", "critic")}
+    codes, music = shared["codes"], shared["music"]
+    assert codes.shape == (8, 6, 2)
+    true, heard, _ = codes_of(net.gpt, module.vq.module, given)
+    danced = net.gpt.eval().dance(true[:, :1], heard)
+    actor, count, errors = 0.0, 0, []
+    for row in range(8):
+        starts = range(len(danced[row]) - 5)
+        [begin] = [at for at in starts if torch.equal(heard[row, at : at + 6], music[row])]
+        assert torch.equal(danced[row, begin : begin + 6], codes[row])
+        joints = module.vq.module.decode(codes[row : row + 1, 1:-1]).detach()[0]
+        beats = given["beats"][row, 4 * (begin + 1) : 4 * (begin + 5)].numpy()
+        reward = beat_rewards((joints - joints[:, :1]).numpy(), beats, 20.0, 4, 10.0)
+        states = net.gpt.states(codes[row : row + 1, :-1], music[row : row + 1, 1:])
+        values = net.critic(states, tiled_causal(5, states.device))[0].sum(1)
+        chances = net.gpt.logits(states)[0].log_softmax(-1)
+        for at in range(4):
+            error = float(reward[at] + 0.9 * values[at + 1] - values[at])
+            errors.append(error**2)
+            if begin == 0 or at == 3:
+                actor -= error * sum(float(chances[at, half, codes[row, at + 1, half]]) for half in range(2))
+                count += 1
+    assert float(found["actor"]) == pytest.approx(actor / count, rel=1e-4)
+    assert float(found["critic"]) == pytest.approx(sum(errors) / len(errors), rel=1e-4)
+    # Only the last layers and the critic learn, and what follows is no more than a target.
+    gpt = net.gpt
+    trained = {*gpt.head.parameters(), *gpt.out.parameters(), *net.critic.parameters()}
+    (found["actor"] + found["critic"]).backward()
+    assert {weight for weight in net.parameters() if weight.grad is not None} == trained
+    values = torch.randn(2, 4, requires_grad=True)
+    td_error(torch.randn(2, 3), values, 0.9).sum().backward()
+    torch.testing.assert_close(values.grad, torch.tensor([-1.0, -1.0, -1.0, 0.0]).expand(2, 4))
 
 
 def test_actor_and_critic_take_turns() -> None:
@@ -151,9 +188,3 @@ def test_actor_and_critic_take_turns() -> None:
     actor, critic = module.optimizer_groups()
     assert [actor.steps_at(step) for step in range(7)] == [True, True, False, False, False, True, True]
     assert all(actor.steps_at(step) != critic.steps_at(step) for step in range(10))
-    values = module.losses_of("actor", dances(), {})
-    values["loss"].backward()
-    assert all(weight.grad is None for weight in net.critic.parameters())
-    net.gpt.zero_grad()
-    module.losses_of("critic", dances(), {})["loss"].backward()
-    assert all(weight.grad is None or not weight.grad.any() for weight in net.gpt.parameters())
