@@ -131,6 +131,18 @@ TABLES = {
             *TEXT[1:5],
         ),
     ),
+    "mocap_cmu": Table(
+        "CMU's clips and words: UDE",
+        _of("", {"generated": "evaluate"}, ANSWERS),
+        (
+            Column("R@1 among 9, text to motion", "tma.t2m_r1", 2),
+            Column("Matching", "tma.matching_score", 2),
+            Column("FID (TMA)", "tma.fid", 0),
+            Column("FID_k", "movement.fid_k", 0),
+            Column("skating, %", "physics.skating", 1, 100),
+            Column("jitter", "physics.jitter", 1),
+        ),
+    ),
     "ude_codebook": Table(
         "Codebooks of 512 codes, 1,000 steps of 32 windows",
         {
@@ -164,6 +176,7 @@ TABLES = {
 INGREDIENTS = "python benchmarks/ude_ingredients.py CLIPS WORK"
 COMMANDS = {
     "dances": "motionloom run ude-dance",
+    "mocap_cmu": "motionloom run mocap-cmu",
     "rivals": "motionloom run baselines-tiny",
     **dict.fromkeys(("rivals_ude_text", "rivals_ude_music"), "motionloom run baselines-tiny-ude"),
 }
