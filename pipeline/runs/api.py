@@ -19,7 +19,7 @@ from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache
 from motionloom.pipeline.contract.units import WORK
-from motionloom.pipeline.launch.console import make_console
+from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.doubts import doubts
@@ -66,7 +66,7 @@ def run_recipe(
     if verify:
         folders = [stage_folder(run, stage.name) for stage in loaded.stages]
         count = sum(require_unchanged(folder, again=True) for folder in folders)
-        console.print(f"{run}: {count} files have the sha256 that their stages noted", markup=False)
+        say(console, f"{run}: {count} files have the sha256 that their stages noted")
     try:
         plan = make_plan(loaded, run, select, go_on)
     except UserError:
@@ -79,7 +79,7 @@ def run_recipe(
         say_estimate(loaded, console, run, todo)
         console.print(plan_table(loaded, plan))
         for doubt in doubts(loaded, run, (row.stage for row in todo)):
-            console.print(f"[yellow]{escape(doubt)}[/]", soft_wrap=True)
+            say(console, doubt, "yellow")
     replaced = replaced_stages(run, plan)
     refusal = None if replace else explain_replacements(run, loaded.name, replaced)
     if refusal is not None and not dry_run:
@@ -92,7 +92,7 @@ def run_recipe(
     if started := [name for name in started_trainings(run, plan) if name not in named]:
         console.print(f"[yellow]replaces unfinished trainings: {', '.join(started)}[/]")
     if dry_run:
-        console.print(f"{len(todo)} of {len(plan)} stages would run in {run}", markup=False)
+        say(console, f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run
     chosen = selected(loaded, select or Selection())
     if todo:
@@ -104,14 +104,14 @@ def run_recipe(
         message = f"{run}: the selected stages are finished ({len(chosen)} of {len(plan)}), nothing to do"
     else:
         message = f"{run}: all {len(plan)} stages are finished, nothing to do"
-    console.print(message, markup=False)
+    say(console, message)
     if todo:
         execute(loaded, run, plan, console)
     for row in plan:
         page = stage_folder(run, row.stage.name) / "report.html"
         # Not the page of an earlier run with other settings.
         if "page" in row.stage.kind.gives(row.stage.config) and row.action != "leave" and page.is_file():
-            console.print(f"watch it: {page.resolve()}", markup=False, soft_wrap=True)
+            say(console, f"watch it: {page.resolve()}")
     return run
 
 
@@ -243,7 +243,7 @@ def report_run(
         with atomic_path(out) as whole:
             shutil.copyfile(page, whole)
         page = out
-    console.print(str(page.resolve()), markup=False, soft_wrap=True)
+    say(console, page.resolve())
     return page
 
 
@@ -271,9 +271,5 @@ def export_run(
     with run_at(folder, at) as run, new_folder(out.absolute()) as whole:
         write_bundle(run, whole, half=half, sampling=SamplingConfig.of(sampling))
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
-    console.print(
-        f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"',
-        markup=False,
-        soft_wrap=True,
-    )
+    say(console, f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"')
     return out

@@ -8,13 +8,13 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
 
 from motionloom.datasets.base.files import remove_temporaries, write_text
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache, StageContext, StageKind
+from motionloom.pipeline.launch.console import say
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.continuation import Started
@@ -52,7 +52,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
         if leads:
             said = doubts(recipe, run, (row.stage for row in todo))
             for doubt in said:
-                console.print(f"[yellow]{escape(doubt)}[/]", soft_wrap=True)
+                say(console, doubt, "yellow")
             _begin(recipe, run, plan)
         for row in todo:
             stage, folder = row.stage, stage_folder(run, row.stage.name)
@@ -62,7 +62,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 console.print(f"[bold]\\[{place}] {stage.name}[/] ({stage.kind.summary})")
                 for doubt in doubts(recipe, run, [stage]):
                     if doubt not in said:  # of data that this run has made
-                        console.print(f"    [yellow]{escape(doubt)}[/]", soft_wrap=True)
+                        say(console, f"    {doubt}", "yellow")
                 _prepare(folder, row)
             perform(stage.kind, context_of(recipe, run, stage, folder, console, team), team, run)
             if leads:

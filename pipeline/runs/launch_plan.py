@@ -201,7 +201,8 @@ def make_launch_plan(
     names: dict[str, str] = {}  # stage -> its group
     waits: dict[str, set[str]] = {}  # group -> all groups before it
     for job in jobs:
-        machines, settings = _machines(options, job, gpus_per_node), _settings(options, job, gpus_per_node)
+        machines = _machines(options, job, gpus_per_node)
+        settings = _settings(job, machines)
         first: tuple[str, ...] = ()
         if options.parts > 1 and (cut := tuple(stage.name for stage in job.stages if stage.kind.parts)):
             # The group behind it finds the parts made, and joins them.
@@ -241,16 +242,15 @@ def _machines(options: SlurmOptions, job: _Job, gpus: int) -> Machines:
     if job.light:
         light = options.light_cpus, options.light_memory_gb, options.light_minutes
         return Machines(1, 1, int(job.gpu), *light)
-    nodes, each = job.shape(gpus)
+    each = min(job.processes, max(gpus, 1))
     cpus, memory = options.cpus_per_gpu * each, options.memory_gb_per_gpu * each
-    return Machines(nodes, each, each if gpus else 0, cpus, memory, options.time_minutes)
+    return Machines(job.processes // each, each, each if gpus else 0, cpus, memory, options.time_minutes)
 
 
-def _settings(options: SlurmOptions, job: _Job, gpus: int) -> tuple[str, ...]:
-    nodes, each = job.shape(gpus)
-    fields = [f"nodes={nodes}", f"devices={each}"]
+def _settings(job: _Job, machines: Machines) -> tuple[str, ...]:
+    fields = [f"nodes={machines.nodes}", f"devices={machines.processes}"]
     if job.light:
-        fields.append(f"convert_workers={options.light_cpus}")
+        fields.append(f"convert_workers={machines.cpus}")
     # A node whose driver is broken must not do a GPU's work on its CPU.
     fields.append(f"accelerator={'gpu' if job.gpu else 'cpu'}")
     return tuple(f"hardware.{field}" for field in fields)
@@ -267,11 +267,6 @@ class _Job:
     stages: list[Stage]
     before: set[int]
     """Places, among the jobs, of all that it waits for."""
-
-    def shape(self, gpus: int) -> tuple[int, int]:
-        """Nodes, and processes on each."""
-        each = min(self.processes, max(gpus, 1))
-        return self.processes // each, each
 
 
 def _jobs(recipe: Recipe, options: SlurmOptions, nodes: int, gpus: int) -> list[_Job]:

@@ -29,6 +29,7 @@ from rich.console import Console
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.progress import duration
 from motionloom.datasets.schema import UserError
+from motionloom.pipeline.launch.console import say
 from motionloom.pipeline.launch.process import SAVED
 from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.dry_run import (
@@ -148,7 +149,7 @@ def launch_recipe(
         if not dry_run or (run / "recipe.yaml").is_file():
             raise
         # The data may be on another machine.
-        console.print(f"time and disk not estimated: {error}", soft_wrap=True, markup=False)
+        say(console, f"time and disk not estimated: {error}")
     if (refusal := explain_replacements(run, loaded.name, replaced_stages(run, rows))) is not None:
         raise UserError(refusal)
     plan = make_launch_plan(
@@ -162,10 +163,10 @@ def launch_recipe(
         go_on=go_on,
     )
     for line in plan.lines():
-        console.print(line, soft_wrap=True, markup=False)
+        say(console, line)
     planned = [row for row in rows if row.action in {"run", "resume"}]
     for doubt in doubts(loaded, run, (row.stage for row in planned)):
-        console.print(doubt, style="yellow", soft_wrap=True, markup=False)
+        say(console, doubt, "yellow")
     _require_time(plan, slurm, training_times(run, planned))
     if dry_run:
         say_estimate(loaded, console, run, planned)
@@ -189,12 +190,11 @@ def _require_time(plan: LaunchPlan, options: SlurmOptions, times: Mapping[str, f
 def _show_scripts(plan: LaunchPlan, options: SlurmOptions, console: Console) -> None:
     folder = Path(plan.out) / LOG_FOLDER / "DATE-TIME"
     if plan.shipped is None:
-        line = f"would write {folder / RECIPE_FILE}: the resolved recipe"
-        console.print(line, soft_wrap=True, markup=False)
+        say(console, f"would write {folder / RECIPE_FILE}: the resolved recipe")
     ids = {group.name: f"ID-OF-{group.name}" for group in plan.groups}
     for script in slurm_scripts(plan, options, folder, Path.cwd()):
         console.print(f"\n{script.path}:\n{script.text}", soft_wrap=True, markup=False)
-        console.print(" ".join(script.submit(ids)), soft_wrap=True, markup=False)
+        say(console, " ".join(script.submit(ids)))
 
 
 def slurm_scripts(plan: LaunchPlan, options: SlurmOptions, folder: Path, cwd: Path) -> list[Script]:
@@ -227,13 +227,9 @@ def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> lis
             raise UserError(f"sbatch refused {script.path}: {submitted.stderr.strip()}")
         ids[script.group.name] = submitted.stdout.strip().partition(";")[0]
         before = ", ".join(ids[name] for name in script.group.after)
-        console.print(f"{script.group.name}: job {ids[script.group.name]}{before and f', after {before}'}")
+        say(console, f"{script.group.name}: job {ids[script.group.name]}{before and f', after {before}'}")
     jobs = list(ids.values())
-    console.print(
-        f"watch: squeue --jobs {','.join(jobs)}; stop: scancel {' '.join(jobs)}; logs: {folder}",
-        soft_wrap=True,
-        markup=False,
-    )
+    say(console, f"watch: squeue --jobs {','.join(jobs)}; stop: scancel {' '.join(jobs)}; logs: {folder}")
     return jobs
 
 
