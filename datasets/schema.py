@@ -47,14 +47,21 @@ def nearest(name: str, valid: Sequence[str], shown: Sequence[str] | None = None,
     return f"; did you mean '{near[0]}'?" if near else f"; valid {what}: {', '.join(names)}"
 
 
-def require_local(path: Path) -> None:
-    """Refuse a URL where a path is wanted: as a path, `s3://bucket/x` is a folder named `s3:`."""
-    if found := re.match(r"([A-Za-z][A-Za-z0-9+.-]+):/", str(path)):
-        raise UserError(
-            f"{found[1]}://{str(path)[found.end() :].lstrip('/')}: no URL is read or written here, only this "
-            f"machine's files; `motionloom data copy` carries data sets there and back, and stages of kind "
-            f"`shards` read them there"
-        )
+def require_local(place: object) -> None:
+    """Refuse a URL where a path is wanted: as a path, `s3://bucket/x` is a folder named `s3:`.
+
+    `place` may be anything: of lists and configs all paths are looked at, of what else there is nothing.
+    """
+    if isinstance(place, Path):
+        if found := re.match(r"([A-Za-z][A-Za-z0-9+.-]+):/", str(place)):
+            raise UserError(
+                f"{found[1]}://{str(place)[found.end() :].lstrip('/')}: no URL is read or written here, only "
+                f"this machine's files; `motionloom data copy` carries data sets there and back, and stages "
+                f"of kind `shards` read them there"
+            )
+    elif isinstance(place, list | tuple | Config):
+        for one in place.__dict__.values() if isinstance(place, Config) else place:
+            require_local(one)
 
 
 MOST_JSON_BYTES = 2**28
@@ -94,15 +101,8 @@ class Config(BaseModel):
             made = cls.model_validate(data)
         except ValidationError as error:
             raise UserError(explain(error, cls, where)) from None
-        made._require_local_paths()
+        require_local(made)
         return made
-
-    def _require_local_paths(self) -> None:
-        for value in self.__dict__.values():
-            if isinstance(value, Path):
-                require_local(value)
-            elif isinstance(value, Config):
-                value._require_local_paths()
 
     @classmethod
     def load_json(cls, path: Path) -> Self:

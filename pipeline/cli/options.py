@@ -51,10 +51,7 @@ class Commands(typer.Typer):
         def register(function: F) -> F:
             @wraps(function)
             def called(**values: object) -> object:
-                for value in values.values():
-                    for path in value if isinstance(value, list | tuple) else (value,):
-                        if isinstance(path, Path):
-                            require_local(path)
+                require_local(list(values.values()))
                 return function(**values)
 
             decorate(called)
