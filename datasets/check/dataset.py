@@ -104,9 +104,9 @@ class CheckReport:
     frames: int
 
 
-def check(root: Path, *, progress: bool = False) -> list[Problem]:
+def check(root: Path) -> list[Problem]:
     """Everything wrong with the dataset in `root`; an empty list when it is sound. Warnings are left out."""
-    return examine(root, progress=progress).errors
+    return examine(root).errors
 
 
 def examine(root: Path, *, progress: bool = False) -> CheckReport:

@@ -175,6 +175,6 @@ def _runs(columns: NDArray[np.int64]) -> list[tuple[slice, slice]]:
     return [(slice(int(columns[a]), int(columns[b - 1]) + 1), slice(a, b)) for a, b in pairwise(edges)]
 
 
-def padded_length(lengths: NDArray[np.int64], multiple: int = 4) -> int:
-    """The longest length, rounded up to what the tokenizers' down-sampling divides."""
-    return -(-int(lengths.max()) // multiple) * multiple
+def padded_length(lengths: NDArray[np.int64]) -> int:
+    """The longest length, rounded up to a multiple of 4, which the tokenizers' down-sampling divides."""
+    return -(-int(lengths.max()) // 4) * 4

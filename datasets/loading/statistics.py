@@ -19,7 +19,6 @@ from typing import Any, TypeVar, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.progress import track
 from torch import Tensor
 
 from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
@@ -172,7 +171,7 @@ class Moments:
         return np.sqrt(self.m2 / np.where(self.count > 0, self.count, 1.0))
 
 
-def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -> FeatureStats:
+def compute(dataset: ClipDataset, group: bool = False) -> FeatureStats:
     """Statistics of every frame of `dataset`, in one pass.
 
     `group` gives all columns of one feature field the mean of their stds, as HumanML3D does, so that a
@@ -182,7 +181,7 @@ def compute(dataset: ClipDataset, group: bool = False, progress: bool = False) -
     layout = dataset.layout
 
     def moments_of(part: ClipDataset) -> Iterator[Moments]:
-        for i in track(range(len(part)), "feature statistics", disable=not progress):
+        for i in range(len(part)):
             yield Moments.of(part.motion(i), layout.present_columns[part.present[i]])
 
     return from_moments(_pooled(dataset, moments_of) or Moments.none(layout.dim), layout, group=group)
@@ -224,7 +223,7 @@ _CONSTANT = 1e-6
 """A column whose standard deviation is below this share of its size (or of 1) does not change."""
 
 
-def frame_statistics(dataset: ClipDataset, modality: Modality, progress: bool = False) -> FrameStats:
+def frame_statistics(dataset: ClipDataset, modality: Modality) -> FrameStats:
     """Statistics of a modality's features over every clip of `dataset` that has them, in one pass.
 
     In a mix each data set counts as often as its weight has it drawn, as in `compute`.
@@ -233,8 +232,7 @@ def frame_statistics(dataset: ClipDataset, modality: Modality, progress: bool = 
     widths: set[int] = set()
 
     def moments_of(part: ClipDataset) -> Iterator[Moments]:
-        present = np.flatnonzero(part.has(member)).tolist()
-        for i in track(present, f"{modality.name} statistics", disable=not progress):
+        for i in np.flatnonzero(part.has(member)).tolist():
             rows = part.array(i, member)
             if rows is None:
                 continue

@@ -85,13 +85,9 @@ def body_captions(
 
 
 def face_captions(
-    truth: Truth,
-    rng: np.random.Generator,
-    number: int = 2,
-    body: Sequence[str] = (),
-    wordings: Wordings = "few",
+    truth: Truth, rng: np.random.Generator, body: Sequence[str] = (), wordings: Wordings = "few"
 ) -> list[str]:
-    """Captions of the face alone, about a person that none of the clip's `body` captions contradicts.
+    """Two captions of the face alone, about a person that none of the clip's `body` captions contradicts.
 
     Any of them may be trained on together: where a body caption says "a woman" no face is a man's, and where
     others of the same clip say "a man" the face is a person's. With many wordings they name nobody in
@@ -100,12 +96,12 @@ def face_captions(
     if wordings != "few" and not isinstance(truth, DanceTruth):
         faces = words().many.faces[truth.face]
         return _different(
-            lambda: _written(f"{_pick(rng, _NOBODY)} {_third_person(_pick(rng, faces))}", rng), number
+            lambda: _written(f"{_pick(rng, _NOBODY)} {_third_person(_pick(rng, faces))}", rng), 2
         )
     faces = words().few.faces[truth.face]
     named = {who for who in _GENDERED if any(text.startswith(f"{who} ") for text in body)}
     people = tuple(who for who in words().few.who if who not in _GENDERED or named <= {who})
-    order = rng.permutation(len(faces))[:number]
+    order = rng.permutation(len(faces))[:2]
     return [f"{_pick(rng, people)} {faces[int(k)]}" for k in order]
 
 
