@@ -262,6 +262,8 @@ class Manifest(Config):
     dropped: list[Dropped] = []
     licences: dict[str, int] = {}
     """Clips under each licence, for sources that mix several."""
+    credits: list[str] = []
+    """Sentences that these licences ask for, wherever the data or what was made from it is shown."""
     audio: dict[str, Any] | None = None
     """Settings the audio features were made with; a model trained on them keeps these."""
     notes: list[str] = []

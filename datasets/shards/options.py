@@ -57,6 +57,8 @@ class DatasetFacts:
     """Number type of `motion.npy`."""
     licences: dict[str, int] = field(default_factory=dict)
     """Clips under each licence, for sources that mix several."""
+    credits: Sequence[str] = ()
+    """Sentences that these licences ask for."""
     audio: dict[str, object] | None = None
     """Settings the audio features are made with."""
     dropped: Sequence[Dropped] = ()

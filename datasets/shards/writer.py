@@ -222,6 +222,7 @@ def _planned(tasks: Sequence[ShardTask[T]], facts: DatasetFacts) -> Planned:
         shards=[],
         dropped=list(facts.dropped),
         licences=facts.licences,
+        credits=list(facts.credits),
         audio=facts.audio,
         notes=list(facts.notes),
     )

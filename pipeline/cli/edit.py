@@ -91,7 +91,7 @@ def edit(
         [motions[0].original, *motions],
         wanted,
         title=f"{clip.name}, edited",
-        note=page_note(len(motions), Path(run_folder).resolve().name, seed, remarks),
+        note=page_note(len(motions), Path(run_folder).resolve().name, seed, remarks, model.bundle.terms),
         seed=seed,
         names=[clip.stem, *[f"{clip.stem} edited" for _ in motions]],
         labels=["the clip", *["edited" for _ in motions]],

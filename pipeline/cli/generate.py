@@ -193,7 +193,7 @@ def _generate_files(
             motions,
             formats,
             title=page_title([motion.caption for motion in motions], songs, asked.script),
-            note=page_note(len(motions), Path(asked.model).resolve().name, asked.seed, notes),
+            note=page_note(len(motions), Path(asked.model).resolve().name, asked.seed, notes, bundle.terms),
             seed=asked.seed,
             names=None if asked.captions else each([Excerpt.named(path).path.stem for path in asked.songs]),
             figure=posing,

@@ -48,7 +48,7 @@ from motionloom.pipeline.inference.requests import (
 from motionloom.pipeline.inference.script import DrivenSegment, segment_frames, sound_of
 from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.render.sound import Segment
-from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.artifact import Terms, require_consistent
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, hint_at, owner_of
 
@@ -72,6 +72,8 @@ class Bundle:
     ) -> None:
         self.stages, self.captioners = tuple(stages), tuple(captioners)
         """The stages that generate, the default of each kind first; and those that caption motions."""
+        self.terms = Terms.of(stage.folder for stage in (*self.stages, *self.captioners))
+        """Licences and credits of all data that it was made from."""
         self.stage_cache = stage_cache
         self.recommended = recommended or SamplingConfig()
         """How its motions are best drawn; fields that are not set here are nobody's recommendation."""

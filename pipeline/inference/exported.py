@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterable
 from itertools import chain, count
 from pathlib import Path
 
+from huggingface_hub import ModelCardData
+
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.register import code_of, distribution_of
 from motionloom.pipeline.contract.lookup import FORMAT, BundleFile
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.store.artifact import Artifact, InputStage, require_unchanged
+from motionloom.pipeline.store.artifact import Artifact, InputStage, Terms, require_unchanged
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 from motionloom.pipeline.store.weights import LayoutFacts, halve_weights
@@ -21,10 +25,20 @@ HUB_CONFIG = {"format": "motionloom bundle"}
 """`config.json`, which the hub looks for; nothing here reads it."""
 
 
-def write_bundle(run: Path, out: Path, *, half: bool = False, sampling: SamplingConfig | None = None) -> None:
+CARD = "README.md"
+"""The model's card, as the hub shows it."""
+
+_HUB_LICENCE = re.compile(r"mit|apache-2\.0|cc0-1\.0|cc-by(?:-sa)?-[34]\.0|cc-by-nc(?:-sa|-nd)?-[34]\.0")
+"""Licences that the hub knows by name."""
+
+
+def write_bundle(
+    run: Path, out: Path, *, half: bool = False, sampling: SamplingConfig | None = None
+) -> Terms:
     """Copy what generation needs of a run's finished stages into `out`; with `half`, weights as 16 bits.
 
-    What is set of `sampling` goes with the model: motions are drawn so where nobody says otherwise.
+    What is set of `sampling` goes with the model: motions are drawn so where nobody says otherwise. Returns
+    licences and credits of its data, which its card says.
     """
     bundle, sampling = Bundle.from_run(run), sampling or SamplingConfig()
     if bundle.stages:
@@ -36,6 +50,24 @@ def write_bundle(run: Path, out: Path, *, half: bool = False, sampling: Sampling
     out.mkdir(parents=True, exist_ok=True)
     _write_stages(bundle, out, half, sampling.model_dump(mode="json", exclude_unset=True))
     write_json(out / "config.json", HUB_CONFIG)
+    write_text(out / CARD, _card(run.resolve().name, bundle.terms))
+    return bundle.terms
+
+
+def _card(name: str, terms: Terms) -> str:
+    """The card of a model: its licence, where it comes from, and who is to be named."""
+    known = terms.licence.lower() if _HUB_LICENCE.fullmatch(terms.licence.lower()) else None
+    facts = ModelCardData(
+        license=known or "other",
+        license_name=None if known else terms.licence,
+        library_name="motionloom",
+        pipeline_tag="text-to-3d",
+        tags=["human-motion", "text-to-motion", "whole-body"],
+    )
+    lines = [f"---\n{facts.to_yaml()}\n---", f"# {name}"]
+    lines += [f"Licence: {terms.licence}, the strictest of its data ({', '.join(terms.licences)})."]
+    lines += ["Wherever the model or its motions are shown:"] if terms.credits else []
+    return "\n\n".join([*lines, *(f"- {credit}" for credit in terms.credits)]) + "\n"
 
 
 def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, object]) -> None:

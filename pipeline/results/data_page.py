@@ -231,6 +231,8 @@ def _source(page: Page, manifest: Manifest, records: Records) -> None:
         ["licence", "clips"],
         [[name or "none stated", count] for name, count in records.licences.most_common()],
     )
+    if manifest.credits:
+        page.add_subheading("Credits").add_list(manifest.credits)
     counted = [f"{what}: {count:,}" for what, count in records.remarks.items() if count]
     remarks = [*manifest.notes, *counted]
     if remarks:

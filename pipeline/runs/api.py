@@ -262,14 +262,20 @@ def export_run(
     otherwise. With `at` trainings that are not finished are taken from a checkpoint (`snapshot.run_at`);
     their artifacts say the step.
     """
-    from motionloom.pipeline.inference.exported import write_bundle
+    from motionloom.pipeline.inference.exported import CARD, write_bundle
 
     console = console or make_console()
     require_folder(out)
     if out.exists() and any(out.iterdir()):
         raise UserError(f"{out}: exists and is not empty; choose a new folder with --out")
     with run_at(folder, at) as run, new_folder(out.absolute()) as whole:
-        write_bundle(run, whole, half=half, sampling=SamplingConfig.of(sampling))
+        terms = write_bundle(run, whole, half=half, sampling=SamplingConfig.of(sampling))
     size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file()) / 2**20
     say(console, f'{out}: {size:.1f} MiB; use it: motionloom generate {out} "a person waves"')
+    listed = ", ".join(terms.licences) or "none stated"
+    say(
+        console,
+        f"licence of this model: {terms.licence}, the strictest of its data ({listed}); {out / CARD} has "
+        f"the credits that it asks for ({len(terms.credits)})",
+    )
     return out

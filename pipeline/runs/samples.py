@@ -66,7 +66,8 @@ def draw_samples(run: Path, stage: str) -> Path:
         row |= {f"{who}/{name}": found[name].value for name in first if name in found}
     place = stage_folder(run, stage) / SAMPLES
     out = place / f"step={artifact.step:08d}"
-    title, note = f"{stage} at step {artifact.step:,}", page_note(len(made), run.resolve().name, 0)
+    title = f"{stage} at step {artifact.step:,}"
+    note = page_note(len(made), run.resolve().name, 0, terms=bundle.terms)
     write_motions(out, made, default_formats(), title=title, note=note, seed=0)
     with open_own(place / SAMPLE_FIGURES, "ab") as file:
         file.write(json.dumps(row).encode() + b"\n")

@@ -30,6 +30,7 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
 )
 from motionloom.pipeline.launch.console import make_console, say
+from motionloom.pipeline.runs.execute import terms_of
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import fingerprint_of
@@ -223,6 +224,7 @@ def _finish(
         made, seen = str(identity_of(place)), place_from(folder, place)
         inputs[role] = InputStage(stage=place.name, fingerprint=made, folder=seen)
     config, made_of = stage.config.dump(), [source.fingerprint for source in inputs.values()]
+    home = stage_folder(folder, stage.name)
     Artifact(
         stage=stage.name,
         kind=stage.kind.name,
@@ -232,4 +234,5 @@ def _finish(
         config=config,
         step=step,
         inputs=inputs,
-    ).finish(stage_folder(folder, stage.name))
+        terms=terms_of(stage, home, inputs.values()),
+    ).finish(home)

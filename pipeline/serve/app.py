@@ -140,6 +140,7 @@ class Site:
                 "modalities": sorted(self.model.modalities),
                 "face": bool(bundle.faces),
                 "examples": self.model.examples(),
+                "credits": bundle.terms.credits,
                 "fps": self.model.fps,
                 "joint_names": list(skeleton.joints),
                 "parents": [int(parent) for parent in skeleton.parents],

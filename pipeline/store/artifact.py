@@ -18,6 +18,7 @@ from pathlib import Path
 from pydantic import Field, JsonValue, field_validator
 
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.licences import UNKNOWN, strictest
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.shards.checksums import state_of
@@ -75,6 +76,33 @@ class Change(Config):
     new: JsonValue
 
 
+class Terms(Config):
+    """Licences of all data that something was made from, and the sentences that they ask for."""
+
+    licences: tuple[str, ...] = ()
+    credits: tuple[str, ...] = ()
+
+    @property
+    def licence(self) -> str:
+        """What holds for a model: the strictest of its data."""
+        return strictest(self.licences)
+
+    @classmethod
+    def union(cls, parts: Iterable[Terms]) -> Terms:
+        """Those of data that was mixed, or of stages that something was made from."""
+        parts = list(parts)
+        licences = sorted({licence for part in parts for licence in part.licences})
+        sentences = dict.fromkeys(sentence for part in parts for sentence in part.credits)
+        return cls(licences=tuple(licences), credits=tuple(sentences))
+
+    @classmethod
+    def of(cls, stages: Iterable[Path]) -> Terms:
+        """Those of finished stages, by their folders; unknown where a stage does not say."""
+        made = [Artifact.find(stage) for stage in stages]
+        unknown = cls(licences=(UNKNOWN,))
+        return cls.union(unknown if one is None or one.terms is None else one.terms for one in made)
+
+
 class Artifact(Config):
     """The record of a finished stage."""
 
@@ -91,6 +119,8 @@ class Artifact(Config):
     step: int | None = Field(None, exclude_if=lambda step: step is None)
     """Step of weights that were taken from a training before its end."""
     inputs: dict[str, InputStage]
+    terms: Terms | None = Field(None, exclude_if=lambda terms: terms is None)
+    """Licences and credits of its own data and of all stages above it."""
     outputs: dict[str, OutputFile] = Field(default_factory=dict)
 
     @field_validator("outputs")

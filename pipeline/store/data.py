@@ -18,6 +18,7 @@ from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset, read_manifest
 from motionloom.datasets.shards.store import LocalStore, Store, open_store
+from motionloom.pipeline.store.artifact import Terms
 from motionloom.pipeline.store.run_folder import STAGE_NAME
 
 SHARDS = "shards"
@@ -128,6 +129,14 @@ class Data:
             if isinstance(store, LocalStore)
             for shard in manifest.shards
         ]
+
+    def terms(self) -> Terms:
+        """Licences and credits of its own shards; a mix has none but those of its stages."""
+        manifests = [] if self._mixed or not self._is_ours else [one for _, one in self._sources()]
+        return Terms.union(
+            Terms(licences=tuple(one.licences or [one.licence]), credits=tuple(one.credits))
+            for one in manifests
+        )
 
     @cached_property
     def _mixed(self) -> list[tuple[Data, float]]:

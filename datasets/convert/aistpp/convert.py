@@ -94,6 +94,7 @@ class Aistpp(BodyRelease[AistppConfig]):
     example = "aist_plusplus_final shards"
     config_class = AistppConfig
     terms = MOTION_LICENCE
+    credit = "Motion of AIST++ (Li, Yang, Ross and Kanazawa, ICCV 2021), Google LLC, CC BY 4.0."
     model = "SMPL"
     lists = ("splits",)
 

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of_json
-from motionloom.datasets.base.licences import strictest
+from motionloom.datasets.base.licences import credits_of, strictest
 from motionloom.datasets.convert.bvh.plan import BvhClip, BvhConfig, JointMaps, load_maps, plan_bvh
 from motionloom.datasets.convert.bvh.settle import added_frames
+from motionloom.datasets.convert.captions.humanml_index import CREDITS, WORDS_CREDIT
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.look import SourceJoints, named_unit
@@ -56,6 +57,14 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def licence(self, plan: ConversionPlan[BvhClip]) -> str:
         return self.config.licence or ("" if self.config.humanml_index is None else strictest(plan.licences))
+
+    def credits(self, plan: ConversionPlan[BvhClip]) -> list[str]:
+        if self.config.humanml_index is None:
+            return super().credits(plan)
+        subsets = {str(clip.about["subset"]) for _, clip in plan.items}
+        own = [CREDITS[subset] for subset in sorted(subsets) if subset in CREDITS]
+        words = [WORDS_CREDIT] if self.config.humanml_texts else []
+        return [*credits_of(plan.licences, self.config.name, own), *words]
 
     def convert(self, clip: BvhClip) -> Sample:
         motion = self.encode(clip)

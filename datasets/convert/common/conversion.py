@@ -57,6 +57,7 @@ class Conversion(Generic[C]):
             options=self.options,
             motion_type=self.config.motion_type,
             licences=self.plan.licences,
+            credits=self.converter.credits(self.plan),
             audio=self.converter.audio(),
             dropped=self.plan.left_out(),
             lost=lost,

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.licences import credits_of
 from motionloom.datasets.base.register import Table
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import SourceJoints
@@ -53,6 +54,8 @@ class Converter(ABC, Generic[Cfg, C]):
     """Options of the command line and of a recipe's stage; the docstrings of its fields are their help."""
     published: ClassVar[str] = ""
     """Numbers that the makers of a set state, and where; a note of the plan says what is found of them."""
+    credit: ClassVar[str] = ""
+    """The sentence that names the makers of a set, where its licence asks for one."""
     version: ClassVar[int] = 1
     """Raised when the same source gives other samples: finished shards are then made again."""
 
@@ -93,6 +96,10 @@ class Converter(ABC, Generic[Cfg, C]):
     def licence(self, plan: ConversionPlan[C]) -> str:
         """The licence of the whole data set."""
         return self.config.licence or next(iter(plan.licences), "")
+
+    def credits(self, plan: ConversionPlan[C]) -> list[str]:
+        """Return the sentences that the licences of the planned clips ask for."""
+        return credits_of(plan.licences, self.config.name, [self.credit] if self.credit else [])
 
     def options(self) -> dict[str, object]:
         """Return all that samples depend on beside the source: options, and facts of the files they name."""

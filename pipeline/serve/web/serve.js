@@ -205,5 +205,6 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   one("start-words").textContent = info.examples.length ? "It knows, for example:" : "What you ask for is shown here.";
   one("start-examples").replaceChildren(...choices(info.examples));
   start.hidden = false;
+  one("credits").textContent = info.credits.join(" ");
   if (!matchMedia("(pointer: coarse)").matches) one("caption").focus(); // a phone would open its keyboard over the page
 })();

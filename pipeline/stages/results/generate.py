@@ -25,6 +25,7 @@ from motionloom.pipeline.inference.shown import FigureOptions
 from motionloom.pipeline.inference.writers import WRITERS, Format, default_formats
 from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
+from motionloom.pipeline.store.artifact import Terms
 
 
 class GenerateConfig(StageConfig):
@@ -69,13 +70,14 @@ class GenerateStage(StageKind):
                 f"stage '{context.name}': nothing to generate from: no held-out clip has a caption or music "
                 f"that a generator of this run is conditioned on; give captions"
             )
+        terms = Terms.of(stage.folder for stage in context.inputs.values())
         motions = [*said, *(motion for motion, _ in danced)]
         write_motions(
             context.folder / "motions",
             motions,
             config.formats,
             title=f"Generated motions of {context.recipe}",
-            note=page_note(len(motions), context.recipe, context.seed, mismatches),
+            note=page_note(len(motions), context.recipe, context.seed, mismatches, terms),
             seed=context.seed,
             scores=[Score()] * len(said) + [clip.score() for _, clip in danced],
             figure=config.figure,

@@ -19,6 +19,7 @@ from motionloom.pipeline.evaluation.cases import Clips
 from motionloom.pipeline.render.charts import curve_label, log_lines
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
+from motionloom.pipeline.store.artifact import Terms
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.run_state import RunState
 from motionloom.pipeline.store.training_log import (
@@ -156,6 +157,8 @@ def add_run_facts(page: Page, context: StageContext, state: RunState | None) -> 
         _stages_of_run(page, state)
     if "data" in context.inputs:
         _data(page, context.given["data"])
+    if credits := Terms.of(stage.folder for stage in context.inputs.values()).credits:
+        page.add_subheading("Credits").add_list(credits)
     with page.folded("Settings of every stage"):
         for name, kind, settings in _settings(context, state):
             rows = [[key, setting_text(value)] for key, value in flatten(settings).items()]
