@@ -121,7 +121,7 @@ def choose_maps(
         raise UserError(f"{config.source}: {doubt.replace(MAPS_FOLDER, str(place))}")
     plan.items = [item for item in plan.items if item[1].found.skeleton not in doubts]
     plan.notes += doubts.values()
-    for key in maps.keys() & settles & first_clips.keys():
+    for key in [key for key in first_clips if key in maps and key in settles]:  # in the plan's order
         maps[key] = _settle(config, maps[key], first_clips[key], plan)
     for clip in left:
         plan.reject(clip.label(), f"no certain joint map for its skeleton ({doubts[clip.found.skeleton]})")

@@ -110,11 +110,11 @@ def remove(root: Path, *, ids: Sequence[str] = (), subjects: Sequence[str] = ())
         pending = aside / MANIFEST_FILE
         if finished.exists() or not pending.exists():
             manifest = load_manifest(root)
+            if not (ids or subjects):
+                raise UserError(f"{root}: give the clips to remove: --subject NAME or --id ID")
             shutil.rmtree(aside, ignore_errors=True)
         else:
             manifest = Manifest.load_json(pending)
-            if not (ids or subjects or Removed.of(root).hashes):
-                raise UserError(f"{root}: give --id or --subject")
         indices = {shard.name: ShardIndex.load_json(_old_index(root, shard)) for shard in manifest.shards}
         clips = [clip for index in indices.values() for clip in index.clips]
         before = Removed.of(root)

@@ -204,6 +204,11 @@ def test_beat2_keeps_face_and_what_is_said(built: Callable[[str], Path], tmp_pat
     assert [one.id for _, one in plan.items] == [clip]
 
 
+def test_speech_that_goes_on_after_the_motion_is_said(shared: Path) -> None:
+    notes = planned("beat2", shared / "data/reports/data/beat2-longer-speech").plan.notes
+    assert any("the sound of 1 clips goes on after the motion, 14.0 s at most" in note for note in notes)
+
+
 def test_snapmogen_and_styles_are_cut(built: Callable[[str], Path]) -> None:
     clips = {clip.id: clip for _, clip in planned("snapmogen", built("snapmogen")).plan.items}
     assert {clip.last - clip.first for clip in clips.values()} == {90, 50}

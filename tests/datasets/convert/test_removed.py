@@ -112,6 +112,8 @@ def test_single_clips_and_their_mirror_images(source: Path, made: Path, tmp_path
     for wrong, said in (({"ids": ["bert/tak01"]}, "bert/take01"), ({"subjects": ["bart"]}, "'bert'")):
         with pytest.raises(UserError, match=said):
             remove(out, **wrong)
+    with pytest.raises(UserError, match="--subject NAME or --id ID"):
+        remove(out)
     with pytest.raises(UserError, match="nothing would be left"):
         remove(out, subjects=PEOPLE)
     assert content(out) == content(made)
