@@ -32,6 +32,7 @@ from motionloom.datasets.schema import (
     UserError,
     nearest,
 )
+from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.finish import OLD_FOLDER, Planned, finish
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, index_path
 from motionloom.datasets.shards.reader import load_manifest, manifest_layout
@@ -124,6 +125,12 @@ def remove(root: Path, *, ids: Sequence[str] = (), subjects: Sequence[str] = ())
         _require_known(root, clips, given, before)
         if len(gone) == len(clips):
             raise UserError(f"{root}: nothing would be left; delete the folder")
+        # What is damaged must not be written again as if it were whole.
+        lost = {clip.id for clip in gone}
+        for shard in manifest.shards:
+            if any(clip.id in lost for clip in indices[shard.name].clips):
+                old = aside / shard.name
+                require_intact(LocalShard(old if old.exists() else root / shard.name, shard))
         record = record.and_more(
             f"{kind} {getattr(clip, kind)}" for clip in gone for kind in ("id", "source")
         )
@@ -132,7 +139,7 @@ def remove(root: Path, *, ids: Sequence[str] = (), subjects: Sequence[str] = ())
             finished.replace(pending)
             sync_folder(root)
         write_json(root / REMOVED_FILE, record.dump())
-        kept = without_names(manifest, gone, record)
+        kept = _unnamed(manifest, gone, record)
         licences, results, written = Counter(manifest.licences), list[Result](), 0
         for shard in manifest.shards:
             index = indices[shard.name]
@@ -211,7 +218,7 @@ def _never(item: None) -> list[Sample]:
     raise AssertionError("every clip is kept")
 
 
-def without_names(manifest: Manifest, gone: Sequence[ClipEntry], record: Removed) -> Manifest:
+def _unnamed(manifest: Manifest, gone: Sequence[ClipEntry], record: Removed) -> Manifest:
     """A manifest, without shards, that names no removed file."""
     names = {clip.source for clip in gone} | {
         drop.source for drop in manifest.dropped if record.has("", drop.source)

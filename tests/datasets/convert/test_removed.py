@@ -129,6 +129,20 @@ def test_single_clips_and_their_mirror_images(source: Path, made: Path, tmp_path
     assert Removed(salt="x").and_more(["id h/007"]).has("h/M007", "h/M007.npy")
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_damaged_shard_is_not_written_again(seed: int, made: Path, tmp_path: Path) -> None:
+    draw, out = random.Random(seed), Path(shutil.copytree(made, tmp_path / "out"))
+    held = [path for path in sorted(out.glob("*.tar")) if b"anna/" in path.read_bytes()]
+    damaged = draw.choice(held)
+    raw = bytearray(damaged.read_bytes())
+    raw[draw.randrange(len(raw))] ^= 1 << draw.randrange(8)
+    damaged.write_bytes(raw)
+    before = content(out)
+    with pytest.raises(UserError, match=rf"{damaged.name}: .*sha256"):
+        remove(out, subjects=["anna"])
+    assert content(out) == before and not (out / REMOVED_FILE).exists()
+
+
 class KilledError(BaseException):
     """Stands for a kill."""
 
