@@ -67,7 +67,7 @@ def read_manifest(store: Store, digest: str | None = None) -> tuple[Manifest, st
     except MissingFileError:
         raise UserError(
             f"{store.place}: no {MANIFEST_FILE}, so the conversion is unfinished or this is no dataset; "
-            f"convert it"
+            f"convert it, or join its parts (data join)"
         ) from None
     manifest = Manifest.parse(parse_json(raw, where), where)
     if manifest.schema_version != SCHEMA_VERSION:

@@ -7,6 +7,7 @@ import json
 import shutil
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from bvh_clips import unpack_bandai
 
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
 from motionloom.datasets.convert.bvh.plan import BvhClip
+from motionloom.datasets.convert.common import scan
 from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.features.codec import decode
@@ -121,6 +123,22 @@ def test_a_finished_conversion_reads_nothing_again(
     monkeypatch.setattr("motionloom.datasets.convert.common.scan.read_file", pytest.fail)
     assert convert(given, tmp_path / "out") == first
     assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")} == before
+
+
+def test_of_parts_that_begin_at_once_one_reads_the_source(
+    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, names = scan.read_file, list[str]()
+
+    def counted(path: Path, label: str) -> bytes:
+        names.append(label)
+        return real(path, label)
+
+    monkeypatch.setattr(scan, "read_file", counted)
+    with ThreadPoolExecutor(3) as pool:
+        plans = list(pool.map(lambda _: prepare(config(copy), out=tmp_path / "out").plan.items, range(3)))
+    assert plans[0] == plans[1] == plans[2] and len(names) == len({*names}) == 7
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [".scan.json"]
 
 
 @pytest.mark.parametrize("count", [1, 3])
