@@ -129,6 +129,7 @@ def test_of_parts_that_begin_at_once_one_reads_the_source(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, names = scan.read_file, list[str]()
+    time.sleep(0.05)  # as above
 
     def counted(path: Path, label: str) -> bytes:
         names.append(label)
