@@ -63,13 +63,16 @@ class Case:
     id: str
     caption: str
     error: float
-    recorded: NDArray[Any]
-    made: NDArray[Any]
+    recorded: NDArray[np.floating]
+    made: NDArray[np.floating]
     """Joints [T, N, 3] in metres, as are the recorded ones."""
 
 
 def extreme_cases(
-    of: str, truths: Sequence[Truth], errors: Sequence[float], motion_of: Callable[[int], NDArray[Any]]
+    of: str,
+    truths: Sequence[Truth],
+    errors: Sequence[float],
+    motion_of: Callable[[int], NDArray[np.floating]],
 ) -> list[Case]:
     """The clips with the largest and the smallest errors; `made` gives joints [T, N, 3] by number."""
     return [

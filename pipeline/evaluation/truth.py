@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 if TYPE_CHECKING:
@@ -62,17 +63,23 @@ def recorded_seconds(truths: Sequence[Truth], generator: MotionGenerator) -> lis
 
 
 def perform(
-    bundle: Bundle, truths: Sequence[Truth], *, seconds: float | None = None, **drawn: Any
+    bundle: Bundle,
+    truths: Sequence[Truth],
+    *,
+    seconds: float | None = None,
+    seed: int = 0,
+    sampling: SamplingConfig | None = None,
 ) -> list[GeneratedMotion]:
     """Motions for the captions of clips, each as long as its clip where neither `seconds` nor the model says
-    more; `drawn` is for `Bundle.generate`.
+    more.
     """
     maker = bundle.generator
     return bundle.generate(
         [truth.caption for truth in truths],
         face=[truth.face_caption for truth in truths],
         seconds=recorded_seconds(truths, maker) if seconds is None and not maker.decides_length else seconds,
-        **drawn,
+        seed=seed,
+        sampling=sampling,
     )
 
 

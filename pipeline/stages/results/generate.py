@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 from pydantic import Field
 
@@ -94,7 +93,7 @@ def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[str]]
     """Motions for the captions of the config, or of held-out clips, and what they do not show of these."""
     config: GenerateConfig = context.config
     bundle = bundle_driven_by("text", context.every("generators"), context.stage_cache)
-    how: dict[str, Any] = {"seconds": config.seconds, "seed": context.seed, "sampling": config.sampling}
+    seconds, seed, sampling = config.seconds, context.seed, config.sampling
     if bundle is None:
         if config.captions:
             raise UserError(
@@ -102,10 +101,11 @@ def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[str]]
             )
         return [], []
     if config.captions:
-        made = bundle.generate(config.captions, face=config.captions, **how)
+        said = config.captions
+        made = bundle.generate(said, face=said, seconds=seconds, seed=seed, sampling=sampling)
     else:
         truths = spread_truths(context.given["data"].held_out(prefer="test"), config.count)
-        made = perform(bundle, truths, **how) if truths else []
+        made = perform(bundle, truths, seconds=seconds, seed=seed, sampling=sampling) if truths else []
     return made, bundle.find_mismatches(made)
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -217,9 +216,8 @@ def _rows(
         controls = None if made.face is None else synthetic_face_controls(made.face)
         rows.append(("generated", shown(made).joints, controls))
     figure = (layout.fps, layout.skeleton.parents)
-    music: dict[str, Any] = {"sound": score.sound, "beats": score.beats, "segments": score.segments}
     return [
-        ViewerMotion(joints, *figure, label, words, group, controls, **music)
+        ViewerMotion(joints, *figure, label, words, group, controls, score.sound, score.beats, score.segments)
         for label, joints, controls in rows
     ]
 

@@ -14,9 +14,9 @@ from safetensors.numpy import load_file
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.inference.generators.vae import between
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.stages.networks.tma import between
 
 RECIPE = """
 name: made
