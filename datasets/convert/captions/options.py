@@ -182,7 +182,9 @@ def _listed(given: object) -> object:
 class CaptionConfig(ConvertConfig):
     """Options of converters that take captions in any form."""
 
-    captions: Annotated[tuple[Path, ...], BeforeValidator(_listed)] = ()
+    captions: Annotated[
+        tuple[Path, ...], BeforeValidator(_listed, json_schema_input_type=Path | tuple[Path, ...] | None)
+    ] = ()
     """Captions by the clips' names: JSON lines, JSON, CSV, TSV, CMU's or KIT-ML's lists, or a folder of these
     and of .txt files (docs/sources.md); several count together. Columns of other names stand behind the file:
     `takes.csv:text=Beschreibung,file=Datei`. Without it clips have no captions.
