@@ -161,14 +161,16 @@ class SplitRule:
         return subject_of(path) if self.by == "subjects" else clip_id
 
     def another(self, names: Iterable[str]) -> str:
-        """Return the rule with the seed that gives every split some of these names, nearest to 80/5/15; empty
-        where there is none.
+        """Return the rule with the seed that gives every split some of these names of clips, nearest to
+        80/5/15 of the clips; empty where there is none.
         """
-        distinct, best = sorted(set(names)), (float(len(SPLITS)), "")
-        for seed in range(1, _SEEDS_TRIED if len(distinct) >= len(SPLITS) else 1):
-            counts = Counter(hash_split(name, seed) for name in distinct)
-            wanted = {"train": TRAIN_SHARE, "val": VAL_SHARE, "test": 1 - TRAIN_SHARE - VAL_SHARE}
-            far = sum(abs(counts[split] / len(distinct) - wanted[split]) for split in SPLITS)
+        clips, best = Counter(names), (float(len(SPLITS)), "")
+        wanted = {"train": TRAIN_SHARE, "val": VAL_SHARE, "test": 1 - TRAIN_SHARE - VAL_SHARE}
+        for seed in range(1, _SEEDS_TRIED if len(clips) >= len(SPLITS) else 1):
+            counts = Counter[str]()
+            for name, count in clips.items():
+                counts[hash_split(name, seed)] += count
+            far = sum(abs(counts[split] / clips.total() - wanted[split]) for split in SPLITS)
             if all(counts[split] for split in SPLITS) and far < best[0]:
                 best = far, f"{self.by}:{seed}"
         return best[1]
