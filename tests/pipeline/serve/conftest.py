@@ -25,6 +25,7 @@ from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.serve.app import Site, Worker
 from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.server import listen, server_of
+from motionloom.pipeline.store.artifact import Terms
 from motionloom.pipeline.store.known_captions import Unknown
 
 LAYOUT = MotionLayout.named("wholebody363", fps=20.0)
@@ -69,6 +70,7 @@ class QuickModel:
             generator=generator,
             recommended=SamplingConfig(cfg_scale=1.25, top_p=0.9),
             generate=self.generate,
+            terms=Terms(credits=("Motion of nobody.",)),
             main="body",
             of=lambda stage: generator,
             encode=lambda *_: {},
