@@ -30,11 +30,11 @@ from motionloom.datasets.shards.options import Part
 source, out, part, workers, dies_at = sys.argv[1:]
 encode, left = Bvh.encode, [int(dies_at)]
 
-def dies(self, label, data):
+def dies(self, *clip):
     left[0] -= 1
     if left[0] == 0:
         os.kill(os.getpid(), signal.SIGKILL)
-    return encode(self, label, data)
+    return encode(self, *clip)
 
 if __name__ == "__main__":
     Bvh.encode = dies
