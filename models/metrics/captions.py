@@ -136,5 +136,5 @@ def _longest_common(one: Words, other: Words) -> int:
 def _clipped_cosine(own: dict[Ngram, float], other: dict[Ngram, float]) -> float:
     """Cosine in which no sequence of the sentence counts more than in the reference."""
     norms = math.sqrt(sum(v * v for v in own.values()) * sum(v * v for v in other.values()))
-    shared = sum(min(own[ngram], other[ngram]) * other[ngram] for ngram in own.keys() & other.keys())
+    shared = sum(min(own[ngram], other[ngram]) * other[ngram] for ngram in own if ngram in other)
     return shared / norms if norms else 0.0

@@ -46,10 +46,11 @@ if __name__ == "__main__":
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """40 clips in two folders; one is broken, one has no certain joint map, one's name is no UTF-8."""
+    """40 clips of four skeletons; one is broken, one has no certain joint map, one's name is no UTF-8."""
     root = tmp_path_factory.mktemp("mocap")
-    for seed in range(40):
-        write_clip(root / f"take{seed % 2}" / f"{seed}.bvh", seed, 36)
+    for seed, left in zip(range(40), 10 * [b"left_", b"Left_", b"LEFT_", b"left-"], strict=True):
+        write_clip(path := root / f"take{seed % 2}" / f"{seed}.bvh", seed, 36)
+        path.write_bytes(path.read_bytes().replace(b"left_", left))
     whole = (root / "take0" / "0.bvh").read_bytes()
     (root / "armless.bvh").write_bytes(whole.replace(b"left_", b"gauche_"))
     (root / "take1" / "cut.bvh").write_bytes(whole[:-40])
