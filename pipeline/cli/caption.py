@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import Dropped, UserError
-from motionloom.pipeline.cli.options import AsJson, At, Device, ModelFolder, print_json
+from motionloom.pipeline.cli.options import At, Device, ModelFolder
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place
 
@@ -26,7 +26,6 @@ def caption(
     ] = None,
     at: At = None,
     device: Device = "auto",
-    as_json: AsJson = False,
 ) -> None:
     """The likeliest sentences about clips, by a model with a captioner.
 
@@ -40,7 +39,7 @@ def caption(
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.runs.snapshot import run_at
 
-    console = make_console(aside=as_json)
+    console = make_console()
     if out is not None:
         require_file_place(out)
     found, left_out = [], []
@@ -61,5 +60,3 @@ def caption(
     if out is not None:
         write_text(out, "".join(f"{json.dumps(one.record(), ensure_ascii=False)}\n" for one in found))
         say(console, f"{out}: {len(found)} clips")
-    if as_json:
-        print_json([one.record() for one in found])

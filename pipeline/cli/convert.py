@@ -49,7 +49,6 @@ _RUN_OPTIONS: dict[str, tuple[object, object]] = {
     ),
     "workers": (Workers, 2),
     "sets": (Annotated[list[str] | None, set_option("A setting, as listed above.")], None),
-    "as_json": (AsJson, False),
 }
 
 
@@ -78,8 +77,9 @@ convert_app = typer.Typer(
 
 
 @convert_app.callback()
-def _convert() -> None:
+def _convert(context: typer.Context, as_json: AsJson = False) -> None:
     """Real motion capture to shards. Begin with --plan."""
+    context.obj = as_json
 
 
 def _command(name: str) -> Any:
@@ -88,7 +88,8 @@ def _command(name: str) -> Any:
     config = entry.config_class
 
     def run(source: Path, out: Path, plan: bool, part: str | None, workers: int, sets: list[str] | None,
-            as_json: bool, **everyday: Any) -> None:  # fmt: skip
+            context: typer.Context, **everyday: Any) -> None:  # fmt: skip
+        as_json = bool(context.obj)
         if as_json and not plan:
             raise UserError("--json is for the plan: give --plan too")
         settings = {key: value for key, value in everyday.items() if value is not None}
@@ -101,6 +102,7 @@ def _command(name: str) -> Any:
         )
 
     parameters = [
+        _parameter("context", typer.Context),
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),
         _parameter("out", Annotated[Path, typer.Argument(help="Folder for the shards.")]),
     ]

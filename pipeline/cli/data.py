@@ -228,7 +228,6 @@ def clean(
             "every clip is back."
         ),
     ] = None,
-    as_json: AsJson = False,
 ) -> None:
     """Suspect clips on a page to watch and decide about; what is left out is listed, and nothing deleted.
 
@@ -239,7 +238,7 @@ def clean(
 
     Example: `motionloom data clean shards --decisions decisions.json`
     """
-    console, page = make_console(aside=as_json), out or root / "clean.html"
+    console, page = make_console(), out or root / "clean.html"
     if decisions is not None:
         from motionloom.datasets.check.suspects import decide, undo
         from motionloom.datasets.schema import Decisions
@@ -252,20 +251,16 @@ def clean(
             console,
             f"{root}: {len(manifest.excluded)} clips are left out; stages that read this set run again",
         )
-        if as_json:
-            print_json({"path": root, "excluded": manifest.excluded})
         return
     from motionloom.pipeline.results.clean_page import kinds_of, suspects_of, write_clean_page
 
     require_file_place(page)
     found = suspects_of(root, model, progress=console.is_terminal)
-    for suspect in list(found.values())[: None if as_json else _SUSPECTS]:
+    for suspect in list(found.values())[:_SUSPECTS]:
         say(console, f"{suspect.id}: {'; '.join(fault.text for fault in suspect.faults)}")
     write_clean_page(root, page, found, _SUSPECTS)
     kinds = ", ".join(f"{count} {kind}" for kind, count in kinds_of(found).items())
     say(console, f"{page}: {len(found)} suspects{f' ({kinds})' if kinds else ''}")
-    if as_json:
-        print_json({"path": root, "page": page, "suspects": list(found.values())})
 
 
 def _holds_files(folder: Path) -> bool:

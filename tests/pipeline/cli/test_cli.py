@@ -210,7 +210,7 @@ def test_parts_are_planned_made_and_joined(tmp_path: Path, call: Call) -> None:
     words = ("data", "convert", "bvh", tmp_path / "mocap", "--licence", "CC0", "--workers", 1)
     splits, out, whole = ("--set", f"splits={tmp_path / 'splits'}"), tmp_path / "out", tmp_path / "whole"
     assert call("data", "join", tmp_path).code == 2 and call(*words, out, "--part", "3/2").code == 2
-    plan = json.loads(call(*words, out, *splits, "--part", "1/2", "--plan", "--json").out)
+    plan = json.loads(call(*words[:2], "--json", *words[2:], out, *splits, "--part", "1/2", "--plan").out)
     assert plan["command"].endswith("--part 1/2") and not list(out.glob("*.tar"))
     assert call(*words, out, *splits, "--part", "1/2").code == 0
     tars = [ShardIndex.load_json(path) for path in out.glob("*.index.json")]
@@ -332,9 +332,10 @@ def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:
     (tmp_path / "mocap/frame_time_zero.bvh").write_text(re.sub(r"Frame Time: .*", "Frame Time: 0.0", text))
     words = ("data", "convert", "bvh", tmp_path / "mocap", tmp_path / "out", "--licence", "x")
     words += ("--set", f"joint_map={write_map(tmp_path / 'map.json')}", "--workers", "1")
-    plan = loaded(call(*words, "--plan", "--json").out)
+    json_of = ("data", "convert", "--json", *words[2:])
+    plan = loaded(call(*json_of, "--plan").out)
     assert sum(plan["clips"].values()) == 1 and "frame_time_zero.bvh" in json.dumps(plan["unreadable"])
-    refused = call(*words, "--json")
+    refused = call(*json_of)
     assert refused.code == 2 and "give --plan too" in refused.err and not (tmp_path / "out").exists()
     wrong = call(*words, "--set", "strict=true")
     assert wrong.code == 2 and "'strict'" in wrong.err

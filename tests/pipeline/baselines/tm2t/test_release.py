@@ -165,9 +165,10 @@ def test_a_release_tokenizes_as_it_does_and_captions(
     keys = given["decoder.layer_stack.0.enc_attn.w_ks.weight"]
     assert torch.equal(loaded["decoder.0.other.key.weight"], keys)
     np.savez(tmp_path / "walk.npz", joints=walk(frames=48), metadata=json.dumps({"fps": 20}))
-    done = call("caption", tmp_path / "run", tmp_path / "walk.npz", "--json")
+    done = call("caption", tmp_path / "run", tmp_path / "walk.npz", "-o", tmp_path / "said.jsonl")
     assert done.code == 0, done.err
-    said = {word for found in json.loads(done.out)[0]["captions"] for word in found["text"].split()}
+    record = json.loads((tmp_path / "said.jsonl").read_text())
+    said = {word for found in record["captions"] for word in found["text"].split()}
     assert said and said <= set(WORDS[3:])
 
 
