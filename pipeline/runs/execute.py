@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
 
 from motionloom.datasets.base.files import remove_temporaries, write_text
-from motionloom.datasets.base.licences import UNKNOWN
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
@@ -20,11 +19,10 @@ from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.continuation import Started
 from motionloom.pipeline.runs.doubts import doubts
-from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, require_fit
+from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, require_fit, terms_of
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.runs.verify_shards import verify_shards
-from motionloom.pipeline.store.artifact import Artifact, InputStage, Terms
-from motionloom.pipeline.store.data import Data
+from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import remove_tree, write_json
 from motionloom.pipeline.store.run_folder import identity_of, place_from, require_own, stage_folder
 
@@ -186,17 +184,6 @@ def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[Plann
         inputs=inputs,
         terms=terms_of(stage, stage_folder(run, stage.name), inputs.values()),
     )
-
-
-def terms_of(stage: Stage, folder: Path, inputs: Iterable[InputStage]) -> Terms:
-    """Licences and credits of all that a stage was made from."""
-    sources = [source.place(folder) for source in inputs]
-    own = Data(folder).terms()
-    # Data of a kind that keeps no manifest, or weights that others have trained, may be under any licence.
-    brought = "data" in stage.kind.gives(stage.config) and not sources and not own.licences
-    if brought or getattr(stage.config, "published", None) is not None:
-        own = Terms(licences=(UNKNOWN,))
-    return Terms.union([own, Terms.of(sources)])
 
 
 def _input(

@@ -21,6 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from motionloom.datasets.base.licences import UNKNOWN
 from motionloom.datasets.base.register import code_of
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import Every, Stage, fingerprint_fields
@@ -29,7 +30,8 @@ from motionloom.pipeline.runs.continuation import Continuation, Started, continu
 from motionloom.pipeline.runs.inputs import require_elsewhere
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.runs.resolve import Tree
-from motionloom.pipeline.store.artifact import Artifact
+from motionloom.pipeline.store.artifact import Artifact, InputStage, Terms
+from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.files import fingerprint_of
 from motionloom.pipeline.store.run_folder import identity_of, stage_folder
 from motionloom.pipeline.store.yaml import flatten
@@ -279,3 +281,14 @@ def _descendants(recipe: Recipe, name: str) -> set[str]:
         if out & set(stage.inputs.values()):
             out.add(stage.name)
     return out
+
+
+def terms_of(stage: Stage, folder: Path, inputs: Iterable[InputStage]) -> Terms:
+    """Licences and credits of all that a stage was made from."""
+    sources = [source.place(folder) for source in inputs]
+    own = Data(folder).terms()
+    # Data of a kind that keeps no manifest, or weights that others have trained, may be under any licence.
+    brought = "data" in stage.kind.gives(stage.config) and not sources and not own.licences
+    if brought or getattr(stage.config, "published", None) is not None:
+        own = Terms(licences=(UNKNOWN,))
+    return Terms.union([own, Terms.of(sources)])

@@ -30,7 +30,7 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
 )
 from motionloom.pipeline.launch.console import make_console, say
-from motionloom.pipeline.runs.execute import terms_of
+from motionloom.pipeline.runs.plan import terms_of
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import fingerprint_of
