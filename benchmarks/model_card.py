@@ -359,7 +359,6 @@ def card_of(
         apart=figures["apart"],
         seed=figures["seed"],
         table=markdown(head, rows_of(shares)),
-        examples="; ".join(f'"{body}"' for body, _ in other[:2]),
         chosen=choice(sampling),
         single=single_draws(figures["single draws"]),
         unknown=f"Of the first {strange['captions']} clips it calls {strange[OTHER]} of these captions and "
