@@ -23,7 +23,8 @@ PROGRAM = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main"]
 
 def shards(run: Path) -> dict[Path, bytes]:
     data = run / "stages/data/shards"
-    return {path.relative_to(data): path.read_bytes() for path in data.rglob("*") if path.is_file()}
+    found = (path for path in data.rglob("*") if path.is_file() and path.name != ".scan.json")
+    return {path.relative_to(data): path.read_bytes() for path in found}
 
 
 def cost(*words: object) -> float:

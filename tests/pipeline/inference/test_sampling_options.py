@@ -41,6 +41,7 @@ from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.stages.networks.tma import VaeMotion
 from motionloom.pipeline.stages.results.evaluate_units import EvaluateConfig
+from motionloom.pipeline.store.artifact import Terms
 from motionloom.pipeline.store.networks import LoadedGpt, TrainedTokenizer
 
 GPT = GptConfig(layers=1, dim=16, heads=2, ff=16, block_size=32)
@@ -216,6 +217,7 @@ def test_the_commands_settings_reach_the_sampling(
         generate=lambda captions, **options: seen.update(options) or [],
         generator=SimpleNamespace(capabilities=Capabilities()),
         notes=lambda *_: [],
+        terms=Terms(),
     )
     monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: watching)
     asked = {"sampler": "dpm++", "denoising_steps": 7, "cfg_scale": 3.0, "temperature": 0.0}

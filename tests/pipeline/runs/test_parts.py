@@ -9,6 +9,7 @@ from preempted import write_recipe
 from rich.console import Console
 
 from motionloom.datasets.base.lock import file_lock
+from motionloom.datasets.convert.common.conversion import SCAN_FILE
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
@@ -21,8 +22,9 @@ def convert(recipe: Path, run: Path, part: str = "", until: str = "data") -> Non
 
 
 def files(run: Path) -> dict[Path, bytes]:
-    data = run / "stages/data"
-    found = (path for path in data.rglob("*") if path.is_file() and path.name != "timing.json")
+    """All but times, and a scan's memory, which leaves out files that had just been written."""
+    data, left = run / "stages/data", ("timing.json", SCAN_FILE)
+    found = (path for path in data.rglob("*") if path.is_file() and path.name not in left)
     return {path.relative_to(data): path.read_bytes() for path in found}
 
 
