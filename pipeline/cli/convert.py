@@ -65,6 +65,8 @@ class ConverterGroup(TyperGroup):
         """The command that `args` name; a misspelt one is answered with the nearest."""
         if args and args[0] not in names() and not args[0].startswith("-"):
             raise UserError(f"data convert {args[0]}: no such source{nearest(args[0], list(names()))}")
+        if "--json" in args:
+            raise UserError(f"give --json before the source: motionloom data convert --json {args[0]} …")
         return super().resolve_command(ctx, args)
 
 

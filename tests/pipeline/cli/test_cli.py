@@ -335,6 +335,7 @@ def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:
     json_of = ("data", "convert", "--json", *words[2:])
     plan = loaded(call(*json_of, "--plan").out)
     assert sum(plan["clips"].values()) == 1 and "frame_time_zero.bvh" in json.dumps(plan["unreadable"])
+    assert call(*words, "--plan", "--json").code == 2
     refused = call(*json_of)
     assert refused.code == 2 and "give --plan too" in refused.err and not (tmp_path / "out").exists()
     wrong = call(*words, "--set", "strict=true")
