@@ -122,7 +122,7 @@ class TextStage(StageKind[TextConfig]):
     summary = "caption embeddings"
     config = TextConfig
     takes = ("data",)
-    version = 2  # distances of validation captions
+    version = 3  # captions that are known without their words
 
     def run(self, context: StageContext) -> None:
         keep_place(context.config.encoder, context.folder)
