@@ -207,6 +207,8 @@ class Look:
     def require_people(self, source: str) -> None:
         if not self.problems:
             return
+        if not self.clips:  # nobody was seen, and a conversion would read no more
+            raise UserError(f"{source}: {'; '.join(self.problems)}")
         tries = "".join(f"; try {suggestion}" for suggestion in self.suggestions)
         raise UserError(
             f"{source}: no people standing on a floor were seen in {self.clips} clips: "

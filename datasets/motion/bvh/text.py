@@ -55,7 +55,7 @@ class Hierarchy:
 
 
 def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
-    """The bytes with LF line ends and no BOM, and what errors call them."""
+    """The bytes with LF line ends, without BOM and padding at the end, and what errors call them."""
     if isinstance(source, bytes):
         data, where = source, name or "BVH data"
     elif isinstance(source, str) and "\n" in source:
@@ -68,7 +68,10 @@ def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]
             raise UserError(f"{where}: cannot read ({error.strerror})") from None
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    return data.removeprefix(b"\xef\xbb\xbf"), where
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise UserError(f"{where}: UTF-16 text; save it as UTF-8")
+    # DOS ends texts with 0x1A, and what fills blocks of a disk writes NUL behind them.
+    return data.removeprefix(b"\xef\xbb\xbf").rstrip(b"\0\x1a \n"), where
 
 
 def find_motion(data: bytes, where: str) -> MotionSection:

@@ -50,13 +50,16 @@ def euler(order: str, *degrees: float) -> np.ndarray:
     return np.asarray(Rotation.from_euler(order, degrees, degrees=True).as_matrix().reshape(3, 3))
 
 
-def test_bom_and_crlf_equal_the_control(shared: Path) -> None:
+def test_what_stands_around_the_text_changes_nothing(shared: Path) -> None:
     folder = shared / "data/broken/bvh"
-    control, other = read_bvh(folder / "control_ok.bvh"), read_bvh(folder / "crlf_bom.bvh")
+    control, data = read_bvh(folder / "control_ok.bvh"), (folder / "control_ok.bvh").read_bytes()
     assert (control.fps, control.frames, len(control.joints)) == (30.0, 6, 22)
-    assert other.joints == control.joints
-    np.testing.assert_array_equal(other.values, control.values)
-    np.testing.assert_array_equal(other.offsets, control.offsets)
+    padded = (data + end for end in (b"\x1a", b"\r\n\x1a", b"\n\0" + bytes(500), b"\0\n"))
+    for text in (folder / "crlf_bom.bvh", *padded):
+        other = read_bvh(text)
+        assert other.joints == control.joints
+        np.testing.assert_array_equal(other.values, control.values)
+        np.testing.assert_array_equal(other.offsets, control.offsets)
 
 
 def test_whole_clip_agrees_with_an_independent_reader(shared: Path, tmp_path: Path) -> None:
@@ -158,6 +161,8 @@ def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "empty.bvh").touch()
     with pytest.raises(UserError, match="empty file"):
         read_bvh(str(tmp_path / "empty.bvh"))
+    with pytest.raises(UserError, match="UTF-8"):
+        read_bvh(TINY.encode("utf-16"))
     with pytest.raises(UserError, match="channel"):
         read_bvh(b"HIERARCHY\nROOT a\n{\nOFFSET 0 0 0\nCHANNELS 0\n}\nMOTION\nFrames: 1\nFrame Time: 1\n0\n")
 
