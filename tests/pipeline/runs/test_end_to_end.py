@@ -140,7 +140,7 @@ def test_an_exported_folder_works_alone(
     shutil.copytree(exported, elsewhere)
     shutil.rmtree(exported)
     files = [p for p in elsewhere.rglob("*") if p.is_file()]
-    assert {p.suffix for p in files} == {".json", ".safetensors"}
+    assert {p.suffix for p in files} == {".json", ".md", ".safetensors"}
     assert json.loads((elsewhere / "skeleton.json").read_text())["name"] == "smplx52"
     assert not any(str(small_run.folder.parent) in p.read_text() for p in files if p.suffix == ".json")
     out, first = tmp_path / "motions", arrays(only(motions, ".npz"))
