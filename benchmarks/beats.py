@@ -30,7 +30,6 @@ COLUMNS = (
     Column("ours", "ours", 2),
     Column("ours, any octave", "ours, any octave", 2),
     Column("ours, ms late", "ours, late", 0),
-    Column("our downbeats", "our downbeats", 2),
     Column("librosa's", "librosa's", 2),
     Column("librosa's, any octave", "librosa's, any octave", 2),
     Column("librosa's, ms late", "librosa's, late", 0),
@@ -54,7 +53,6 @@ def hits(truth: Times, found: Times) -> int:
 
 
 def f_measure(truth: Times, found: Times) -> float:
-    """0..1"""
     return 2 * hits(truth, found) / max(1, len(truth) + len(found))
 
 
@@ -84,9 +82,6 @@ def rendered(count: int) -> Record:
             found[name].append(f_measure(truth, times))
             found[f"{name}, any octave"].append(max(f_measure(one, times) for one in tempi(truth)))
             found[f"{name}, late"].append(1000 * lateness(truth, times))
-        # Bars begin at every beat whose number is a multiple of the meter.
-        bars = truth[(song.beat_number(0.0) + np.arange(len(truth))) % song.meter == 0]
-        found["our downbeats"].append(f_measure(bars, ours.times[ours.bar_places == 0]))
     cells = {name: [float(np.nanmean(values))] for name, values in found.items() if values}
     return {"title": f"{count} rendered songs", "cells": cells}
 

@@ -8,11 +8,11 @@ shoulder. For walking and running: the distance covered and its speed.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from bench import arguments, command_line
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import heading
@@ -49,7 +49,7 @@ def only(joints: Joints, side: str) -> bool:
 
 UP, DOWN = -0.1, -0.2
 Check = Callable[[Joints, float], bool]
-BY_CONTENT: dict[str, Check] = {
+BY_CONTENT: dict[str, Check] = {  # by the label of a clip's content
     "walk-turn-left": lambda j, f: turned(j, f) > 45,
     "walk-turn-right": lambda j, f: turned(j, f) < -45,
     "walk": lambda j, f: abs(turned(j, f)) < 45 and 0.3 < speed(j, f) < 2.0,
@@ -61,7 +61,6 @@ BY_CONTENT: dict[str, Check] = {
     "wave-left-hand": lambda j, f: only(j, "left"),
     "wave-both-hands": lambda j, f: min(raised(j, "left"), raised(j, "right")) > UP,
 }
-"""By the label of a clip's content."""
 CAPTIONS = {
     "a person walks and turns left.": "walk-turn-left",
     "a person walks and turns right.": "walk-turn-right",
@@ -76,33 +75,17 @@ CAPTIONS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_line(__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--samples", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-    bundle = Bundle.open(args.run)
-    print(
-        "| caption | does it | median turn | wrist above shoulder: left, right | speed |\n"
-        "|---|---|---|---|---|"
-    )
-    total = 0
+    args = arguments(parser)
+    bundle, total = Bundle.open(args.run), 0
     for caption, content in CAPTIONS.items():
-        check = BY_CONTENT[content]
-        motions = bundle.generate([caption] * args.samples, seed=args.seed)
-        fps = bundle.layout.fps
-        good = sum(check(m.joints, fps) for m in motions)
+        motions = bundle.generate([caption] * args.samples, seed=0)
+        good = sum(BY_CONTENT[content](motion.joints, bundle.layout.fps) for motion in motions)
+        print(f"{caption} {good}/{args.samples}")
         total += good
-        turn = np.median([turned(m.joints, fps) for m in motions])
-        left, right = (np.median([raised(m.joints, s) for m in motions]) for s in ("left", "right"))
-        pace = np.median([speed(m.joints, fps) for m in motions])
-        print(
-            f"| {caption} | {good}/{args.samples} | {turn:.0f}° | {left:.2f} m, {right:.2f} m "
-            f"| {pace:.2f} m/s |"
-        )
-    print(f"| all | {total}/{args.samples * len(CAPTIONS)} | | | |")
+    print(f"all {total}/{args.samples * len(CAPTIONS)}")
 
 
 if __name__ == "__main__":

@@ -181,11 +181,7 @@ def main() -> None:
     )
     parser.add_argument("--name", help="what the card calls it; default: the folder's name, or the card's")
     parser.add_argument("--clips", type=int, help="test clips, at most; default: as the card says, or all")
-    parser.add_argument("--top-p", type=float, help="default: as the card says, or the export")
-    parser.add_argument("--cfg", type=float, help="guidance of body and hands; default: likewise")
-    parser.add_argument("--candidates", type=int, help="draws of which TMA chooses; default: likewise")
     parser.add_argument("--seed", type=int, help="default: as the card says, or 0")
-    parser.add_argument("--licence", default="apache-2.0")
     args = parser.parse_args()
     model, console = model_folder(args.model), Console()
     before = noted(model)
@@ -201,9 +197,7 @@ def main() -> None:
     except KeyError as error:
         raise UserError(f"{WORDS.name} has no other words for {error}") from None
     bundle = Bundle.open(model)
-    asked = {"top_p": args.top_p, "cfg_scale": args.cfg, "candidates": args.candidates}
-    asked = {name: value for name, value in asked.items() if value is not None}
-    sampling = bundle.drawing(SamplingConfig.of(asked or before.get("sampling")))
+    sampling = bundle.drawing(SamplingConfig.of(before.get("sampling")))
     said = {
         FAMILIAR: ([t.caption for t in truths], [t.face_caption for t in truths]),
         OTHER: ([body for body, _ in other], [face or body for body, face in other]),
@@ -247,7 +241,7 @@ def main() -> None:
     }
     if args.write:
         (model / CARD_FIGURES).write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-        card = card_of(figures, recipe, data, bundle, other, model, args.licence)
+        card = card_of(figures, recipe, data, bundle, model)
         (model / "README.md").write_text(card, encoding="utf-8")
         console.print(str(model / "README.md"), soft_wrap=True)
     else:
@@ -306,9 +300,7 @@ def single_draws(single: Mapping[str, Shares]) -> str:
 
 def music_section() -> str:
     """How its dances follow real songs, from the records of `benchmarks/real_songs.py`."""
-    record = read_records().get("real_songs")
-    if record is None:
-        return ""
+    record = read_records()["real_songs"]
     row = record["rows"][0]
     columns = {column["figure"]: column for column in record["columns"]}
     own, shifted = (shown(row["cells"][name], columns[name]) for name in ("own", "shifted"))
@@ -319,9 +311,8 @@ def music_section() -> str:
 
 
 def card_of(
-    figures: Mapping[str, Any], recipe: Recipe, data: SynthConfig, bundle: Bundle,
-    other: Sequence[tuple[str, str]], model: Path, licence: str,
-) -> str:  # fmt: skip
+    figures: Mapping[str, Any], recipe: Recipe, data: SynthConfig, bundle: Bundle, model: Path
+) -> str:
     """The card as Markdown."""
     shares, strange, sampling = figures["right"], figures["unknown"], figures["sampling"]
     head = ["right, %", *(f"{title}: {kind}" for title, kind in columns_of(shares))]
@@ -340,15 +331,13 @@ def card_of(
     uses = ["--audio song.mp3", f"{words} --audio song.mp3@0:30-1:00", *uses] if heard else uses
     asked = "" if sampling == recommended else options
     return CARD.read_text(encoding="utf-8").format(
-        licence=licence,
         examples_of_use="\n".join(f"motionloom generate {figures['name']} {use}{asked}" for use in uses),
         songs=" and dances to songs that FluidSynth played" if heard else "",
         or_music=" and no recorded music" if heard else "",
         music=music_section() if heard else "",
         name=figures["name"],
         description=recipe.description,
-        sampling=", ".join(f"{name} {value}" for name, value in sampling.items())
-        or "the defaults of sampling",
+        sampling=", ".join(f"{name} {value}" for name, value in sampling.items()) or "the defaults",
         fps=bundle.layout.fps,
         bytes=size,
         clips=f"{sum(split_of(k, data) == 'train' for k in range(data.clips)):,}",
