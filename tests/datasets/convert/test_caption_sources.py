@@ -82,7 +82,7 @@ def test_clips_that_the_user_moves_are_counted(source: Path, tmp_path: Path) -> 
         convert_command("bvh", {**given, "splits": splits}, out, plan=False, workers=1, console=console)
         assert ("to another split" in said.getvalue()) is (splits == "clips:7")
     moved = sum(hash_split(name, 5) != hash_split(name, 7) for name in NAMES)
-    assert f"{moved} clips move to another split" in said.getvalue()
+    assert f"{moved} clips move" in said.getvalue()
 
 
 def test_captions_of_several_files_count_together(source: Path, tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_files_of_captions_that_are_not_used_are_said(source: Path, tmp_path: Pa
         notes = prepare(BvhConfig.parse({**fields, "uncaptioned": "keep"}, "x")).plan.notes
         return "".join(note for note in notes if "not used" in note)
 
-    assert unused().startswith("2 files of captions in the source are not used: jump.txt, sub/captions.csv;")
+    assert unused().startswith("2 files") and ": jump.txt, sub/captions.csv;" in unused()
     assert unused(tree / "sub/captions.csv").startswith("1 files")
     assert not unused(tree)
 

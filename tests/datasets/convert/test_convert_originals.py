@@ -159,7 +159,7 @@ def test_clips_are_cut_named_split_and_mirrored(tree: Path) -> None:
 
 def test_share_alike_is_a_set_of_its_own(tree: Path) -> None:
     plan = planned(tree).plan
-    assert any(note.startswith("MPI_HDM05: 1 clips under CC-BY-SA-3.0") for note in plan.notes)
+    assert any(note.startswith("MPI_HDM05: 1 clips") and "CC-BY-SA-3.0" in note for note in plan.notes)
     conversion = planned(tree, licence="CC-BY-SA-3.0")
     plan, path = conversion.plan, tree / "mocap" / [*FILES][5]
     assert [clip.id for _, clip in plan.items] == ["000040", "M000040"]
@@ -189,7 +189,7 @@ def test_names_and_lengths_that_do_not_agree_stop(tree: Path) -> None:
     rows = [*ROWS.splitlines(), "CMU/133/133_24_poses,100,206,000015"]
     write_index(tree, rows)
     assert "2 clips" in planned(tree).plan.stop  # and the mirrored one
-    with pytest.raises(UserError, match=r"133_24\.bvh \(000015\): the index ends 0\.25 s after"):
+    with pytest.raises(UserError, match=r"133_24\.bvh \(000015\): .* 0\.25 s"):
         run_conversion(planned(tree), tree / "out", progress=False)
     assert not (tree / "out").exists()
     left = planned(tree, uncaptioned="drop").plan
