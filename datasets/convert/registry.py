@@ -12,9 +12,8 @@ from typing import Any
 from motionloom.datasets import convert as _folder
 from motionloom.datasets.convert import sets as _sets
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion
+from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion, moved_clips
 from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter, Converter, PlanSettings
-from motionloom.datasets.convert.common.earlier import moved_clips
 from motionloom.datasets.convert.common.removed import Removed
 from motionloom.datasets.schema import REMOVED_FILE, UserError
 

@@ -44,7 +44,7 @@ class Planned(Config):
     manifest: Manifest
     """Without shards; `dropped` are those that the plan left out."""
     fingerprints: dict[str, str]
-    """Of every shard, of all parts, by its name, in the manifest's order."""
+    """Fingerprint of every shard of all parts by its name, in the manifest's order."""
     items: int
     """Items of all shards."""
     lost: list[Dropped]
@@ -100,7 +100,7 @@ def join_parts(out: Path) -> Manifest:
 
 
 def _require_one_plan(out: Path, records: Mapping[Part, Planned]) -> Planned:
-    """What all parts have planned."""
+    """Return the plan that all parts share; `UserError` where one has another."""
     (one, planned), *others = records.items()
     for part, other in others:
         if other.fingerprints != planned.fingerprints:

@@ -64,7 +64,7 @@ class DatasetFacts:
     dropped: Sequence[Dropped] = ()
     """Clips that the plan has left out already."""
     lost: Sequence[Dropped] = ()
-    """Those of them that were meant to become samples."""
+    """Clips among `dropped` that were meant to become samples."""
     most_lost: float = 1.0
     """Share of the clips that may be lost; where more are, the finished set is said to be unfit."""
     notes: Sequence[str] = ()

@@ -84,12 +84,12 @@ class Terms(Config):
 
     @property
     def licence(self) -> str:
-        """What holds for a model: the strictest of its data."""
+        """Return the licence of a model: the strictest of its data."""
         return strictest(self.licences)
 
     @classmethod
     def union(cls, parts: Iterable[Terms]) -> Terms:
-        """Those of data that was mixed, or of stages that something was made from."""
+        """Return the terms of mixed data, or of all stages that something was made from."""
         parts = list(parts)
         licences = sorted({licence for part in parts for licence in part.licences})
         sentences = dict.fromkeys(sentence for part in parts for sentence in part.credits)
@@ -97,7 +97,7 @@ class Terms(Config):
 
     @classmethod
     def of(cls, stages: Iterable[Path]) -> Terms:
-        """Those of finished stages, by their folders; unknown where a stage does not say."""
+        """Return the terms of finished stages, by their folders; unknown where a stage does not say."""
         made = [Artifact.find(stage) for stage in stages]
         unknown = cls(licences=(UNKNOWN,))
         return cls.union(unknown if one is None or one.terms is None else one.terms for one in made)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import operator
+from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -14,8 +16,10 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter
 from motionloom.datasets.convert.common.look import Look, look_at
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
-from motionloom.datasets.schema import Manifest, UserError
+from motionloom.datasets.schema import SPLITS, Manifest, Split, UserError
+from motionloom.datasets.shards.index import load_index
 from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions
+from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tasks import plan_shards
 from motionloom.datasets.shards.writer import dataset_writer
 
@@ -125,3 +129,20 @@ def run_conversion(
                 for warning in seen.warnings:
                     say(f"warning: {warning}")
         return writer.write(conversion.converter.convert)
+
+
+def moved_clips(folder: Path, plan: ConversionPlan[C]) -> str:
+    """Return how many clips of the finished set in a folder are in another split in the plan, by splits;
+    empty where all stay.
+    """
+    before: dict[str, Split] = {}
+    with suppress(UserError):  # none, or unfinished
+        shards = load_manifest(folder).shards
+        for split in SPLITS:
+            index = load_index(folder, split, [shard for shard in shards if shard.split == split])
+            before |= {index.id(clip): split for clip in range(len(index))}
+    pairs = Counter(
+        f"{before[clip.id]} -> {split}" for split, clip in plan.items if before.get(clip.id, split) != split
+    )
+    counts = ", ".join(f"{count:,} {pair}" for pair, count in sorted(pairs.items()))
+    return f"{folder}: {pairs.total():,} clips move to another split: {counts}" if pairs else ""
