@@ -127,8 +127,16 @@ def observed_columns(motion: Tensor, known: Tensor, places: Places | None) -> Te
 
 def known_columns(pieces: Tensor, layout: MotionLayout, columns: NDArray[np.int64]) -> Tensor:
     """Return which values are known, bool [B, T, D], given the known pieces of the figure, bool [B, T, P]."""
-    of = torch.from_numpy(piece_columns(layout)[columns]).to(pieces.device)
-    steps = torch.from_numpy(step_columns(layout)[columns]).to(pieces.device)
+    return _of_pieces(pieces, *_piece_and_step(layout, columns))
+
+
+def _piece_and_step(layout: MotionLayout, columns: NDArray[np.int64]) -> tuple[Tensor, Tensor]:
+    """Each column's piece, int64 [D], and whether it is a step to the next frame, bool [D]."""
+    return torch.from_numpy(piece_columns(layout)[columns]), torch.from_numpy(step_columns(layout)[columns])
+
+
+def _of_pieces(pieces: Tensor, of: Tensor, steps: Tensor) -> Tensor:
+    of, steps = of.to(pieces.device), steps.to(pieces.device)
     # A step is known where both its frames are; a clip's last frame repeats the step before.
     following = torch.cat([pieces[:, 1:], pieces[:, -1:]], dim=1)
     both = pieces & following
@@ -156,12 +164,14 @@ class Observations:
     ) -> None:
         rooted = Recovery.possible(layout, columns)
         self.recovery = Recovery(layout, columns, mean, std) if rooted else None
-        self.layout, self.columns, self.share = layout, columns, share
+        self.share = share
+        # Found here, since torch.compile does not enter the locks of Python 3.11's cached properties.
+        self._columns = _piece_and_step(layout, columns)
 
     def __call__(self, motion: Tensor, length: Tensor) -> Tensor:
         """Return the observed columns [B, T, 2 D + 6] of motion [B, T, D] with `length` [B] real frames."""
         pieces, path = self._draw(length, motion.shape[1])
-        known = known_columns(pieces, self.layout, self.columns)
+        known = _of_pieces(pieces, *self._columns)
         places = None
         if self.recovery is not None:
             rooted = pieces[..., LOWER]
