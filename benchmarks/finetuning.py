@@ -4,11 +4,11 @@
       --set layout=wholebody363 --set fingers=resting
     python benchmarks/finetuning.py LABELS WORK --data shards --start synthetic --judge runs/bvh-body
 
-`scratch` trains tokenizer, TMA and GPT from new weights, with the data's own statistics. `whole` and `lora`
-train networks of the same sizes on from those of `--start`, all of the GPT or adapters of it. All have the
-same clips, and `--seconds` of processor time for their three trainings: what a step costs is measured first,
-and the seconds that were really taken are reported. Each arm takes the best of the same number of learning
-rates of its GPT (`--rates`, times its recipe's), by its cross-entropy on held-out clips with a seed of its
+`scratch` trains tokenizer, TMA and GPT from new weights, with the data's own statistics. `tuned` trains
+networks of the same sizes on from those of `--start`. Both have the same clips, and `--seconds` of processor
+time for their three trainings: what a step costs is measured first, and the seconds that were really taken
+are reported. Each arm takes the best of the same number of learning rates of its GPT (`--rates`, times its
+recipe's), by its cross-entropy on held-out clips with a seed of its
 own (`--search-seed`).
 
 One motion is made for the first caption of every test clip. They are judged by what no arm was trained with:
@@ -55,8 +55,7 @@ Joints = NDArray[np.float64]
 STAGES = ("tokenizer", "tma", "gpt")
 ARMS: dict[str, dict[str, tuple[float, float]]] = {
     "scratch": {"tokenizer": (0.35, 2.0e-3), "tma": (0.15, 5.0e-4), "gpt": (0.50, 1.0e-3)},
-    "whole": {"tokenizer": (0.25, 1.0e-3), "tma": (0.15, 5.0e-4), "gpt": (0.60, 5.0e-4)},
-    "lora": {"tokenizer": (0.25, 1.0e-3), "tma": (0.15, 5.0e-4), "gpt": (0.60, 1.0e-3)},
+    "tuned": {"tokenizer": (0.25, 1.0e-3), "tma": (0.15, 5.0e-4), "gpt": (0.60, 5.0e-4)},
 }
 """Arm -> training -> its share of the time, and its learning rate."""
 BATCH = {"tokenizer": 32, "tma": 32, "gpt": 16}
@@ -151,7 +150,6 @@ def arm_recipe(
         length = {"steps": steps[name], "batch_size": BATCH[name]}
         stages[name]["train"] = {**length, "checkpoint_every": every, "validate_every": every}
     stages["gpt"]["loss"] = {"align_weight": 0.0}
-    stages["gpt"]["lora"] = {"rank": args.rank} if arm == "lora" else None
     return {**recipe, "stages": stages_of(stages, read, text)}
 
 
@@ -180,19 +178,19 @@ def train_arm(recipe: dict[str, Any], folder: Path) -> dict[str, float]:
 
 
 def costs(args: argparse.Namespace) -> dict[str, float]:
-    """Processor seconds of a step of each training; "lora" of a GPT's adapters."""
+    """Processor seconds of a step of each training."""
     out: dict[str, float] = {}
-    for arm, name in (*(("whole", name) for name in STAGES), ("lora", "gpt")):
+    for name in STAGES:
         spent = []
         for steps in PROBE:
             folder = args.work / "probe"
-            recipe = arm_recipe(args, arm, 0, dict.fromkeys(STAGES, PROBE[0]) | {name: steps}, 1.0)
+            recipe = arm_recipe(args, "tuned", 0, dict.fromkeys(STAGES, PROBE[0]) | {name: steps}, 1.0)
             if name == "gpt":
                 train(folder, until="tma,tokens", **recipe)
             begin = process_seconds()
             train(folder, until=name, force=True, **recipe)
             spent.append(process_seconds() - begin)
-        out["lora" if arm == "lora" else name] = (spent[1] - spent[0]) / (PROBE[1] - PROBE[0])
+        out[name] = (spent[1] - spent[0]) / (PROBE[1] - PROBE[0])
     return out
 
 
@@ -200,8 +198,7 @@ def steps_of(args: argparse.Namespace, arm: str, cost: Mapping[str, float]) -> d
     """Steps that fill the time."""
     out = {}
     for name, (share, _) in ARMS[arm].items():
-        each = cost["lora" if arm == "lora" and name == "gpt" else name]
-        out[name] = max(20, round(args.seconds * share / each / 10) * 10)
+        out[name] = max(20, round(args.seconds * share / cost[name] / 10) * 10)
     return out
 
 
@@ -237,7 +234,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--rates", type=float, nargs="+", default=[0.3, 1.0, 3.0])
     parser.add_argument("--search-seed", type=int, default=100)
-    parser.add_argument("--rank", type=int, default=16)
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     parser.add_argument("--tested", type=int, default=0, help="test clips to generate for; 0 for all")
     parser.add_argument("--top-p", type=float, default=0.95)

@@ -185,7 +185,6 @@ def _take(
         average = AveragedWeights(net, config.train.ema)
         average.load_state_dict(content["average"])
         average.fill(net)
-    kind.trained(config, net)
     home.mkdir(parents=True)
     save_model(home, net, facts)
     rows = json.loads(content["log"]["rows"])

@@ -20,7 +20,6 @@ from torch import nn
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank
-from motionloom.models.training.lora import trained_share
 from motionloom.pipeline.contract.lookup import outside_stage
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.contract.stage import (
@@ -127,9 +126,6 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     def prepare(self, config: C, net: N, inputs: I) -> None:
         """Set what the network takes over from other stages before training: statistics, weights."""
 
-    def trained(self, config: C, net: N) -> None:
-        """Turn the trained network, in place, into what is saved."""
-
     def loaded(self, net: N, facts: ModelFacts, inputs: I) -> object:
         """Return the output for other stages: the trained network, frozen, or an object around it."""
         return net
@@ -185,12 +181,8 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         hyper = hyper_parameters(self.name, config, seed, context.inputs, context.folder)
         module.save_hyperparameters(hyper)
         batches = self.batches(config, net, inputs, seed, log)
-        part, whole = trained_share(net)
-        if part < whole:
-            log(f"{part:,} of {whole:,} parameters are trained ({part / whole:.1%})")
         fit(context, module, config.train, batches.train, batches.validation)
         if rank() == 0:
-            self.trained(config, net)
             save_model(context.folder, net, facts)
 
     def _fill(self, net: N, path: Path) -> None:

@@ -13,7 +13,6 @@ from torch import Tensor
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
-from motionloom.models.training.lora import LoraConfig, add_lora, merge_lora, require_peft
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs, Stage, filled_by, register
@@ -56,20 +55,10 @@ class GptStageConfig(TrainedStageConfig):
     """Train on the face captions."""
     min_frames: int = Field(16, ge=1)
     """Captions about fewer frames are left out where the clip has a longer one."""
-    lora: LoraConfig | None = None
-    """Train adapters beside the weights that `inputs.start` brings; null trains all. What is saved is one
-    network of plain weights either way."""
 
     def require_fit(self, hardware: Hardware) -> None:
-        """Reject settings that compile and FSDP do not support: sampling inside the loss, and LoRA."""
+        """Reject what compile and FSDP do not support: sampling inside the loss."""
         super().require_fit(hardware)
-        if self.lora is not None:
-            require_peft()
-            if self.train.compile or self.train.strategy == "fsdp":
-                raise UserError(
-                    "lora trains adapters, which train.compile and train.strategy fsdp do not know; set "
-                    "compile: false and strategy: ddp, or lora: null"
-                )
         if self.aligned_on_samples and (self.train.compile or self.train.strategy == "fsdp"):
             raise UserError(
                 "loss.align_on samples draws motions token by token, which train.compile and train.strategy "
@@ -137,10 +126,8 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     def module(
         self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int
     ) -> StageModule:
-        if config.lora is not None:
-            add_lora(net, config.lora)
         module = super().module(config, net, inputs, seed)
-        module.compilable = config.lora is None and not config.aligned_on_samples
+        module.compilable = not config.aligned_on_samples
         return module
 
     def module_settings(
@@ -150,10 +137,6 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         if not config.aligned or inputs.tma is None:
             return {"loss": config.loss}
         return {"loss": config.loss, "tokenizer": inputs.tokenizer.net, "tma": inputs.tma.net}
-
-    def trained(self, config: GptStageConfig, net: InterleavedGPT) -> None:
-        if config.lora is not None:
-            merge_lora(net)
 
     def batches(
         self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int, log: Log
@@ -185,10 +168,8 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         return token_batches(net, clips_of, data.held_out().split, seed, tables)
 
     def dry_module(self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs) -> StageModule:
-        """Without the judge of sampled motions, which keeps nothing for the backward pass, and without
-        adapters, which peft cannot make of tensors without values: a bound from above.
-        """
-        module = self.module(config.model_copy(update={"lora": None}), net, inputs, seed=0)
+        """Without the judge of sampled motions, which keeps nothing for the backward pass."""
+        module = self.module(config, net, inputs, seed=0)
         if config.aligned_on_samples:
             module.tokenizer = None  # type: ignore[assignment]
         return module
@@ -243,11 +224,6 @@ def _its_own(start: Stage, wrong: list[str]) -> str:
 
 def require_start(stage: Stage, others: Mapping[str, Stage]) -> None:
     """A GPT can go on from another's weights where both are one network that reads and writes the same."""
-    if stage.config.lora is not None and START not in stage.inputs:
-        raise UserError(
-            f"stage '{stage.name}' has lora and no trained GPT to add adapters to; name one in "
-            f"stages.{stage.name}.inputs.{START}, or set lora: null"
-        )
     start = others.get(stage.inputs.get(START, ""))
     if start is None:
         return

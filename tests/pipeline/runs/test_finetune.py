@@ -42,7 +42,7 @@ stages:
     net: {{reset_below: 0.01}}
     train: {{steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}}
   tma: {{train: {{steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}}}}
-  gpt: {{lora: {{rank: 4}}, train: {{steps: 6, batch_size: 4, checkpoint_every: 2, validate_every: 4}}}}
+  gpt: {{train: {{steps: 6, batch_size: 4, checkpoint_every: 2, validate_every: 4}}}}
 """
 
 
@@ -105,13 +105,12 @@ def test_stages_are_those_of_the_model(mine: Mine) -> None:
 
 
 def test_what_is_left_out_is_the_models_own(mine: Mine, tmp_path: Path) -> None:
-    recipe = mine.load("tokenizer=null", "tma=null", "gpt.lora=null")
+    recipe = mine.load("tokenizer=null", "tma=null")
     inputs = recipe.stage("gpt").inputs
     for role in ("tokenizer", "tma"):
         assert Path(inputs[role]).resolve() == mine.exported / role
         assert role not in [stage.name for stage in recipe.stages]
     assert Path(recipe.stage("evaluate").inputs["tokenizer"]).resolve() == mine.exported / "tokenizer"
-    assert recipe.stage("gpt").config.lora is None
     recipe = mine.load()  # resolved, it is the same without a start
     (tmp_path / "again.yaml").write_text(recipe.to_yaml())
     assert "\nstart:" not in recipe.to_yaml()
@@ -132,7 +131,6 @@ def test_what_is_left_out_is_the_models_own(mine: Mine, tmp_path: Path) -> None:
         (["text.encoder=another"], "'tma' starts from .* captions of another text encoder"),
         (["stages.face_gpt={}"], "stages.face_gpt has no kind, and start .* has no 'face_gpt' to go on from"),
         (["stages.stats={kind: stats}"], "'tokenizer' starts .* differs in inputs.stats; .*model/stats}"),
-        (["gpt.inputs={start: null}"], "has lora and no trained GPT to add adapters to"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_before_anything_runs(mine: Mine, sets: list[str], says: str) -> None:
@@ -153,7 +151,7 @@ def test_a_run_is_gone_on_from_and_exported_with_the_stages_of_the_other(
     mine: Mine, small_run: Any, tmp_path: Path
 ) -> None:
     other = Path(shutil.copytree(small_run.folder, tmp_path / "other"))
-    sets = [f"start={other}", "tokenizer=null", "tma=null", "gpt.lora=null", "gpt.optim.lr=1e-9"]
+    sets = [f"start={other}", "tokenizer=null", "tma=null", "gpt.optim.lr=1e-9"]
     sets += ["gpt.optim.warmup_steps=0", "gpt.train.steps=1"]
     run = run_recipe(
         mine.recipe, tmp_path / "run", overrides=sets, select=Selection(until="gpt"), console=QUIET
@@ -177,27 +175,13 @@ def test_a_ude_is_refused(ude_run: Any, mine: Mine) -> None:
         mine.load(f"start={ude_run.folder}")
 
 
-@pytest.fixture(scope="module")
-def trained(mine: Mine, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The whole way to a GPT, a few steps each."""
-    pytest.importorskip("peft", reason="peft is not installed (the extra `lora`)")
-    run = tmp_path_factory.mktemp("trained") / "run"
-    with (run.parent / "out.txt").open("w") as out:
-        console = Console(file=out, width=200)
-        run_recipe(mine.recipe, run, select=Selection(until="gpt"), console=console)
-    return run
-
-
-def test_it_trains_adapters_and_leaves_plain_weights(mine: Mine, trained: Path, tmp_path: Path) -> None:
-    said = (trained.parent / "out.txt").read_text()
-    assert "parameters are trained (" in said and said.count("parameters are trained") == 1
+def test_it_trains_every_weight_and_exports_the_models_face(mine: Mine, tmp_path: Path) -> None:
+    trained = run_recipe(mine.recipe, tmp_path / "run", select=Selection(until="gpt"), console=QUIET)
     before, after = (
         load_file(p / "model.safetensors") for p in (mine.exported / "gpt", trained / "stages/gpt")
     )
     assert before.keys() == after.keys()
-    moved = {name for name, value in after.items() if not torch.equal(value, before[name].float())}
-    ends = ("attention.qkv.weight", "attention.out.weight", "ff_in.weight", "ff_out.weight")
-    assert moved == {name for name in after if name.endswith(ends)}
+    assert not any(torch.equal(value, before[name].float()) for name, value in after.items())
     data = Data(trained / "stages/data").split("train")
     assert data.layout.name == "wholebody363" and data.layout.fps == 20
     # What its pages, commands and exports read: its own body, and the face of the model it started from.
@@ -224,15 +208,3 @@ def test_every_weight_comes_from_the_export(mine: Mine, name: str) -> None:
     assert state.keys() == wanted.keys()
     for key, value in wanted.items():
         torch.testing.assert_close(state[key], value.to(state[key].dtype), rtol=0, atol=0)
-
-
-def test_a_killed_training_of_adapters_ends_with_the_same_bytes(
-    mine: Mine, trained: Path, tmp_path: Path
-) -> None:
-    run = Path(shutil.copytree(trained, tmp_path / "run"))
-    gpt = run / "stages/gpt"
-    for name in ("artifact.json", "model.json", "model.safetensors", "checkpoints/step=00000006.ckpt"):
-        (gpt / name).unlink()
-    run_recipe(mine.recipe, run, select=Selection(until="gpt"), console=QUIET)
-    for name in ("model.safetensors", "metrics.jsonl"):
-        assert (gpt / name).read_bytes() == (trained / "stages/gpt" / name).read_bytes()
