@@ -11,7 +11,6 @@ from .inference.motion import joined as joined
 from .inference.outputs import write_motions as write_motions
 from .inference.stream import MotionStream as MotionStream
 from .inference.writers import Writer as Writer
-from .results.compare.command import compare_runs as compare_runs
 from .results.paper.compare import compare_with_paper as compare_with_paper
 from .runs.api import evaluate_run as evaluate_run
 from .runs.api import export_run as export_run

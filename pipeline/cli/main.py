@@ -306,25 +306,6 @@ def report(
 
 
 @app.command()
-def compare(
-    run_folders: Annotated[
-        list[Path], typer.Argument(metavar="RUN RUN...", help="Two run folders or more, finished or not.")
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The page.")] = Path("compare.html"),
-) -> None:
-    """Several runs on one page: settings that differ, figures side by side, training curves over each other.
-
-    The best of a figure is marked among runs that were measured alike. Nothing is computed again, and
-    unfinished runs show what they have.
-
-    Example: `motionloom compare runs/humantomato-tiny runs/second -o compare.html`
-    """
-    from motionloom.pipeline.results.compare.command import compare_runs
-
-    compare_runs(run_folders, out, console=make_console())
-
-
-@app.command()
 def export(
     run_folder: RunFolder,
     out: Annotated[Path, typer.Option("--out", "-o", help="New folder.")] = Path("exported"),

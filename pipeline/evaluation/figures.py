@@ -1,6 +1,6 @@
 """A figure: one number that was measured, with all that one must know to read it.
 
-An evaluation writes a list of them (`metrics.json`). The terminal, the report, `compare`, the papers' tables
+An evaluation writes a list of them (`metrics.json`). The terminal, the report, the papers' tables
 and JSON output filter that list; none of them knows a metric by name. Numpy is not imported here, so that
 reading takes no time.
 
@@ -235,46 +235,26 @@ def figures_in(folder: Path) -> dict[str, Any]:
     }
 
 
-def of_group(figures: Iterable[Figure]) -> dict[str, list[Figure]]:
-    """Figures by group, in order."""
-    out: dict[str, list[Figure]] = {}
-    for figure in figures:
-        out.setdefault(figure.group, []).append(figure)
-    return out
-
-
-def rows_of(figures: Iterable[Figure]) -> dict[str, dict[str, Figure]]:
-    """Row -> name -> figure, rows in the order of `ROWS`."""
-    out: dict[str, dict[str, Figure]] = {}
-    for figure in figures:
-        out.setdefault(figure.row, {})[figure.name] = figure
-    return dict(sorted(out.items(), key=lambda item: ROWS.index(item[0]) if item[0] in ROWS else len(ROWS)))
-
-
-def columns_of(figures: Iterable[Figure]) -> dict[str, Figure]:
-    """Name -> a figure of that column, in order."""
-    out: dict[str, Figure] = {}
-    for figure in figures:
-        out.setdefault(figure.name, figure)
-    return out
-
-
 def figure_tables(figures: Iterable[Figure]) -> list[TableRows]:
     """A table for each group of figures; the terminal and the report show the same ones."""
-    return [_table(group, members) for group, members in of_group(figures).items()]
+    groups: dict[str, list[Figure]] = {}
+    for figure in figures:
+        groups.setdefault(figure.group, []).append(figure)
+    return [_table(group, members) for group, members in groups.items()]
 
 
 def _table(group: str, figures: Sequence[Figure]) -> TableRows:
-    columns = columns_of(figures)
+    columns: dict[str, str] = {}
+    found: dict[str, dict[str, Figure]] = {}
+    for one in figures:
+        unit = "" if one.unit in ("", "share") else f", {one.unit}"
+        columns.setdefault(one.name, f"{one.title}{unit}")
+        found.setdefault(one.row, {})[one.name] = one
     rows = [
-        [
-            row if row != MODEL else "model",
-            *(row_figures[name].text() if name in row_figures else "" for name in columns),
-        ]
-        for row, row_figures in rows_of(figures).items()
+        [row or "model", *(found[row][name].text() if name in found[row] else "" for name in columns)]
+        for row in sorted(found, key=lambda row: ROWS.index(row) if row in ROWS else len(ROWS))
     ]
-    titles = [heading(one) for one in columns.values()]
-    return "; ".join([group, *remarks(figures)]), ["", *titles], rows
+    return "; ".join([group, *_remarks(figures)]), ["", *columns.values()], rows
 
 
 def print_tables(figures: Iterable[Figure], console: Console) -> None:
@@ -300,12 +280,7 @@ def say_difference(protocols: Mapping[str, Protocol]) -> str:
     return f"Not all measured alike, so not all ranked: {', '.join(parts)}." if parts else ""
 
 
-def heading(column: Figure) -> str:
-    """The title of a column with its unit."""
-    return f"{column.title}, {column.unit}" if column.unit not in ("", "share") else column.title
-
-
-def remarks(figures: Sequence[Figure]) -> list[str]:
+def _remarks(figures: Sequence[Figure]) -> list[str]:
     """Remarks on a group of figures: clips, candidates, intervals, and notes on figures not to be trusted."""
     protocol = figures[0].protocol
     out = (

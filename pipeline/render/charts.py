@@ -25,24 +25,16 @@ COLOURS = 8
 
 @dataclass(frozen=True)
 class Line:
-    """One curve: x and y [K]; points that are not finite are left out; `dashed` sets validation off.
-
-    Curves take the eight colours in turn, or the `colour` they are given.
-    """
+    """One curve: x and y [K]; points that are not finite are left out; `dashed` sets validation off."""
 
     name: str
     x: ArrayLike
     y: ArrayLike
     dashed: bool = False
-    colour: int | None = None
 
 
 def log_lines(
-    rows: Sequence[Mapping[str, float]],
-    figure: str,
-    name: str,
-    colour: int | None = None,
-    splits: tuple[str, str] = ("train", "val"),
+    rows: Sequence[Mapping[str, float]], figure: str, name: str, splits: tuple[str, str] = ("train", "val")
 ) -> list[Line]:
     """A figure of a training log, that of the second split dashed; nothing where it was not logged."""
     out = []
@@ -50,7 +42,7 @@ def log_lines(
         points = [(row["step"], row[f"{split}/{figure}"]) for row in rows if f"{split}/{figure}" in row]
         if points:
             steps, values = zip(*points, strict=True)
-            out.append(Line(f"{name} ({split})", steps, values, split == splits[1], colour))
+            out.append(Line(f"{name} ({split})", steps, values, split == splits[1]))
     return out
 
 
@@ -72,7 +64,7 @@ def line_chart(lines: Sequence[Line], *, x_label: str = "step", y_label: str = "
     parts = _axes(x_axis, y_axis, x_label, y_label)
     hover = []
     for index, (line, (x, y)) in enumerate(zip(lines, curves, strict=True)):
-        colour = (index if line.colour is None else line.colour) % COLOURS
+        colour = index % COLOURS
         if len(x) > 2 * STRETCHES:
             keep = {0, len(x) - 1}
             for stretch in np.array_split(np.arange(len(x)), STRETCHES):
@@ -196,7 +188,7 @@ def _legend(lines: Sequence[Line]) -> str:
     if len(lines) < 2:
         return ""
     marks = "".join(
-        f'<span><i class="key s{(k if line.colour is None else line.colour) % COLOURS}'
+        f'<span><i class="key s{k % COLOURS}'
         f'{" dashed" if line.dashed else ""}"></i>'
         f"{escape(line.name)}</span>"
         for k, line in enumerate(lines)

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
 from numpy.typing import ArrayLike
 
 from motionloom.datasets.base.files import write_text
-from motionloom.pipeline.render.charts import COLOURS, Line, histogram, line_chart
+from motionloom.pipeline.render.charts import Line, histogram, line_chart
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     fill,
@@ -27,25 +26,7 @@ from motionloom.pipeline.render.viewer import (
     viewer_script,
 )
 
-
-@dataclass(frozen=True)
-class Cell:
-    """A table's cell that is more than its text."""
-
-    text: str
-    colour: int | None = None
-    """Shows a curve's colour before the text."""
-    best: bool = False
-    maybe: bool = False
-    """The best, but not for sure."""
-    soft: bool = False
-    """Beside the point: what a figure is compared with."""
-
-    def __str__(self) -> str:
-        return self.text
-
-
-Value = str | float | int | Cell | None
+Value = str | float | int | None
 SHORT = 24
 """Columns whose cells have no more letters than this are not broken into lines."""
 
@@ -87,7 +68,7 @@ class Page:
 
     def add_table(
         self,
-        columns: Sequence[str | Cell],
+        columns: Sequence[str],
         rows: Sequence[Sequence[Value]],
         caption: str = "",
         digits: int = 3,
@@ -226,14 +207,6 @@ def _is_number(value: Value) -> bool:
 def _cell(value: Value, digits: int) -> str:
     if value is None:
         return "–"
-    if isinstance(value, Cell):
-        key = "" if value.colour is None else f'<i class="key s{value.colour % COLOURS}"></i>'
-        text = escape(value.text)
-        if value.maybe:
-            return f'{key}<strong>{text}</strong> <span class="best" title="best mean, not for sure">☆</span>'
-        if value.best:
-            return f'{key}<strong>{text}</strong> <span class="best" title="best of those compared">★</span>'
-        return f'{key}<span class="soft">{text}</span>' if value.soft else f"{key}{text}"
     if isinstance(value, float):
         return escape(
             f"{value:.{digits}f}" if 1e-3 <= abs(value) < 1e5 or value == 0 else f"{value:.{digits}g}"

@@ -1,8 +1,7 @@
 """A run read from its files alone: its finished stages and how far the others are.
 
 No stage is loaded and torch is not imported. Everything that reads a run begins here: `contract/lookup.py`
-makes stages of these records that can be loaded, the report, `compare` and the papers' tables take them as
-they are.
+makes stages of these records that can be loaded, the report and the papers' tables take them as they are.
 """
 
 from __future__ import annotations
@@ -131,8 +130,6 @@ class StageState:
     settings: Mapping[str, object]
     """Settings that made a finished stage; else those of the recipe."""
     progress: Progress
-    inputs: Mapping[str, object] = field(default_factory=dict)
-    """Roles that its recipe fills otherwise than by their names."""
     why: str = ""
     """Reason why a finished stage is outdated."""
     artifact: Artifact | None = None
@@ -169,12 +166,7 @@ class RunState:
     folder: Path
     recipe: str
     seed: int | None
-    data_seed: int | None
-    hardware: Mapping[str, object]
     stages: tuple[StageState, ...]
-
-    def stage(self, name: str) -> StageState | None:
-        return next((stage for stage in self.stages if stage.name == name), None)
 
     @property
     def unfinished(self) -> list[StageState]:
@@ -186,14 +178,12 @@ def run_state(run: Path) -> RunState:
     require_run(run)
     entries = stages_of(run)
     recipe = read_yaml(run / "recipe.yaml")
-    seed, data_seed = recipe.get("seed"), recipe.get("data_seed")
+    seed = recipe.get("seed")
     changes: dict[Path, Changed | None] = {}
     return RunState(
         folder=run,
         recipe=str(recipe.get("name", run.name)),
         seed=seed if isinstance(seed, int) else None,
-        data_seed=data_seed if isinstance(data_seed, int) else None,
-        hardware=_mapping(recipe.get("hardware")),
         stages=tuple(_stage(run, name, entry, changes) for name, entry in entries.items()),
     )
 
@@ -219,7 +209,6 @@ def _stage(
         folder=folder,
         settings=settings,
         progress=progress,
-        inputs=_mapping(entry.get("inputs")),
         why=why,
         artifact=artifact,
         step=int(rows[-1]["step"]) if rows else (0 if progress == "started" and steps else None),

@@ -22,31 +22,20 @@ from motionloom.pipeline.evaluation.figures import (
 )
 
 
-def write_run(
-    run: Path,
-    stages: Mapping[str, Mapping[str, Any]],
-    *,
-    seed: int = 0,
-    facts: Mapping[str, Any] | None = None,
-) -> Path:
-    """A run of `stages`: name -> kind, config, inputs (role -> stage), figures, log; in this order.
+def write_run(run: Path, stages: Mapping[str, Mapping[str, Any]]) -> Path:
+    """A run of `stages`: name -> kind, config, inputs (role -> stage), figures; in this order.
 
-    A stage with `finished: False` stands in the recipe alone, with its log where it has begun. `facts` go
-    into the recipe.
+    A stage with `finished: False` stands in the recipe alone.
     """
     run.mkdir(parents=True, exist_ok=True)
     entries = {name: {"kind": stage["kind"], **stage.get("config", {})} for name, stage in stages.items()}
-    recipe = {"name": run.name, **(facts or {}), "stages": entries}
+    recipe = {"name": run.name, "stages": entries}
     (run / "recipe.yaml").write_text(yaml.safe_dump(recipe, sort_keys=False))
     for name, stage in stages.items():
-        folder, finished = run / "stages" / name, stage.get("finished", True)
-        if finished or "log" in stage:
-            folder.mkdir(parents=True)
-        if "log" in stage:
-            (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in stage["log"]))
-            (folder / "started.json").write_text(json.dumps({"fingerprint": f"of-{name}"}))
-        if not finished:
+        if not stage.get("finished", True):
             continue
+        folder = run / "stages" / name
+        folder.mkdir(parents=True)
         inputs = {
             role: {"stage": source, "fingerprint": f"of-{source}"}
             for role, source in stage.get("inputs", {}).items()
@@ -56,12 +45,11 @@ def write_run(
             "kind": stage["kind"],
             "version": 1,
             "fingerprint": f"of-{name}",
-            "seed": seed,
+            "seed": 0,
             "config": stage.get("config", {}),
             "inputs": inputs,
         }
         (folder / "artifact.json").write_text(json.dumps(record))
-        (folder / "timing.json").write_text(json.dumps({"seconds": 61.0, "hardware": "an abacus"}))
         if "figures" in stage:
             stage["figures"].write(folder / FILE_NAME)
     return run
@@ -125,63 +113,3 @@ def by_text(
         "judges": {"tma": {"stage": "tma", "sha256": judge}},
     }
     return FigureFile("evaluate", tuple(out), about)
-
-
-def metrics(mpjpe: float = 50.0, r1: float = 0.5, half: float | None = 0.01, **protocol: Fact) -> FigureFile:
-    """A few figures; keywords change the protocol of those of generated motion."""
-    rebuilt: dict[str, Fact] = {"split": "test", "clips": 40, "clips_sha256": "r" * 64}
-    made: dict[str, Fact] = {
-        "split": "test", "clips": 40, "clips_sha256": "c" * 64, "lengths": "free", "repeats": 2,
-        "sampling.temperature": 1.0, "judge": "e" * 64, **protocol,
-    }  # fmt: skip
-    ranked = made | {"candidates": 8}
-    figures = [
-        figure("reconstruction.mpjpe", mpjpe, protocol=rebuilt, better="lower", unit="mm"),
-        figure("reconstruction.mpjpe", 200.0, row=STILL, protocol=rebuilt, better="lower", unit="mm"),
-        figure("reconstruction.mpjpe", 80.0, row=NEAREST, protocol=rebuilt, better="lower", unit="mm"),
-        figure("reconstruction.bits_per_second", 100.0, protocol=rebuilt),
-        figure("tma.t2m_r1", r1, half, protocol=ranked, group="precision", better="higher"),
-        figure("tma.t2m_r1", 0.9, row=RECORDED, protocol=ranked, group="precision", better="higher"),
-        figure("tma.t2m_r1", 0.125, row=CHANCE, protocol=ranked, group="precision", better="higher"),
-        figure("tma.matching_score", 0.8, protocol=ranked, group="precision", better="lower"),
-        figure("tma.fid", 3.0, protocol=made, group="spread", better="lower"),
-        figure("tma.diversity", r1, protocol=made, group="spread"),
-    ]
-    return FigureFile("evaluate", tuple(figures), {"stage": "evaluate", "split": "test"})
-
-
-def log(steps: int, start: float = 1.0) -> list[dict[str, float]]:
-    """Rows of a training that learns."""
-    rows: list[dict[str, float]] = [
-        {"step": step, "train/loss": start / step, "train/extra": 1.0} for step in range(10, steps + 1, 10)
-    ]
-    return [*rows, {"step": steps, "val/loss": start / steps}]
-
-
-def write_compared(
-    folder: Path,
-    *,
-    seed: int = 7,
-    stages: Mapping[str, Mapping[str, Any]] | None = None,
-    finished: tuple[str, ...] = ("data", "tokenizer", "evaluate"),
-    logs: Mapping[str, list[dict[str, float]]] | None = None,
-    figures: FigureFile | None = None,
-) -> Path:
-    """A run whose stages data, tokenizer and evaluate (or `stages`), each from the one before, have settings,
-    logs and figures.
-    """
-    entries = {
-        "data": {"kind": "synth", "clips": 40},
-        "tokenizer": {"kind": "h2vq", "train": {"steps": 100}, "net": {"width": 8}},
-        "evaluate": {"kind": "evaluate", "repeats": 2},
-    } | dict(stages or {})
-    written: dict[str, dict[str, Any]] = {}
-    for above, name in zip((None, *entries), entries, strict=False):
-        config = {key: value for key, value in entries[name].items() if key not in ("kind", "inputs")}
-        stage = {"kind": entries[name]["kind"], "config": config, "finished": name in finished}
-        stage |= {"inputs": {above: above}} if above else {}
-        stage |= {"log": logs[name]} if logs and name in logs else {}
-        stage |= {"figures": figures} if figures and entries[name]["kind"] == "evaluate" else {}
-        written[name] = stage
-    facts = {"name": "by-hand", "seed": seed, "hardware": {"devices": 0}}
-    return write_run(folder, written, seed=seed, facts=facts)

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, ROWS, Figure, Protocol, say_difference
-from motionloom.pipeline.results.compare.runs import run_labels
 from motionloom.pipeline.results.paper.evaluations import Evaluation, evaluations_of
 from motionloom.pipeline.results.paper.filled import (
     FilledRow,
@@ -37,6 +36,18 @@ def fill(name: str, table: PaperTable, runs: Sequence[Path] = ()) -> FilledTable
     return _Filling(name, table, runs).filled()
 
 
+def _labels(runs: Sequence[Path]) -> dict[Path, str]:
+    """Run -> the last name of its folder, and as many of those above as tell the runs apart."""
+    places = [run.resolve() for run in runs]
+    names = [str(place) for place in places]
+    for depth in range(1, max((len(place.parts) for place in places), default=0) + 1):
+        short = ["/".join(place.parts[-depth:]) for place in places]
+        if len(set(short)) == len(short):
+            names = short
+            break
+    return dict(zip(runs, names, strict=True))
+
+
 class _Filling:
     """A table being filled in."""
 
@@ -44,7 +55,7 @@ class _Filling:
         self.name, self.table = name, table
         runs = list(dict.fromkeys(runs))
         self.evaluations = {run: evaluations_of(run, table.measures) for run in runs if table.measures}
-        self.labels = dict(zip(runs, run_labels([run.resolve() for run in runs]), strict=True))
+        self.labels = _labels(runs)
         self.decimals = [self._decimals(at) for at in range(len(table.columns))]
         self.used: dict[tuple[Path, str], Evaluation] = {}
         self.compared: set[tuple[Path, str]] = set()

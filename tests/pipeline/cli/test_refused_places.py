@@ -25,7 +25,6 @@ def places(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished run, its shards and a BVH source, all free to change."""
     root = tmp_path_factory.mktemp("places")
     shutil.copytree(small_run.folder, root / "run")
-    shutil.copytree(small_run.folder, root / "other")
     shutil.copy(small_run.recipe, root / "small.yaml")
     shutil.copytree(small_run.folder / "stages" / "data" / "shards", root / "shards")
     (root / "mocap").mkdir()
@@ -54,7 +53,6 @@ WRITING: dict[str, Sequence[str]] = {
     ),
     "evaluate": ("evaluate", "{root}/run", "--clips", "4"),
     "report": ("report", "{root}/run", "--out", "{out}/page.html"),
-    "compare": ("compare", "{root}/run", "{root}/other", "--out", "{out}/page.html"),
     "table": ("evaluate", "--table", "humantomato/7", "{root}/run", "--out", "{out}/seven.md"),
     "export": ("export", "{root}/run", "--out", "{out}"),
     "data synth": ("data", "synth", "{out}", "--clips", "3", "--workers", "1"),

@@ -6,7 +6,6 @@ One process runs them in turn, from the lightest on, and says after each which l
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from typing import Any
@@ -31,7 +30,7 @@ for words in commands:
 """
 
 
-WITHOUT = ("version", "help", "run help", "convert help", "tables", "table of a run", "compare")
+WITHOUT = ("version", "help", "run help", "convert help", "tables", "table of a run")
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +39,6 @@ def imported(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[s
     shards = small_run.folder / "stages" / "data" / "shards"
     run = ["run", str(small_run.recipe), "--out", str(small_run.folder)]
     made = tmp_path_factory.mktemp("made")
-    twin = shutil.copytree(small_run.folder, made / "twin")
     commands = {
         "version": ["--version"],
         "help": ["--help"],
@@ -48,7 +46,6 @@ def imported(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[s
         "convert help": ["data", "convert", "bvh", "--help"],
         "tables": ["evaluate", "--table", "list"],
         "table of a run": ["evaluate", "--table", "humantomato/7", str(small_run.folder)],
-        "compare": ["compare", str(small_run.folder), str(twin), "-o", str(made / "page.html")],
         "check": ["data", "check", str(shards)],
         "info": ["info"],
         "nothing to do": run,

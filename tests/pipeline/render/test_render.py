@@ -23,7 +23,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.camera import FIELD_OF_VIEW, Camera, fit_distance
 from motionloom.pipeline.render.charts import Line, histogram, line_chart
 from motionloom.pipeline.render.film import write_mp4
-from motionloom.pipeline.render.page import Cell, Page
+from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.scene import LAMP, SKY, SOLE, Actor, Ground, cover, draw_figure
 from motionloom.pipeline.render.viewer import ViewerMotion, quantise, safe_json, viewer_script, write_viewer
 
@@ -249,31 +249,20 @@ def test_page_is_whole_and_escapes(tmp_path: Path, walk: Walk) -> None:
     assert "mountViewer" not in plain and len(plain) < 16_000
 
 
-# Charts and marked cells as HTML: right numbers, readable names, nothing unescaped.
+# Charts and folds as HTML: right numbers, readable names, nothing unescaped.
 
 MARKUP = '<b onclick="x">&'
 
 
-def test_cells_and_folds_of_a_page() -> None:
-    page = Page("t").add_table(
-        ["", Cell(MARKUP, colour=3)],
-        [["a", Cell(MARKUP, best=True)], ["b", Cell("2", soft=True)]],
-        pinned=True,
-    )
+def test_folds_of_a_page() -> None:
+    page = Page("t")
     with page.folded(MARKUP):
         for title in ("two", "three"):
             page.add_plot([Line("x", [1, 2], [1, 2])], title)
     body = page.html().split("<main>")[1].split("</main>")[0]
-    assert MARKUP not in body and body.count("★") == 1 and '<i class="key s3">' in body
+    assert MARKUP not in body
     assert body.count('<div class="plots">') == 1
     assert body.index("<details") < body.index("three") < body.index("</details>")
-
-
-def test_curves_take_the_colour_they_are_given() -> None:
-    html = line_chart([Line("a", [0, 1], [0, 1], colour=5), Line("b", [0, 1], [1, 0], dashed=True, colour=5)])
-    assert re.findall(r'polyline class="curve (s\d)"', html) == ["s5", "s5"]
-    assert re.findall(r'class="key (s\d)', html) == ["s5", "s5"]
-    assert re.findall(r"curve (s\d)", line_chart([Line("a", [0, 1], [0, 1])] * 2)) == ["s0", "s1"]
 
 
 def test_line_chart_keeps_spikes_and_drops_what_is_not_finite() -> None:

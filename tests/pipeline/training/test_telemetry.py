@@ -13,12 +13,20 @@ from rich.console import Console
 from tiny_adversaries import DIM, Duel, Vectors, train
 
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.stages.results.report_parts import draw_flights
 from motionloom.pipeline.store.run_state import RunState, StageState
 from motionloom.pipeline.store.training_log import read_flight, read_rows, read_training_log
 from motionloom.pipeline.training.telemetry import WaitTimes, waited_in_steps
 from motionloom.pipeline.training.utilization import Utilization, pass_flops
+
+
+@pytest.mark.parametrize(("rows", "words"), [('{"st', "not a training log"), ("7\n", "line 1 is")])
+def test_a_damaged_log_is_named(rows: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text(rows)
+    with pytest.raises(UserError, match=rf"metrics\.jsonl: {words}"):
+        read_training_log(tmp_path)
 
 
 def test_a_training_notes_speed_and_waits(tmp_path: Path) -> None:
@@ -134,7 +142,7 @@ def test_telemetry_and_profile_end_no_training(tmp_path: Path) -> None:
 
 def test_the_report_shows_speed_and_waits(tmp_path: Path) -> None:
     stages = tuple(StageState(name, "toy", tmp_path / name, {}, "finished") for name in ("data", "gpt"))
-    state, empty = RunState(tmp_path, "toys", 1, None, {}, stages), Page("title")
+    state, empty = RunState(tmp_path, "toys", 1, stages), Page("title")
     draw_flights(empty, state)
     assert "How the trainings ran" not in empty.html()
     for rank, waited in enumerate((0.1, 0.3)):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
+import run_records as records
 
 VQ = {"net": {"kind": "vq", "part": "bodyhand", "num_codes": 256}}
 RVQ = {"net": {"kind": "rvq", "part": "bodyhand", "num_codes": 512, "levels": 2}}
@@ -16,16 +15,8 @@ H2VQ = {"net": {"kind": "h2vq", "part": "bodyhand", "num_codes": 512}}
 GPT = {"face": False, "prior": "tma", "loss": {"align_weight": 0.1}}
 
 
-@pytest.fixture(scope="session")
-def records() -> Iterator[ModuleType]:
-    """The module that writes runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[2] / "helpers"))
-        yield importlib.import_module("run_records")
-
-
 @pytest.fixture
-def baselines(tmp_path: Path, records: ModuleType) -> Callable[..., Path]:
+def baselines(tmp_path: Path) -> Callable[..., Path]:
     """`baselines("name", data="synth")`: a run with several tokenizers, generators and evaluations."""
 
     def make(name: str = "bl", *, data: dict[str, Any] | None = None, judge: str = "a") -> Path:

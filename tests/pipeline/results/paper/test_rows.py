@@ -7,10 +7,10 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
+import run_records as records
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.evaluation.figures import CHANCE, STILL, TRAINING, FigureFile
@@ -79,7 +79,7 @@ def test_a_row_takes_the_figures_of_the_evaluation_of_its_model(baselines: Make)
 
 
 def test_answers_are_of_runs_that_have_a_row_and_equal_ones_stand_once(
-    baselines: Make, records: ModuleType, tmp_path: Path
+    baselines: Make, tmp_path: Path
 ) -> None:
     stages: dict[str, Any] = {
         "data": {"kind": "synth", "config": {"clips": 8}},
@@ -116,7 +116,7 @@ def test_generated_motion_beside_recorded_and_chance(baselines: Make) -> None:
     assert told["sampling"] == ("temperature 1.0", None)
 
 
-def test_only_what_was_measured_alike_is_ranked(baselines: Make, records: ModuleType, tmp_path: Path) -> None:
+def test_only_what_was_measured_alike_is_ranked(baselines: Make, tmp_path: Path) -> None:
     table = filled("humantomato/13", baselines("a"), baselines("b", judge="b"))
     assert set(ours(table)) == {"a gpt", "a temos", "b gpt", "b temos"}
     # Each within its own run, for another TMA judges the other.
@@ -133,7 +133,7 @@ def test_only_what_was_measured_alike_is_ranked(baselines: Make, records: Module
         assert ("temperature 0.0" in said) == ("sampling.temperature" in changed)
 
 
-def test_equal_figures_are_best_together_or_not_at_all(baselines: Make, records: ModuleType) -> None:
+def test_equal_figures_are_best_together_or_not_at_all(baselines: Make) -> None:
     run = baselines()
     for name, mpjpe in (("evaluate", 110.0), ("evaluate_vq", 140.0)):
         records.reconstruction(mpjpe).write(run / "stages" / name / "metrics.json")
@@ -142,7 +142,7 @@ def test_equal_figures_are_best_together_or_not_at_all(baselines: Make, records:
     assert best(filled("humantomato/7", run)) == {}
 
 
-def test_two_sizes_share_a_row(tmp_path: Path, records: ModuleType) -> None:
+def test_two_sizes_share_a_row(tmp_path: Path) -> None:
     def vq(codes: int) -> dict[str, Any]:
         return {"kind": "vq", "config": {"net": {"part": "bodyhand", "num_codes": codes}}}
 
@@ -165,7 +165,7 @@ def test_two_sizes_share_a_row(tmp_path: Path, records: ModuleType) -> None:
     ],
 )
 def test_columns_of_the_data_that_a_run_has(
-    kind: str, path: str | None, hands: bool, columns: list[int], tmp_path: Path, records: ModuleType
+    kind: str, path: str | None, hands: bool, columns: list[int], tmp_path: Path
 ) -> None:
     run = records.write_run(
         tmp_path / "run",
@@ -186,7 +186,7 @@ def test_columns_of_the_data_that_a_run_has(
         assert cells[6] == "60.00"
 
 
-def test_dances_and_texts_of_one_model_share_a_row(tmp_path: Path, records: ModuleType) -> None:
+def test_dances_and_texts_of_one_model_share_a_row(tmp_path: Path) -> None:
     made = [records.figure("movement.fid_k", 20.0, 1.0), records.figure("movement.div_m", 5.0)]
     dances = [*made, *(replace(one, row=STILL) for one in made)]
     stages: dict[str, Any] = {
@@ -224,7 +224,7 @@ def test_runs_of_one_name_are_told_apart_by_their_paths(baselines: Make) -> None
     }
 
 
-def retrieval(records: ModuleType, **about: Any) -> FigureFile:
+def retrieval(**about: Any) -> FigureFile:
     """What the command `retrieval` writes."""
     figures = []
     for name, size in (("A", 40), ("B", 40), ("C", 40), ("D", 32)):
@@ -236,11 +236,11 @@ def retrieval(records: ModuleType, **about: Any) -> FigureFile:
     return FigureFile("retrieval", tuple(figures), {"stage": "tma", **about})
 
 
-def test_retrieval_fills_by_protocol(baselines: Make, records: ModuleType) -> None:
+def test_retrieval_fills_by_protocol(baselines: Make) -> None:
     run = baselines()
     known = {name: stage.fingerprint for name, stage in finished_records(run).items()}
     for name, file in (("tma", "retrieval.json"), ("temos", "retrieval-temos.json")):
-        retrieval(records, stage=name, fingerprint=known[name]).write(run / file)
+        retrieval(stage=name, fingerprint=known[name]).write(run / file)
     table = filled("humantomato/12", run)
     found = [(row.method, row.label) for row in table.rows if row.source == "ours"]
     assert found == [(f"{p}, {m}", f"bl {m.lower()}") for p in "ABCD" for m in ("TEMOS", "TMA")]
@@ -251,17 +251,15 @@ def test_retrieval_fills_by_protocol(baselines: Make, records: ModuleType) -> No
         ({"fingerprint": "of another TMA"}, "measured by another 'tma' than is there now"),
         ({"stage": "gone"}, "not a record of motionloom retrieval on this run"),
     ):
-        retrieval(records, **about).write(run / "retrieval.json")
+        retrieval(**about).write(run / "retrieval.json")
         with pytest.raises(UserError, match=rf"retrieval\.json: {message}"):
             filled("humantomato/12", run)
 
 
 @pytest.mark.parametrize("number", [20, 21])
-def test_retrieval_by_the_evaluator_fills_the_rows_of_guo(
-    number: int, tmp_path: Path, records: ModuleType
-) -> None:
+def test_retrieval_by_the_evaluator_fills_the_rows_of_guo(number: int, tmp_path: Path) -> None:
     run = records.write_run(tmp_path / "g", {"guo": {"kind": "guo_evaluator"}})
-    retrieval(records, stage="guo", fingerprint="of-guo").write(run / "retrieval.json")
+    retrieval(stage="guo", fingerprint="of-guo").write(run / "retrieval.json")
     table = filled(f"humantomato/{number}", run)
     rows = [(row.method, texts(row)[0]) for row in table.rows if row.source == "ours"]
     assert [method.startswith("Guo et al. (2022)") for method, _ in rows] == [True, True]
@@ -306,7 +304,7 @@ def test_conditions() -> None:
         assert fits(inputs={"tokenizer": {"kind": "vq", "where": where}}) is fit
 
 
-def test_what_a_run_lacks_is_one_sentence(baselines: Make, tmp_path: Path, records: ModuleType) -> None:
+def test_what_a_run_lacks_is_one_sentence(baselines: Make, tmp_path: Path) -> None:
     run = baselines()
     with pytest.raises(UserError, match=re.escape(f"make one: motionloom retrieval {run}")):
         filled("humantomato/10", run)

@@ -1,4 +1,4 @@
-"""A run that was trained, whole and with stages taken away: its report and its place in a comparison."""
+"""A run that was trained, whole and with stages taken away: its report."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from motionloom.pipeline.evaluation.figures import FigureFile
-from motionloom.pipeline.results.compare.runs import compared_tables, open_runs, setting_differences
 
 pytestmark = pytest.mark.slow
 
@@ -68,25 +67,3 @@ def test_the_report_of_an_unfinished_run(unfinished: Path, tmp_path: Path, call:
     assert done.code == 0, done.err
     text = text_of(bare / "report/report.html")
     assert "data: not run yet" in text and "0 of 15" in text and "Settings of every stage" in text
-
-
-def test_a_whole_and_an_unfinished_run_compared(
-    small_run: Any, unfinished: Path, tmp_path: Path, call: Callable[..., Any]
-) -> None:
-    twin = tmp_path / "twin"
-    shutil.copytree(small_run.folder, twin)
-    done = call("compare", small_run.folder, unfinished, twin, "-o", tmp_path / "page.html")
-    assert done.code == 0, done.err
-    assert re.search("gpt: .*12 of 30; face_gpt", done.out)
-    runs = open_runs([small_run.folder, unfinished, twin])
-    assert setting_differences(runs) == [], "one recipe made them"
-    mpjpe = FigureFile.read(small_run.folder / "stages/evaluate/metrics.json").of("reconstruction.mpjpe")
-    assert mpjpe is not None
-    tables = compared_tables(runs)
-    assert len(tables[0].rows) == 2 and not tables[0].difference
-    for row in tables[0].rows:
-        assert row.figures["reconstruction.mpjpe"].value == mpjpe.value
-        assert row.best == {}, "twins are equal"
-    titles = " ".join(table.title for table in tables)
-    for words in ("as the papers count", "faces", "TMA-R-Precision", "latents", "what its caption says"):
-        assert words in titles
