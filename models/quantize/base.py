@@ -70,9 +70,6 @@ class Codebook(Protocol):
 class LearntCodebook(nn.Module):
     """Base of codebooks learnt from data: buffers, first codes drawn from a batch, nearest codes, freezing.
 
-    A vector that is not finite counts as padding: a float16 overflow costs the optimizer one step, which the
-    gradient scaler leaves out, and must not stay in the codebook for good.
-
     Args:
         codebook: First codes [K, d], a parameter where it is learnt by gradient.
         initialised: False has the first training batch replace them.
@@ -117,9 +114,7 @@ class LearntCodebook(nn.Module):
         with torch.autocast(z.device.type, enabled=False):
             full = z.to(self._wide(z.dtype))
             rows = full.detach().reshape(-1, full.shape[-1])
-            real = rows.isfinite().all(1)
-            if mask is not None:
-                real = real & mask.reshape(-1)
+            real = torch.ones_like(rows[:, 0], dtype=torch.bool) if mask is None else mask.reshape(-1)
             rows = rows.masked_fill(~real[:, None], 0.0)
             if update and not self._is_initialised:
                 self._initialise(rows, real)

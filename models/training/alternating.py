@@ -16,13 +16,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import torch
-from lightning.fabric import Fabric
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
-from torch.amp import GradScaler
 from torch.optim import Optimizer
 
 from motionloom.models.training.compiled import Compiled
@@ -119,7 +117,7 @@ class AlternatingModule(StageModule):
             raise ValueError("a parameter belongs to two groups")
         self._turns = []
         for group, params in zip(groups, trained, strict=True):
-            optimizer = group.optim.build(params, fused=self.fused)
+            optimizer = group.optim.build(params)
             schedule = StepSchedule(optimizer, partial(group.factor, max_steps=self.max_steps))
             self._turns.append(_Turn(group, params, optimizer, schedule))
         return [
@@ -148,8 +146,7 @@ class AlternatingModule(StageModule):
 
     def _take_turns(self, parts: list[Batch]) -> Tensor:
         shared: list[dict[str, Tensor]] = [{} for _ in parts]
-        scaler = self._scaler()
-        self.gauges, first, stepped = {}, None, False
+        self.gauges, first = {}, None
         for number, turn in enumerate(self._turns):
             if not turn.group.steps_at(self.step):
                 continue
@@ -161,9 +158,7 @@ class AlternatingModule(StageModule):
                     first = loss if first is None else first
                 # Outside of autocast, as the steps of one optimizer are.
                 with torch.autocast(self.device.type, enabled=False):
-                    stepped |= self._step_of(turn, scaler)
-        if scaler is not None and stepped:
-            scaler.update()
+                    self._step_of(turn)
         return torch.zeros(()) if first is None else first
 
     def _backward(
@@ -178,29 +173,17 @@ class AlternatingModule(StageModule):
             self.manual_backward(values["loss"] / self.accumulate)
         return values["loss"].detach()
 
-    def _step_of(self, turn: _Turn, scaler: GradScaler | None) -> bool:
-        """A group's step with the gradients that it has; False if it has none."""
+    def _step_of(self, turn: _Turn) -> None:
+        """A group's step with the gradients that it has, if any."""
         group, optimizer = turn.group, turn.optimizer
         mean_gradients(turn.params)
         if all(param.grad is None for param in turn.params):
-            return False
+            return
         rate = turn.schedule.set_step(self.step)
-        if scaler is not None:
-            scaler.unscale_(optimizer)
         norm = self.clip(turn.params, group.optim.grad_clip)
         if norm is not None:
             self.gauges |= {f"lr/{group.name}": rate, f"grad_norm/{group.name}": norm}
-        if scaler is None:
-            optimizer.step()
-        else:
-            scaler.step(optimizer)
-        return True
-
-    def _scaler(self) -> GradScaler | None:
-        """The loss scaler of float16, which alone needs one."""
-        if self._trainer is not None:
-            return getattr(self._trainer.precision_plugin, "scaler", None)
-        return getattr(cast(Fabric, self.fabric).strategy.precision, "scaler", None)
+        optimizer.step()
 
     @contextmanager
     def _alone_trains(self, turn: _Turn) -> Iterator[None]:

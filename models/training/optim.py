@@ -30,10 +30,10 @@ class OptimConfig(Config):
     grad_clip: float = Field(1.0, ge=0)
     """Largest gradient norm; 0 turns clipping off."""
 
-    def build(self, params: Sequence[nn.Parameter], *, fused: bool) -> Optimizer:
-        """The optimizer of these parameters; `fused` computes a step in one kernel."""
+    def build(self, params: Sequence[nn.Parameter]) -> Optimizer:
+        """Return the optimizer of these parameters, whose step is one kernel."""
         kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
-        return kind(params, lr=self.lr, betas=self.betas, weight_decay=self.weight_decay, fused=fused)
+        return kind(params, lr=self.lr, betas=self.betas, weight_decay=self.weight_decay, fused=True)
 
     def factor(self, step: int, max_steps: int) -> float:
         """Return the factor of `lr` in step `step` of `max_steps`: warm-up, then schedule and drops."""

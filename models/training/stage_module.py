@@ -26,6 +26,7 @@ from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from motionloom.datasets.schema import UserError
 from motionloom.models.layers.frozen import Frozen
 from motionloom.models.training.compiled import Compiled
 from motionloom.models.training.distributed import alone, rank
@@ -83,9 +84,6 @@ class StageModule(L.LightningModule, ABC):
         self._step = 0
         self.accumulate = 1
         """Parts that the batch of a step is cut into."""
-        self.fused = True
-        """Whether the optimizer is one kernel. False for "16-mixed": a fused step also removes the scale of
-        the gradients, and they could not be clipped before it."""
         self.gauges: dict[str, float | Tensor] = {}
         """Learning rate and gradient norm of the step that the newest row of the log ends with."""
         self.figures: list[StepFigures] = []
@@ -104,10 +102,11 @@ class StageModule(L.LightningModule, ABC):
         self._step = step
 
     def setup(self, stage: str) -> None:
-        """Take over what a Trainer decides: parts of a step, and no fused optimizer for "16-mixed"."""
+        """Take over the parts of a step from a Trainer."""
+        if self.trainer.precision == "16-mixed":
+            raise UserError("precision 16-mixed: losses are not scaled for float16; take bf16-mixed")
         if self.automatic_optimization:
             self.accumulate = self.trainer.accumulate_grad_batches
-        self.fused = self.trainer.precision != "16-mixed"
 
     def on_fit_start(self) -> None:
         """Have frozen networks follow this one to the Trainer's device."""
@@ -165,7 +164,7 @@ class StageModule(L.LightningModule, ABC):
     def configure_optimizers(self) -> list[OptimizerLRSchedulerConfig]:
         """Return the optimizer of the trainable parameters with its schedule, as Lightning takes them."""
         trained = [param for param in self.net.parameters() if param.requires_grad]
-        optimizer = self.optim_config.build(trained, fused=self.fused)
+        optimizer = self.optim_config.build(trained)
         self.schedule = StepSchedule(optimizer, partial(self.optim_config.factor, max_steps=self.max_steps))
         return [{"optimizer": optimizer, "lr_scheduler": {"scheduler": self.schedule, "interval": "step"}}]
 

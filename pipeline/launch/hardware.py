@@ -60,8 +60,6 @@ class Hardware(Config):
     been compared in this run as they are now, all each time a stage starts, or none."""
     loggers: tuple[LoggerName, ...] = ("csv",)
     """Where the figures of trainings go, besides `metrics.jsonl`; all but csv are extras of these names."""
-    profile: int = Field(0, ge=0)
-    """Steps of each training that torch's profiler looks at; 0 = none."""
 
     def resolved_accelerator(self) -> Literal["cpu", "gpu"]:
         if self.accelerator == "auto":

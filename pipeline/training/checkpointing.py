@@ -57,7 +57,6 @@ class Checkpoint(_Lightning):
     """Steps of the training that wrote it."""
     state_dict: dict[str, Tensor]
     optimizer_states: list[OptimizerState]
-    scaler: dict[str, object]
     average: dict[str, Tensor] | None
     log: LogState
     row: list[list[Means]]

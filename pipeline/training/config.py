@@ -47,10 +47,10 @@ class TrainConfig(Config):
     codebook is updated with every part (an average and resets over smaller batches), and so is the batch
     normalisation of `tm2t`'s critic. More processes instead of more parts change none.
     """
-    precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
+    precision: Literal["32-true", "bf16-mixed"] = "32-true"
     strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)
     """Distribution over processes: each holds the whole network (`ddp`), or a part of the weights, gradients
-    and optimizer state (`fsdp`: gpt stages, for networks that do not fit; not with compile or 16-mixed).
+    and optimizer state (`fsdp`: gpt stages, for networks that do not fit; not with compile).
     One process holds all; the results are the same."""
     compile: bool | None = None
     """Compile networks and losses with torch.compile, as one graph; null = on a GPU, where the network is
@@ -104,11 +104,6 @@ class TrainedStageConfig(StageConfig):
     def require_fit(self, hardware: Hardware) -> None:
         """The global batch must divide over the processes, and the arithmetic suit the device and FSDP."""
         self.train.local_batch(hardware.world())
-        if self.train.precision == "16-mixed" and hardware.resolved_accelerator() == "cpu":
-            raise UserError(
-                "train.precision 16-mixed is for GPUs, and this trains on a CPU; set train.precision: "
-                "bf16-mixed, or hardware.accelerator: gpu to plan for another machine"
-            )
         require_loggers(hardware.loggers)
         if self.train.strategy == "fsdp":
             self._require_shardable()
@@ -142,8 +137,6 @@ class TrainedStageConfig(StageConfig):
                 "train.ema averages whole weights and train.strategy fsdp keeps each in several processes; "
                 "set train.ema: null or strategy: ddp"
             )
-        if self.train.precision == "16-mixed":
-            raise UserError("train.strategy fsdp has no gradient scaler; set train.precision: bf16-mixed")
 
 
 def optimizers_of(config: BaseModel, prefix: str = "") -> Iterator[tuple[str, OptimConfig]]:

@@ -14,9 +14,7 @@ from lightning.fabric.strategies.ddp import DDPStrategy
 from lightning.fabric.strategies.model_parallel import ModelParallelStrategy
 from lightning.fabric.strategies.strategy import Strategy
 from torch import Tensor, nn
-from torch.amp import GradScaler
 from torch.distributed.device_mesh import DeviceMesh
-from torch.optim import Optimizer
 
 from motionloom.models.layers.transformer import Transformer
 from motionloom.models.training.sharding import sharded
@@ -27,8 +25,7 @@ from motionloom.pipeline.training.config import TrainConfig
 
 
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
-    """Apply the settings of the arithmetic: fused optimizer, accumulation, activation checkpoints."""
-    module.fused = config.precision != "16-mixed"
+    """Apply the settings of the arithmetic: accumulation and activation checkpoints."""
     module.accumulate = config.accumulate
     for part in module.modules():
         if isinstance(part, Transformer):
@@ -149,8 +146,6 @@ class Execution:
         self.model = fabric.setup_module(module, move_to_device=not cut)  # whole, it may not fit there
         module.to(fabric.device)
         self.optimizers = [one["optimizer"] for one in module.configure_optimizers()]
-        self.scaler: GradScaler | None = getattr(fabric.strategy.precision, "scaler", None)
-        """The loss scaler of float16, which alone needs one."""
 
     def take_step(self, parts: Iterable[Batch]) -> Tensor:
         """One training step on the parts of its batch; the loss of the last part."""
@@ -169,16 +164,7 @@ class Execution:
                 if automatic and loss is not None:
                     fabric.backward(loss / module.accumulate)
         if automatic:
-            self._step(self.optimizers[0])
+            module.configure_gradient_clipping(self.optimizers[0])
+            self.optimizers[0].step()
         module.step += 1
         return torch.zeros(()) if loss is None else loss.detach()
-
-    def _step(self, optimizer: Optimizer) -> None:
-        if self.scaler is None:
-            self.module.configure_gradient_clipping(optimizer)
-            optimizer.step()
-            return
-        self.scaler.unscale_(optimizer)
-        self.module.configure_gradient_clipping(optimizer)
-        self.scaler.step(optimizer)  # passes over a step whose gradients overflow
-        self.scaler.update()

@@ -63,12 +63,9 @@ class Failure:
         return f"in step {self.step} the loss is not finite ({terms})"
 
 
-def first_failure(module: StageModule, *, scaled: bool) -> Failure | None:
-    """Read and clear what the module has noted of its latest steps.
-
-    With a gradient scaler, steps whose gradients overflow are skipped and are no failure.
-    """
-    figures, norms = module.figures[:], [] if scaled else module.norms[:]
+def first_failure(module: StageModule) -> Failure | None:
+    """Read and clear what the module has noted of its latest steps."""
+    figures, norms = module.figures[:], module.norms[:]
     module.figures.clear()
     module.norms.clear()
     failures: list[Failure] = []
@@ -103,7 +100,7 @@ class FailureGuard:
         self.name, self.folder, self.module, self.data = name, folder, module, data
         self.console = console
 
-    def check(self, *, scaled: bool) -> None:
+    def check(self) -> None:
         """All ranks call this at the same steps.
 
         Raises:
@@ -111,7 +108,7 @@ class FailureGuard:
             TeamError: In the other ranks.
         """
         # The rank that failed first is the cause: the others got its gradient.
-        failure = first_failure(self.module, scaled=scaled)
+        failure = first_failure(self.module)
         orders = all_ranks([math.inf if failure is None else failure.order], self.module.device)[
             :, 0
         ].tolist()

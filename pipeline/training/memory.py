@@ -27,8 +27,6 @@ from motionloom.pipeline.training.execution import prepare_module
 _BYTES_A_PARAMETER = 16
 """Weight, gradient and two moments in float32."""
 
-_HALF = {"bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
-
 
 def model_card(
     make: Callable[[], tuple[StageModule, Batch, str]], train: TrainConfig, batch: int, hardware: Hardware
@@ -45,7 +43,7 @@ def model_card(
         trained = sum(p.numel() for p in _trained(module))
         buffers = sum(b.numel() * b.element_size() for b in module.net.buffers())
         books = [m for m in module.net.modules() if isinstance(m, EmaQuantizer)]
-        kept = _saved_bytes(module, example, _HALF.get(train.precision))
+        kept = _saved_bytes(module, example, half=train.precision == "bf16-mixed")
     copies = train.keep_checkpoints + (train.steps // train.keep_every if train.keep_every else 0)
     numbers = parameters + (3 if train.ema else 2) * trained
     # FSDP cuts weights, gradients and moments; activations it does not.
@@ -70,8 +68,8 @@ def _trained(module: StageModule) -> list[nn.Parameter]:
     return list({id(p): p for net in nets for p in net.parameters()}.values())
 
 
-def _saved_bytes(module: StageModule, inputs: Batch, half: torch.dtype | None) -> int:
-    """Bytes that the backward pass of one loss keeps, parameters apart; `half` is the type of autocast."""
+def _saved_bytes(module: StageModule, inputs: Batch, *, half: bool) -> int:
+    """Bytes that the backward pass of one loss keeps, parameters apart; `half` under autocast."""
     own = {p.untyped_storage()._cdata for p in module.parameters()}
     sizes: dict[int, int] = {}
 
@@ -83,6 +81,6 @@ def _saved_bytes(module: StageModule, inputs: Batch, half: torch.dtype | None) -
 
     module.train()
     hooks = torch.autograd.graph.saved_tensors_hooks(pack, lambda tensor: tensor)
-    with hooks, torch.autocast("cpu", dtype=half, enabled=half is not None):
+    with hooks, torch.autocast("cpu", dtype=torch.bfloat16, enabled=half):
         module.losses(inputs)["loss"]
     return sum(sizes.values())

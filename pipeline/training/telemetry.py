@@ -1,4 +1,4 @@
-"""Progress and telemetry of a training: the bar, and per rank speed, use, waits, a profile on request.
+"""Progress and telemetry of a training: the bar, and per rank speed, use and waits.
 
 A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, which the report draws.
 """
@@ -14,16 +14,14 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Literal
 
 import torch
 import torch.distributed as dist
 from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
-from torch.profiler import profile, schedule
 
-from motionloom.datasets.base.files import atomic_path, write_text
+from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.progress import Pace, bar
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
@@ -237,48 +235,6 @@ def _rss_mib() -> float:
     """The most memory this process has had so far."""
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most / 2**20 if sys.platform == "darwin" else most / 2**10
-
-
-# A profile by torch's profiler (`hardware.profile`).
-
-WARM_UP = 10
-"""Steps of a training before those that are profiled: kernels are chosen and caches filled in them."""
-
-
-class StepProfiler:
-    """Profiles `steps` steps after the first `WARM_UP`, or the last of a training with fewer steps `left`.
-
-    Each process leaves a trace in the stage's `flight/` folder, which Perfetto and Chrome open. No error in
-    it ends the training.
-    """
-
-    def __init__(self, name: str, folder: Path, steps: int, left: int, console: Console) -> None:
-        self.name, self.steps, self.console = name, min(steps, left), console
-        self.path = folder / FLIGHT / f"profile_rank_{rank()}.json.gz"
-        self._profile: profile | None = None
-        if not self.steps:
-            return
-        before = min(WARM_UP, left - self.steps)
-        warm = min(1, before)
-        phases = schedule(wait=before - warm, warmup=warm, active=self.steps, repeat=1)
-        self._profile = profile(schedule=phases, on_trace_ready=self._write, record_shapes=True)
-
-    def do(self, name: Literal["start", "step", "stop"]) -> None:
-        """Start, count a step, or stop."""
-        if self._profile is None:
-            return
-        with optional(f"profile of {self.name}", self.console):
-            getattr(self._profile, name)()
-            return
-        self._profile = None
-
-    def _write(self, done: profile) -> None:
-        with atomic_path(self.path) as temporary:
-            whole = temporary.with_name(f"{temporary.name}.json.gz")  # torch packs what is called so
-            done.export_chrome_trace(str(whole))
-            whole.replace(temporary)
-        line = f"    {self.name}: profile of {self.steps} steps in {self.path} (open it at ui.perfetto.dev)"
-        self.console.print(line, soft_wrap=True)
 
 
 _REDRAW = 0.1

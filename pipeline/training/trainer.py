@@ -54,7 +54,7 @@ from motionloom.pipeline.training.loaders import TrainingData, on_device
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
 from motionloom.pipeline.training.samples import SampleProcess
-from motionloom.pipeline.training.telemetry import StepProfiler, StepProgress, Telemetry
+from motionloom.pipeline.training.telemetry import StepProgress, Telemetry
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 
@@ -148,16 +148,12 @@ class Training:
         self.stall = StallTimer(
             context.folder / CRASHES / f"stalled_rank_{rank()}.txt", hardware.stall_seconds
         )
-        self.profiler = StepProfiler(
-            name, context.folder, hardware.profile, config.steps - module.step, console
-        )
 
     def run(self) -> None:
         self.log.open()
         self.progress = StepProgress(
             self.context.name, self.module.step, self.config.steps, self.context.console
         )
-        self.profiler.do("start")
         with Signals() as self.signals, self.stall.running():
             self.agreement = Agreement(self.signals, world_size())
             self.signals.ends_compiling = self._end_compiling
@@ -175,7 +171,6 @@ class Training:
             finally:
                 self.progress.close()
                 self.data.close()
-                self.profiler.do("stop")
         summary = self.telemetry.summary()
         if summary:
             self.context.console.print(f"    {self.context.name}: {summary}")
@@ -212,9 +207,8 @@ class Training:
         if self.average is not None:
             self.average.update(self.module.net)
         self.telemetry.end_step()
-        self.profiler.do("step")
         if self.failures.due(step):
-            self.failures.check(scaled=self.execution.scaler is not None)
+            self.failures.check()
         if step % LOG_EVERY == 0:
             self._log_row()
         self.progress.show(step, loss, self.telemetry.note)
@@ -244,7 +238,7 @@ class Training:
         """Losses on all held-out batches, their means weighted by rows; a signal ends it after a batch."""
         module, loader = self.module, self.data.held_out()
         # Weights that are not finite would make the validation a figure that nobody can read.
-        self.failures.check(scaled=self.execution.scaler is not None)
+        self.failures.check()
         # Frozen parts stay in evaluation: modes are restored part by part.
         modes = [(part, part.training) for part in module.modules()]
         module.eval()
@@ -295,7 +289,7 @@ class Training:
         if step == self._saved and not again:
             return
         # No checkpoint of a lost network, nor of other data than the training began with.
-        self.failures.check(scaled=self.execution.scaler is not None)
+        self.failures.check()
         self.shards.check(self.module.device)
         with self.telemetry.waits.waiting_for("checkpoints"):
             self._finish_writing()  # at most one copy of the state is in memory
@@ -315,7 +309,7 @@ class Training:
             self.samples.saved(self._saved)
 
     def _state(self) -> Checkpoint:
-        module, execution = self.module, self.execution
+        module = self.module
         return {
             "global_step": module.step,
             "steps": self.config.steps,
@@ -323,7 +317,6 @@ class Training:
             "optimizer_states": [
                 optimizer_state(module, optimizer) for optimizer in self.execution.optimizers
             ],
-            "scaler": {} if execution.scaler is None else execution.scaler.state_dict(),
             "average": None if self.average is None else self.average.state_dict(),
             "log": self.log.state_dict(),
             "row": rows_of_ranks(module),
@@ -347,8 +340,6 @@ class Training:
                 f"({str(error).splitlines()[-1].strip()}); give the settings that it began with, or begin "
                 f"anew with --from {name}"
             ) from None
-        if self.execution.scaler is not None and state["scaler"]:
-            self.execution.scaler.load_state_dict(state["scaler"])
         if self.average is not None and state["average"] is not None:
             self.average.load_state_dict(state["average"])
         self.log.load_state_dict(state["log"])

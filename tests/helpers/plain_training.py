@@ -10,7 +10,7 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.execution import Execution, launch
 
-Precision = Literal["32-true", "bf16-mixed", "16-mixed"]
+Precision = Literal["32-true", "bf16-mixed"]
 
 
 def take_steps(module: StageModule, batches: Sequence[Batch], precision: Precision = "32-true") -> None:

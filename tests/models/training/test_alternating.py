@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from lightning.fabric.plugins.precision import Precision
 from tiny_adversaries import CRITIC, Duel, Vectors, train
 from torch import Tensor, nn
 
 from motionloom.models.training.alternating import OptimizerGroup
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.training import execution
 
 STEPS = 24
 
@@ -100,50 +97,3 @@ def test_bfloat16_trains_near_float32(tmp_path: Path) -> None:
         # Steps of 24 x lr at most; the two differ by a small share of that.
         torch.testing.assert_close(half.state_dict()[name], value, atol=0.1 * STEPS * CRITIC.lr, rtol=0)
     assert any(not torch.equal(v, full.state_dict()[k]) for k, v in half.state_dict().items())
-
-
-class Scaler(torch.amp.GradScaler):
-    """One that works on a CPU and notes what it is asked."""
-
-    def __init__(self) -> None:
-        super().__init__("cpu", init_scale=1024.0, growth_interval=3)
-        self.updates = 0
-
-    def update(self, new_scale: Any = None) -> None:
-        """As the base class."""
-        self.updates += 1
-        super().update(new_scale)
-
-
-class Scaling(Precision):
-    """Float32 with the gradient scaler of "16-mixed", which Lightning gives to GPUs only."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.scaler = Scaler()
-
-    def backward(self, tensor: Tensor, *arguments: Any, **named: Any) -> None:
-        """As Lightning's mixed precision does."""
-        super().backward(self.scaler.scale(tensor), *arguments, **named)
-
-
-@pytest.mark.parametrize("parts", [1, 2])
-def test_with_a_gradient_scaler(parts: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One scale for all groups of a step, updated once behind them; powers of two change no bit."""
-    plain = train(tmp_path / "plain", accumulate=parts)
-    scaling = Scaling()
-    build = execution.Fabric
-
-    def fabric(**arguments: Any) -> Any:
-        return build(**{**arguments, "precision": None, "plugins": [scaling]})
-
-    monkeypatch.setattr(execution, "Fabric", fabric)
-    monkeypatch.setattr(execution, "prepare_module", without_fused)
-    other = train(tmp_path / "scaled", accumulate=parts)
-    assert scaling.scaler.updates == STEPS and scaling.scaler.get_scale() > 1024
-    for name, value in plain.state_dict().items():
-        torch.testing.assert_close(other.state_dict()[name], value, rtol=1e-5, atol=1e-6)
-
-
-def without_fused(module: Any, config: Any) -> None:
-    module.fused, module.accumulate = False, config.accumulate

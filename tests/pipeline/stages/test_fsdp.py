@@ -195,7 +195,6 @@ def test_the_strategy_is_no_part_of_the_fingerprint() -> None:
         (TmaStageConfig, {}, "for gpt stages"),
         (stage_config(H2VQConfig()), {}, "codebooks must be whole"),
         (GptStageConfig, {"compile": True}, "train.compile makes one graph"),
-        (GptStageConfig, {"precision": "16-mixed"}, "set train.precision: bf16-mixed"),
     ],
 )
 def test_what_cannot_be_cut_is_refused(

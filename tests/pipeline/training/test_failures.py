@@ -99,19 +99,18 @@ NAN, INF = float("nan"), float("inf")
 
 
 @pytest.mark.parametrize(
-    ("steps", "norms", "scaled", "expected"),
+    ("steps", "norms", "expected"),
     [
-        ([figures(1, loss=1.0), figures(2, loss=2.0)], [(1, 1.0)], False, None),
-        ([figures(1, accuracy=NAN, loss=1.0)], [], False, None),  # a metric may lack a value
-        ([figures(3, ce=NAN, loss=NAN), figures(4, loss=NAN)], [(2, 1.0), (3, NAN)], False, 3),
-        ([figures(3, critic_loss=INF, loss=1.0)], [], False, 3),
-        ([figures(3, loss=1.0), figures(4, loss=NAN)], [(3, INF), (4, NAN)], False, 3),
-        ([figures(3, loss=1.0)], [(3, INF)], True, None),  # the scaler skips that step
+        ([figures(1, loss=1.0), figures(2, loss=2.0)], [(1, 1.0)], None),
+        ([figures(1, accuracy=NAN, loss=1.0)], [], None),  # a metric may lack a value
+        ([figures(3, ce=NAN, loss=NAN), figures(4, loss=NAN)], [(2, 1.0), (3, NAN)], 3),
+        ([figures(3, critic_loss=INF, loss=1.0)], [], 3),
+        ([figures(3, loss=1.0), figures(4, loss=NAN)], [(3, INF), (4, NAN)], 3),
     ],
 )
-def test_the_first_failure(steps: Any, norms: Any, scaled: bool, expected: int | None) -> None:
+def test_the_first_failure(steps: Any, norms: Any, expected: int | None) -> None:
     module: Any = SimpleNamespace(figures=steps, norms=[(step, torch.tensor(norm)) for step, norm in norms])
-    found = first_failure(module, scaled=scaled)
+    found = first_failure(module)
     assert (found and found.step) == expected
     assert module.figures == module.norms == []
 

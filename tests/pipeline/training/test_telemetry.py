@@ -130,13 +130,13 @@ def test_flops_are_those_of_the_matrix_products() -> None:
     assert all(param.grad is None for param in duel.parameters())
 
 
-def test_telemetry_and_profile_end_no_training(tmp_path: Path) -> None:
-    """Their folder is a file: both are left out with a warning each."""
+def test_telemetry_ends_no_training(tmp_path: Path) -> None:
+    """Its folder is a file: it is left out with a warning."""
     tmp_path.joinpath("flight").write_text("")
     said = StringIO()
-    train(tmp_path, hardware={"profile": 2}, console=Console(file=said, width=500))
+    train(tmp_path, console=Console(file=said, width=500))
     warnings = [line.split(":")[0].strip() for line in said.getvalue().splitlines() if "left out" in line]
-    assert warnings == ["telemetry of rank 0 is left out", "profile of duel is left out"]
+    assert warnings == ["telemetry of rank 0 is left out"]
     assert read_training_log(tmp_path)[-1]["step"] == 24
 
 
