@@ -1,16 +1,15 @@
 """Speed of what runs often, beside the usual way to do the same: the table "Speed" of docs/results.md.
 
-    python benchmarks/speed.py [--only audio loader batches streaming] [--record speed]
+    python benchmarks/speed.py [--only audio loader batches] [--record speed]
 
 All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
-turns. `streaming` makes ten minutes of motion with a model of the package and looks at its memory.
+turns.
 """
 
 from __future__ import annotations
 
 import io
 import itertools
-import os
 import tempfile
 import warnings
 from argparse import Namespace
@@ -20,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from bench import Column, Record, arguments, command_line, cpu_seconds, process_seconds, report
+from bench import Column, Record, arguments, command_line, cpu_seconds, report
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features, fitting_octaves
@@ -35,8 +34,6 @@ from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.encoder import EncodedText
-from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.inference.script import Script, ScriptSegment
 from motionloom.pipeline.store.tokens import TokenBatches, TokenCaptions, TokenStore
 
 COLUMNS = (Column("ours", "ours"), Column("the usual way", "usual"), Column("times faster", "ratio", 1))
@@ -184,35 +181,12 @@ def loader(args: Namespace) -> Record:
     return row("training windows of 64 × 263 from shards", f"{rates['ours'] / 1e3:.0f} k/s", usual, ratio)
 
 
-def streaming(args: Namespace) -> Record:
-    """How soon a stream's first frames come, its speed, and how far its memory grows."""
-    model = MotionModel(args.model, "cpu")
-    next(model.stream(CAPTIONS[0]))  # loads the text encoder
-    first = cpu_seconds({"first": lambda: next(model.stream(CAPTIONS[1], seed=1))})["first"]
-    begin, frames, early, largest = process_seconds(), 0, 0.0, 0.0
-    captions = itertools.islice(itertools.cycle(CAPTIONS), round(6 * args.minutes) + 1)
-    segments = [ScriptSegment(text=caption, seconds=10.0) for caption in captions]
-    for chunk in model.stream(Script(segments=segments), seed=1):
-        frames += len(chunk.joints)
-        if frames >= 60 * model.fps:
-            pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-            now = pages * os.sysconf("SC_PAGE_SIZE") / 2**20
-            early, largest = early or now, max(largest, now)
-        if frames >= 60 * args.minutes * model.fps:
-            break
-    speed = frames / model.fps / (process_seconds() - begin)
-    grown = f"memory +{largest - early:.0f} MiB in {args.minutes:g} minutes"
-    return row("streaming", f"{speed:.1f} × real time, first frames after {first:.2f} s; {grown}")
-
-
-CASES = {case.__name__: case for case in (audio, loader, batches, streaming)}
+CASES = {case.__name__: case for case in (audio, loader, batches)}
 
 
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES))
-    parser.add_argument("--model", type=Path, default=Path("synthetic"), help="of `streaming`")
-    parser.add_argument("--minutes", type=float, default=10.0, help="of `streaming`'s motion")
     args = arguments(parser)
     report("Speed on one core", COLUMNS, [CASES[name](args) for name in args.only], args.record)
 

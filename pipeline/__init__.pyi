@@ -1,15 +1,11 @@
 from .contract.generation import Prompt as Prompt
 from .contract.sampling import SamplingConfig as SamplingConfig
-from .contract.sampling import StreamConfig as StreamConfig
 from .contract.stage import StageKind as StageKind
 from .evaluation.clip_metrics import ClipMetric as ClipMetric
 from .inference.captioning import captions as captions
 from .inference.model import MotionModel as MotionModel
 from .inference.motion import GeneratedMotion as GeneratedMotion
-from .inference.motion import MotionChunk as MotionChunk
-from .inference.motion import joined as joined
 from .inference.outputs import write_motions as write_motions
-from .inference.stream import MotionStream as MotionStream
 from .inference.writers import Writer as Writer
 from .results.paper.compare import compare_with_paper as compare_with_paper
 from .runs.api import evaluate_run as evaluate_run

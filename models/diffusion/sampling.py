@@ -216,13 +216,3 @@ class _Windows:
             inside = slice(start, start + self.size)
             out[:, inside] += self.weights[k, inside, None] * found[:, k]
         return out
-
-
-@torch.no_grad()
-def decode_window(
-    net: Dmd, codes: Mapping[str, Tensor], x: Tensor, *, seed: int, sampler: Sampler, steps: int
-) -> Tensor:
-    """One window [T, D] of tokens [1, G * per], denoised from x [T, D] as it is; `net` in evaluation mode."""
-    windows = _Windows(net, codes, None, len(x), len(x), 0)
-    noise, x = [torch.Generator().manual_seed(seed)], x[None].to(windows.condition.device)
-    return net.config.schedule.denoise(windows.denoise, x, noise, sampler, steps)[0]

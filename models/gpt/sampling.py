@@ -101,32 +101,6 @@ def uniform_numbers(seeds: Sequence[int], count: int, device: torch.device) -> T
     return torch.from_numpy(np.stack(rows)).to(device)
 
 
-def next_token(
-    network: TokenNetwork,
-    hidden: Tensor,
-    slot: int,
-    *,
-    may_end: Tensor,
-    how: Drawing,
-    uniform: Tensor,
-    scale: Tensor | None = None,
-) -> Tensor:
-    """The tokens of one slot of B rows, int64 [B].
-
-    Args:
-        hidden: The network's output at that position [B, 1, D]; under guidance [2B, 1, D], the conditional
-            rows before the unconditional ones.
-        may_end: Rows that may draw End, bool [B].
-        uniform: The draws, float64 [B] in [0, 1).
-        scale: Each row's guidance [B]; None without.
-    """
-    kind, nothing = network.slots[slot], torch.zeros_like(may_end)
-    legal = network.legal_at(network.ends[kind].expand(len(may_end)), may_end, nothing)
-    rows = legal if scale is None else legal.repeat(2, 1)
-    logits = network.logits(hidden, kind.expand(len(rows), 1), rows[:, None])[:, 0]
-    return how(logits if scale is None else guide(logits, legal, scale), uniform)
-
-
 def requested_groups(
     groups: Tensor | None, batch: int, *, most: int, limit: int | None, device: torch.device
 ) -> Tensor:
@@ -191,9 +165,11 @@ def decode(
         # Numbers count from a row's first new token, whatever it starts from.
         index = (step - before * size).clamp(0, uniform.shape[1] - 1)
         own = uniform.gather(1, index[:, None])[:, 0]
-        token = next_token(
-            network, hidden(step, tokens), slot, may_end=may_end, how=how, uniform=own, scale=scale
-        )
+        kind = network.slots[slot]
+        legal = network.legal_at(network.ends[kind].expand(batch), may_end, no)
+        rows = legal if scale is None else legal.repeat(2, 1)
+        logits = network.logits(hidden(step, tokens), kind.expand(len(rows), 1), rows[:, None])[:, 0]
+        token = how(logits if scale is None else guide(logits, legal, scale), own)
         if slot == 0:
             stops = alive & (token == network.ends[network.slots[0]])
             ended, alive = ended | stops, alive & ~stops

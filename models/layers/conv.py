@@ -90,8 +90,6 @@ class ResidualStack(nn.Module):
         super().__init__()
         dilations = [dilation_growth**i for i in reversed(range(depth))]
         self.blocks = nn.ModuleList(ResidualBlock(width, dilation) for dilation in dilations)
-        self.reach = sum(dilations)
-        """Positions to either side that one of its outputs looks at."""
 
     def forward(self, x: Tensor, real: Tensor | None) -> Tensor:
         for block in self.blocks:
@@ -131,8 +129,6 @@ class ConvDecoder(nn.Module):
         self, dim: int, out_dim: int, *, width: int, doublings: int, depth: int, dilation_growth: int
     ) -> None:
         super().__init__()
-        self.stride = 2**doublings
-        """Frames of one latent."""
         self.enter = Conv(dim, width, 3, padding=1)
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(doublings))
         # Nearest up-sampling, then a convolution: a transposed one leaves a pattern of uneven overlaps.
@@ -155,11 +151,3 @@ class ConvDecoder(nn.Module):
             hidden = up(zero_padded(hidden, real[level - 1]))
         hidden = functional.relu(self.refine(zero_padded(hidden, real[0])))
         return zero_padded(self.leave(zero_padded(hidden, real[0])), real[0])
-
-    def needs(self, first: int, last: int) -> tuple[int, int]:
-        """First and last of the latents that frames `first` to `last` are made of; no others play a role."""
-        first, last = first - 2, last + 2  # refine and leave have kernel 3: one frame to either side each
-        for stack in reversed(self.stacks):
-            assert isinstance(stack, ResidualStack)
-            first, last = (first - 1) // 2 - stack.reach, (last + 1) // 2 + stack.reach
-        return first - 1, last + 1

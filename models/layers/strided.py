@@ -51,8 +51,6 @@ class StridedDecoder(nn.Module):
     def __init__(self, dim: int, out_dim: int, *, width: int, depth: int, dilation_growth: int = 1) -> None:
         super().__init__()
         widths = [dim, width, width]
-        self.stride = 4
-        """Frames of one latent."""
         self.up = nn.ModuleList(Conv(a, b, 3, padding=1) for a, b in pairwise(widths))
         self.stacks = nn.ModuleList(ResidualStack(width, depth, dilation_growth) for _ in range(2))
         self.out = Conv(width, out_dim, 3, padding=1)
@@ -69,11 +67,3 @@ class StridedDecoder(nn.Module):
             wide = zero_padded(hidden, real[level + 1]).repeat_interleave(2, dim=1)
             hidden = stack(_active(up(wide)), real[level])
         return zero_padded(self.out(zero_padded(hidden, real[0])), real[0])
-
-    def needs(self, first: int, last: int) -> tuple[int, int]:
-        """First and last of the latents that frames `first` to `last` are made of; no others play a role."""
-        first, last = first - 1, last + 1
-        for stack in reversed(self.stacks):
-            assert isinstance(stack, ResidualStack)
-            first, last = (first - stack.reach - 1) // 2, (last + stack.reach + 1) // 2
-        return first, last

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Literal, NamedTuple, Protocol, Self, TypedDict, runtime_checkable
+from typing import Literal, NamedTuple, Self, TypedDict
 
 import torch
 from pydantic import Field
@@ -128,17 +128,6 @@ class Latents(NamedTuple):
     metrics: dict[str, Tensor]
 
 
-@runtime_checkable
-class Windowed(Protocol):
-    """A decoder each of whose frames is made of some latents around it."""
-
-    stride: int
-
-    def needs(self, first: int, last: int) -> tuple[int, int]:
-        """First and last of the latents that frames `first` to `last` are made of."""
-        ...
-
-
 class Tokenizer(nn.Module, ABC):
     """Motion [B, T, dim] to tokens and back; T is a multiple of 4.
 
@@ -184,15 +173,6 @@ class Tokenizer(nn.Module, ABC):
         """Bits that the codes of one second of motion carry, so that tokenizers compare fairly."""
         groups = self.layout.fps / GROUP_FRAMES
         return groups * sum(s.per_group * math.log2(s.num_codes) for s in self.streams)
-
-    @property
-    def reach(self) -> int:
-        """Groups before and after a group whose tokens its frames are decoded from, besides its own."""
-        decoder = self.decoder
-        if not isinstance(decoder, Windowed):
-            raise TypeError(f"{type(decoder).__name__} cannot tell which latents a frame is made of")
-        first, last = decoder.needs(0, GROUP_FRAMES - 1)
-        return max(-(first * decoder.stride // GROUP_FRAMES), last * decoder.stride // GROUP_FRAMES)
 
     def select(self, x: Tensor) -> Tensor:
         """The columns this tokenizer models, [..., D of the layout] -> [..., dim]."""

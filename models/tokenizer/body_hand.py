@@ -191,8 +191,6 @@ class _ApartDecoder(nn.Module):
         super().__init__()
         self.decoders = nn.ModuleDict(decoders)
         self.dim = dim
-        self.stride = decoders["body"].stride
-        """Frames of one joined latent."""
         where = torch.cat([columns[name] for name in decoders])
         self.register_buffer("order", torch.argsort(where))
 
@@ -201,11 +199,3 @@ class _ApartDecoder(nn.Module):
         body = self.decoders["body"](joined[..., : self.dim], valid)
         hand = self.decoders["hand"](joined[:, ::2, self.dim :], valid)
         return torch.cat([body, hand], dim=-1)[..., self.order]
-
-    def needs(self, first: int, last: int) -> tuple[int, int]:
-        """First and last of the joined latents that frames `first` to `last` are made of."""
-        body, hand = (self.decoders[name] for name in ("body", "hand"))
-        assert isinstance(body, ConvDecoder) and isinstance(hand, ConvDecoder)
-        (low, high), (low_hand, high_hand) = body.needs(first, last), hand.needs(first, last)
-        per = hand.stride // body.stride
-        return min(low, low_hand * per), max(high, high_hand * per)

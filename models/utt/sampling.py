@@ -92,7 +92,6 @@ def generate(
     how: Drawing = Drawing(),  # noqa: B008 - frozen
     cfg_scale: float | Sequence[float] = 1.0,
     seed: int | Sequence[int] = 0,
-    drawn: int = 0,
 ) -> Codes:
     """Sample code streams for embedded conditions (UDE section 3.3).
 
@@ -111,8 +110,6 @@ def generate(
         cfg_scale: Guidance, one for all rows or one each; 1 is off. Needs a model trained with condition
             dropout.
         seed: One seed, from which `sample_seeds` makes one per row, or one per sample.
-        drawn: Groups, the last ones of `start`, that were drawn by the same seeds: their random numbers are
-            used up, so that sampling in pieces gives what sampling at once gives.
 
     Returns:
         The new codes per stream int64 [B, G * per_group], 0 after each sample's `groups`.
@@ -135,8 +132,7 @@ def generate(
     given, before = last_groups(start, utt.pattern, context)
     size = len(utt.pattern)
     most = int(limit.max()) * size if batch else 0
-    # Numbers of groups already drawn are skipped: sampling in pieces then equals sampling at once.
-    uniform = uniform_numbers(seeds, drawn * size + most, device)[:, drawn * size :]
+    uniform = uniform_numbers(seeds, most, device)
     if not (inject_z and utt.config.z_dim):
         z = None
     elif z is None:

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.schedule import Sampler
-from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.contract.sampling import SamplingConfig
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
@@ -147,51 +146,10 @@ class Stretch:
     """Length of each row, or None where the model decides (only where it is the one stretch)."""
 
 
-class TokenFlow(Protocol):
-    """Tokens of one motion without an end, under conditions that may change."""
-
-    def condition(self, conditions: Conditions) -> None:
-        """Conditions, one row, of all that is drawn from now on; timed ones begin with the next group."""
-
-    def draw(self, left: int | None) -> Mapping[str, Tensor]:
-        """Some groups, one or more and at most `left` (None = there will be another condition, some day).
-
-        Per stream int64 [1, G * per_group].
-        """
-
-
-class FrameFlow(Protocol):
-    """Frames of tokens as they come, as the decoder has them."""
-
-    def push(self, codes: Mapping[str, Tensor]) -> Tensor | None:
-        """More tokens -> the frames that are final now; None = none yet."""
-
-    def finish(self) -> Tensor | None:
-        """No more tokens follow: the rest."""
-
-
-Decoding = tuple[FrameFlow, Callable[[Tensor], Motion]]
-"""A decoder, and what makes features [T, C] in their own units of its frames."""
-
-
-@dataclass(frozen=True)
-class Streaming:
-    """How a generator of tokens makes one motion without an end."""
-
-    group_tokens: Mapping[str, int]
-    """Tokens of a group, by stream."""
-    tokens: Callable[[int, SamplingConfig, StreamConfig], TokenFlow]
-    """Start the tokens of a motion, by its seed. Of one caption they are those of `generate` by the same
-    seed, as long as the network's block holds them."""
-    frames: Callable[[int, SamplingConfig, StreamConfig], Decoding]
-    """Start the decoder of these tokens, by the same seed."""
-
-
 @dataclass(frozen=True)
 class Capabilities:
     """A generator's abilities besides `generate`; the default of each field says that it cannot."""
 
-    streaming: Streaming | None = None
     drive: Callable[[Sequence[Stretch], Sequence[int], SamplingConfig], list[Motion]] | None = None
     """As `generate`, of several stretches one after another, a seed for each motion; [T, C] each."""
     edit: Callable[..., list[Motion]] | None = None

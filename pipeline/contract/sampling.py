@@ -1,9 +1,9 @@
-"""Settings of generation: how tokens, latents and noise are drawn, and how much a stream makes at a time."""
+"""Settings of generation: how tokens, latents and noise are drawn."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import Field
 
@@ -58,19 +58,3 @@ class SamplingConfig(Config):
     def guidance_of(self, part: Part) -> float:
         """Guidance of a generator of that part."""
         return self.face_cfg_scale if part == "face" and self.face_cfg_scale is not None else self.cfg_scale
-
-
-class StreamConfig(Config):
-    """How far a stream looks back and how much it makes at a time; all of it [ours]."""
-
-    chunk_frames: int = Field(8, ge=1)
-    """Frames that come together at least; more cost less in all, fewer come sooner."""
-    context_frames: int = Field(40, ge=0)
-    """Frames that a GPT goes on from where its block is full or another caption comes. UDE's own is its
-    stage's `context_frames`."""
-    hop_frames: int = Field(20, ge=1)
-    """Frames that UDE draws at a time: another caption takes effect after them."""
-    decoder: Literal["diffusion", "tokenizer"] | None = None
-    """The decoder of a UDE's tokens: the diffusion decoder, which is better and needs the tokens of a
-    window before its first frame, or the tokenizer's own, which needs some groups. None takes the first
-    where the model has it."""

@@ -25,7 +25,7 @@ from motionloom.datasets.conditions import Conditions
 from motionloom.models.layers.seeds import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.edits.clip_file import read_clip, read_seed_motion, require_clip
@@ -36,7 +36,6 @@ from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.requests import require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import find_model
-from motionloom.pipeline.inference.stream import MotionStream, segments_of
 from motionloom.pipeline.launch.hardware import choose_device, threads_for
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
@@ -139,41 +138,6 @@ class MotionModel(
             warnings.warn(str(note), stacklevel=2)
         return motions
 
-    def stream(
-        self,
-        caption: str | Script | None = None,
-        *,
-        face: str = "",
-        sound: Sound | None = None,
-        seconds: float | None = None,
-        seed: int = 0,
-        sampling: SamplingConfig | Mapping[str, object] | None = None,
-        streaming: StreamConfig | Mapping[str, object] | None = None,
-    ) -> MotionStream:
-        """One motion as an iterator of chunks, each there as soon as its frames are final.
-
-        Args:
-            caption: What the person does, or a `Script` of several segments. `say` of the stream changes it
-                on the way.
-            face: What the face does.
-            sound: Music to move to, beside a caption or alone.
-            seconds: Length. Without it a caption goes on until `say` or `close`, and music to its end.
-            seed: Equal arguments give equal motions. The frames of one caption are those of `generate` with
-                the same seed and length, as far as the network's block goes.
-            sampling: As of `generate`.
-            streaming: How much at a time: a `StreamConfig` or a mapping like `{"chunk_frames": 4}`.
-
-        As `generate`, it warns of a caption that the model does not know, when its turn has come.
-        """
-        config = StreamConfig.parse({} if streaming is None else streaming, "streaming")
-        segments = segments_of(self.bundle, caption, face=face, sound=sound, seconds=seconds)
-        drawn = SamplingConfig.of(sampling)
-        # The warning is of the loop that takes the chunks.
-        return MotionStream(
-            self.bundle, segments, seed=seed, sampling=drawn, config=config,
-            notice=lambda note: warnings.warn(str(note), stacklevel=5),
-        )  # fmt: skip
-
     def edit(
         self,
         clip: Path | str | GeneratedMotion,
@@ -217,7 +181,7 @@ class MotionModel(
 
     @property
     def max_seconds(self) -> float:
-        """Its longest motion; infinite where there is no limit. Streams have none."""
+        """Its longest motion; infinite where there is no limit."""
         return self.bundle.max_seconds
 
     def _save_pretrained(self, save_directory: Path) -> None:

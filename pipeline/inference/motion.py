@@ -1,8 +1,7 @@
-"""`GeneratedMotion`: one motion, what it was made from, and its files; and the chunks of a stream."""
+"""`GeneratedMotion`: one motion, what it was made from, and its files."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -11,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.render.sound import Driver, Segment
+from motionloom.pipeline.render.sound import Segment
 
 # The writers read this class, so it names their module instead of importing it.
 _OUTPUTS = "motionloom.pipeline.inference.outputs"
@@ -90,38 +88,3 @@ class EditedMotion(GeneratedMotion):
     """How near it is to its task."""
     remarks: tuple[str, ...] = ()
     """Remarks on how the clip was read."""
-
-
-@dataclass(frozen=True)
-class MotionChunk(GeneratedMotion):
-    """Some frames of a stream, final, all driven by one caption; they go on where the chunk before ends."""
-
-    start: int = field(kw_only=True)
-    """Number of its first frame, counted from the stream's."""
-
-
-def joined(chunks: Sequence[MotionChunk], seed: int | None = None) -> GeneratedMotion:
-    """Chunks that follow each other as one motion."""
-    if not chunks:
-        raise UserError("no chunks to join; take at least one from the stream")
-    spans: list[Segment] = []
-    begin = chunks[0].start
-    for chunk in chunks:
-        at = (chunk.start - begin) / chunk.fps
-        end = at + len(chunk.joints) / chunk.fps
-        kind: Driver = "text" if chunk.prompt.sound is None else "music"
-        if spans and spans[-1].label == chunk.caption:
-            spans[-1] = Segment(spans[-1].start, end, chunk.caption, kind)
-        else:
-            spans.append(Segment(at, end, chunk.caption, kind))
-    several = len(spans) > 1
-    faces = [chunk.face for chunk in chunks if chunk.face is not None]
-    return GeneratedMotion(
-        Prompt("; ".join(span.label for span in spans)) if several else chunks[0].prompt,
-        np.concatenate([chunk.features for chunk in chunks]),
-        np.concatenate([chunk.joints for chunk in chunks]),
-        np.concatenate(faces) if len(faces) == len(chunks) else None,
-        chunks[0].layout,
-        tuple(spans) if several else (),
-        seed=seed,
-    )

@@ -130,7 +130,7 @@ def frames_of(
         seconds: One length for all, one for each, or None: as long as what the prompt brings, such as music.
     """
     fps, unit, most = generator.layout.fps, generator.unit_frames, generator.max_frames
-    seed_frames, streaming = generator.capabilities.seed_frames, generator.capabilities.streaming
+    seed_frames = generator.capabilities.seed_frames
     if seconds is None:
         wanted: list[float | None] = [prompt.seconds for prompt in prompts]
     else:
@@ -156,9 +156,7 @@ def frames_of(
         if units < 1 or (most is not None and units * unit > most):
             least = unit / fps
             span = f"any length from {least:.1f} s" if most is None else f"{least:.2g} to {most / fps:.1f} s"
-            longer = most is not None and length * fps > most and streaming is not None
-            more = "; a stream of it goes on as long as you like: --format jsonl, or MotionModel.stream"
-            raise UserError(f"{length:g} s is out of reach: this model makes {span}{more if longer else ''}")
+            raise UserError(f"{length:g} s is out of reach: this model makes {span}")
         out.append(units * unit)
     return out
 

@@ -7,7 +7,7 @@ A new format is one function and its `Writer`, registered: `generate --format`, 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from motionloom.datasets.motion.layout import MotionLayout
-    from motionloom.pipeline.inference.motion import MotionChunk
     from motionloom.pipeline.inference.shown import FigureOptions, ShownMotion
     from motionloom.pipeline.render.body.glb import GlbClip
     from motionloom.pipeline.render.sound import Score
@@ -281,52 +279,3 @@ def writer_for(path: Path) -> Writer:
         ending = f"'{path.suffix}'" if path.suffix else "no ending"
         raise UserError(f"{path}: a motion cannot be saved with {ending}; name a file that ends in {known}")
     return max(fitting, key=lambda writer: len(writer.suffix))
-
-
-# ---- a stream, as JSON lines
-
-DIGITS = 5
-"""Decimals of what is written: a hundredth of a millimetre."""
-
-
-def heading(layout: MotionLayout, seed: int, model: str) -> str:
-    """The first line of a stream: what follows. Then comes one a frame.
-
-        {"format": "motionloom stream", "version": 1, "fps": 20.0, "joint_names": [...], ...}
-        {"frame": 0, "caption": "a person waves", "joints": [[x, y, z], ...], "face": [...]}
-
-    Metres, Y up; `face` only where the model makes one.
-    """
-    facts = {
-        "format": "motionloom stream",
-        "version": 1,
-        "model": model,
-        "seed": seed,
-        "fps": layout.fps,
-        "skeleton": layout.skeleton_name,
-        "joint_names": list(layout.skeleton.joints),
-        "parents": [int(parent) for parent in layout.skeleton.parents],
-        "unit": "m",
-        "up": "y",
-    }
-    return json.dumps(facts) + "\n"
-
-
-def frame_lines(chunk: MotionChunk) -> Iterator[str]:
-    """A line for each frame."""
-    for number, joints in enumerate(chunk.joints):
-        frame: dict[str, object] = {
-            "frame": chunk.start + number,
-            "caption": chunk.caption,
-            "joints": rounded(joints),
-        }
-        if chunk.face is not None:
-            frame["face"] = rounded(chunk.face[number])
-        yield json.dumps(frame, separators=(",", ":"), ensure_ascii=False) + "\n"
-
-
-def rounded(values: NDArray[np.floating]) -> object:
-    """Numbers as lists, short in writing."""
-    import numpy as np
-
-    return np.round(np.asarray(values, np.float64), DIGITS).tolist()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-import sys
-import traceback
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import resources
 from typing import Any, TypeVar
@@ -17,7 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
@@ -29,7 +27,7 @@ from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips
 from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
-from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, lines, make
+from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, make
 
 T = TypeVar("T")
 RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
@@ -64,9 +62,9 @@ class Worker:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="model")
         self._calls: list[Future[Any]] = []
 
-    def submit(self, call: Callable[[], T], *, begun: bool = False) -> Future[T]:
-        """The future of a call; `Busy` where too many wait, unless it goes on with one that was begun."""
-        if self.length >= self.waiting and not begun:
+    def submit(self, call: Callable[[], T]) -> Future[T]:
+        """The future of a call; `Busy` where too many wait."""
+        if self.length >= self.waiting:
             raise Busy(f"{self.waiting} requests are waiting already; try again in a moment")
         future = self._pool.submit(call)
         self._calls.append(future)
@@ -104,7 +102,6 @@ class Site:
             Route("/assets/{name}", self.asset),
             Route("/api/info", self.info),
             Route("/api/generate", self.generate, methods=["POST"]),
-            Route("/api/stream", self.stream, methods=["POST"]),
             Route("/api/sounds", self.add_sound, methods=["POST"]),
             Route("/api/clips", self.add_clip, methods=["POST"]),
             Route("/api/edit", self.edit, methods=["POST"]),
@@ -174,40 +171,16 @@ class Site:
         return await self._respond(http, lambda: self.clips.change(request, sound))
 
     async def _respond(self, http: Request, call: Callable[[], Answer]) -> Response:
-        answer, headers = await self._result(http, call), dict[str, str]()
-        if answer.file:
-            headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
-        return Response(answer.body, media_type=answer.kind, headers=headers)
-
-    async def _result(self, http: Request, call: Callable[[], T]) -> T:
-        """Return the result of the model's thread; nothing is begun for a client that has left by then."""
+        """Return the answer of the model's thread; nothing is begun for a client that has left by then."""
         result = asyncio.wrap_future(self.worker.submit(call))
         while not (await asyncio.wait({result}, timeout=_LOOK))[0]:
             if await http.is_disconnected():
                 result.cancel()
                 raise ClientDisconnect
-        return result.result()
-
-    async def stream(self, http: Request) -> Response:
-        """Return one motion as JSON lines, while it is made; others have their turn between its chunks."""
-        request, sound = await self._read_request(http, MotionRequest)
-        made = lines(self.model, self.name, request, sound, self.config)
-        first = await self._result(http, lambda: next(made))
-
-        async def body() -> AsyncIterator[str]:
-            piece = first
-            try:
-                while piece:
-                    yield piece
-                    call = self.worker.submit(lambda: next(made, ""), begun=True)
-                    piece = await asyncio.wrap_future(call)
-            except Exception as error:
-                words = str(error) if isinstance(error, UserError) else _BROKEN
-                if words is _BROKEN:
-                    traceback.print_exception(error, file=sys.stderr)
-                yield json.dumps({"error": words}) + "\n"
-
-        return StreamingResponse(body(), media_type="application/x-ndjson")
+        answer, headers = result.result(), dict[str, str]()
+        if answer.file:
+            headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
+        return Response(answer.body, media_type=answer.kind, headers=headers)
 
     async def add_sound(self, http: Request) -> Response:
         """Keep the sound file that the body is, under a name for later requests."""

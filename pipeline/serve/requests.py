@@ -7,12 +7,13 @@ import json
 import tempfile
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Generic, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
@@ -22,8 +23,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
-from motionloom.pipeline.inference.stream import MotionStream, segments_of
-from motionloom.pipeline.inference.writers import WRITERS, cell_of, frame_lines, heading, rounded
+from motionloom.pipeline.inference.writers import WRITERS, cell_of
 from motionloom.pipeline.render.viewer import viewer_data
 from motionloom.pipeline.store.known_captions import Unknown
 
@@ -136,13 +136,13 @@ class Answer:
 
 
 def notes_of(
-    model: MotionModel, asked: MotionRequest, sound: Sound | None, motion: GeneratedMotion | None = None
+    model: MotionModel, asked: MotionRequest, sound: Sound | None, motion: GeneratedMotion
 ) -> dict[str, list[str]]:
     """Notes for the person on the motion: captions that are unlike all that the model knows, what could
     be said of the body instead, that a sound has no beat, and that the motion does something else.
     """
     prompt = Prompt(asked.caption, asked.face, sound)
-    found = model.bundle.notes([prompt], [] if motion is None else [motion])
+    found = model.bundle.notes([prompt], [motion])
     unknown = [one for one in found if isinstance(one, Unknown)]
     nearest = [text for one in unknown if one.caption == asked.caption for text in one.nearest]
     return {"notes": [one.what if isinstance(one, Unknown) else one for one in found], "nearest": nearest}
@@ -180,25 +180,6 @@ def motion_of(
     )[0]
 
 
-def lines(
-    model: MotionModel, name: str, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
-) -> Iterator[str]:
-    """JSON lines of a stream of the model of this name, at most as long as the server allows.
-
-    The first line has the notes.
-    """
-    longest = limits.max_seconds if sound is None else min(sound.seconds, limits.max_seconds)
-    caption = asked.caption if asked.caption.strip() else None
-    segments = segments_of(
-        model.bundle, caption, face=asked.face, sound=sound, seconds=asked.seconds or longest
-    )
-    made = MotionStream(model.bundle, segments, seed=asked.seed, sampling=asked.sampling)
-    facts = json.loads(heading(made.layout, asked.seed, name))
-    yield json.dumps({**facts, **notes_of(model, asked, sound)}) + "\n"
-    for chunk in made:
-        yield "".join(frame_lines(chunk))
-
-
 def answer(
     motion: GeneratedMotion,
     form: str,
@@ -229,10 +210,15 @@ def answer(
         whole |= {
             "joint_names": list(motion.joint_names),
             "parents": [int(parent) for parent in motion.layout.skeleton.parents],
-            "joints": rounded(motion.joints),
-            "face_values": None if motion.face is None else rounded(motion.face),
+            "joints": _rounded(motion.joints),
+            "face_values": None if motion.face is None else _rounded(motion.face),
         }
     return Answer(json.dumps(whole, separators=(",", ":"), allow_nan=False).encode(), "application/json")
+
+
+def _rounded(values: NDArray[np.floating]) -> object:
+    """Numbers as lists, to a hundredth of a millimetre, so that they are short in writing."""
+    return np.round(np.asarray(values, np.float64), 5).tolist()
 
 
 def name_of(data: bytes) -> str:

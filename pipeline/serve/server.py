@@ -90,10 +90,7 @@ def warm(model: MotionModel) -> None:
     generator = model.bundle.generator
     if "text" in generator.modalities:
         caption = (model.examples(1) or ["a person stands"])[0]  # a known one: a note here would be nobody's
-        if generator.capabilities.streaming is not None:
-            next(model.stream(caption, seconds=1.0))
-        else:
-            model.generate([caption], seconds=1.0)
+        model.generate([caption], seconds=1.0)
     if "audio" in generator.modalities:
         rate = 22_050
         clicks = (np.arange(4 * rate) % (rate // 2) < 100).astype(np.float32)

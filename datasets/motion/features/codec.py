@@ -73,52 +73,21 @@ def decode(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.f
         raise UserError(
             f"layout {layout.name} has {layout.dim} columns, but these features are {list(features.shape)}"
         )
-    return Decoder(layout)(features)
+    if not features.shape[-2]:
+        return np.zeros((*features.shape[:-1], layout.num_joints, 3))
+    yaw = np.asarray(features[..., layout.slice("root_yaw_velocity")][..., 0], dtype=np.float64)
+    published = layout.family == "h3d"
+    turn = np.exp((-2j if published else 1j) * np.cumsum(_delayed(yaw), axis=-1))
+    xz = np.asarray(features[..., layout.slice("root_xz_velocity")], dtype=np.float64)
+    own = xz[..., 1] + 1j * xz[..., 0]
+    # A published step is seen from the heading of the frame that it leads to.
+    steps = _delayed(own) * turn if published else _delayed(own * turn)
+    return place(features, layout, turn, np.cumsum(steps, axis=-1))
 
 
-class Decoder:
-    """`decode` for a motion whose columns arrive chunk by chunk.
-
-    The root's heading and place are sums over all frames before. They are carried from chunk to chunk and
-    added in the same order, so the joints are, to the bit, those of the whole motion.
-    """
-
-    def __init__(self, layout: MotionLayout) -> None:
-        self.layout = layout
-        self._angle, self._turning = np.asarray(0.0), np.asarray(0.0)
-        """Sum of the turns before the last frame, and the turn that followed it."""
-        self._root, self._going = np.asarray(0j), np.asarray(0j)
-        """Sum and step of the root's way, z + i x; of `h3d` the step is not turned yet."""
-
-    def __call__(self, features: NDArray[np.floating]) -> NDArray[np.float64]:
-        """The next columns [..., T, D] in their own units -> joints [..., T, N, 3] in metres."""
-        if not features.shape[-2]:
-            return np.zeros((*features.shape[:-1], self.layout.num_joints, 3))
-        yaw = np.asarray(features[..., self.layout.slice("root_yaw_velocity")][..., 0], dtype=np.float64)
-        published = self.layout.family == "h3d"
-        angle = _carried(self._angle, self._turning, yaw)
-        turn = np.exp((-2j if published else 1j) * angle)
-        xz = features[..., self.layout.slice("root_xz_velocity")]
-        if published:  # a step is seen from the heading of the frame that it leads to
-            own = xz[..., 1] + 1j * xz[..., 0]
-            going = np.broadcast_to(self._going[..., None], (*own.shape[:-1], 1))
-            steps = np.concatenate([going, own[..., :-1]], axis=-1) * turn
-            steps[..., 0] += self._root
-            way = np.cumsum(steps, axis=-1)
-        else:
-            own = (np.asarray(xz[..., 1], np.float64) + 1j * np.asarray(xz[..., 0], np.float64)) * turn
-            way = _carried(self._root, self._going, own)
-        self._angle, self._turning = angle[..., -1], yaw[..., -1]
-        self._root, self._going = way[..., -1], own[..., -1]
-        return place(features, self.layout, turn, way)
-
-
-def _carried(
-    before: NDArray[np.inexact], step: NDArray[np.inexact], steps: NDArray[np.inexact]
-) -> NDArray[np.inexact]:
-    """Sum of the steps before each frame, going on from `before`, the sum at the frame before, by `step`."""
-    first = np.broadcast_to((before + step)[..., None], (*steps.shape[:-1], 1))
-    return np.cumsum(np.concatenate([first, steps[..., :-1]], axis=-1), axis=-1)
+def _delayed(steps: NDArray[np.inexact]) -> NDArray[np.inexact]:
+    """The step [..., T] that leads to each frame, of those that follow each; 0 before the first."""
+    return np.concatenate([np.zeros_like(steps[..., :1]), steps[..., :-1]], axis=-1)
 
 
 def face_of(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.floating]:

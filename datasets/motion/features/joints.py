@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import ground, heading
-from motionloom.datasets.motion.features.codec import Decoder, decode
+from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.schema import UserError
 
@@ -82,19 +82,3 @@ def _rotation_vectors(motion: NDArray[np.floating], layout: MotionLayout) -> NDA
     if layout.has("pose"):
         return turns("pose")[..., :BODY_JOINTS, :]
     return np.concatenate([turns(f) for f in ("root_orient", "pose_body", "pose_hand")], axis=-2)
-
-
-class JointFlow:
-    """`joints_of` for a motion whose columns arrive chunk by chunk, to the bit those of the whole motion."""
-
-    def __init__(self, layout: MotionLayout) -> None:
-        self.layout = layout
-        # Raw parameters say where each frame stands.
-        self._decode = None if layout.family == "raw" else Decoder(layout.without_face())
-
-    def __call__(self, features: NDArray[np.floating]) -> NDArray[np.float64]:
-        """The next columns [T, D] in their own units -> joints [T, N, 3] in metres."""
-        if self._decode is None:
-            empty = np.zeros((0, self.layout.num_joints, 3))
-            return joints_of(features, self.layout) if len(features) else empty
-        return self._decode(_without_face(features, self.layout))

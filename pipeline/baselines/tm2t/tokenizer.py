@@ -86,12 +86,9 @@ class Tm2tEncoder(nn.Module):
 class Tm2tDecoder(nn.Module):
     """Latents to frames, [B, L, dim] -> [B, 4 L, out_dim]."""
 
-    stride = 4
-
     def __init__(self, dim: int, out_dim: int, *, width: int, depth: int, dilation_growth: int) -> None:
         super().__init__()
         dilations = [dilation_growth**i for i in reversed(range(depth))]
-        self.reach = 2 * sum(dilations)
         self.blocks = nn.ModuleList(_Block(dim, dilation) for dilation in dilations)
         self.up = nn.ModuleList(Conv(a, b, 3, padding=1) for a, b in ((dim, width), (width, out_dim)))
         self.out = Conv(out_dim, out_dim, 3, padding=1)
@@ -107,13 +104,6 @@ class Tm2tDecoder(nn.Module):
             wide = zero_padded(hidden, real[2 - i]).repeat_interleave(2, dim=1)
             hidden = functional.leaky_relu(up(wide), SLOPE)
         return zero_padded(self.out(zero_padded(hidden, real[0])), real[0])
-
-    def needs(self, first: int, last: int) -> tuple[int, int]:
-        """First and last of the latents that frames `first` to `last` are made of; no others play a role."""
-        first, last = first - 1, last + 1
-        for _ in self.up:
-            first, last = (first - 1) // 2, (last + 1) // 2
-        return first - self.reach, last + self.reach
 
 
 class Tm2tQuantizer(OneCodebook):

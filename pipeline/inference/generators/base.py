@@ -16,9 +16,7 @@ from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.tokens import Codes
-from motionloom.models.tokenizer.streaming import StreamDecoder
-from motionloom.pipeline.contract.generation import Capabilities, Decoding, GenerationRequest
-from motionloom.pipeline.contract.sampling import StreamConfig
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.store.networks import TrainedTokenizer
 
 
@@ -95,10 +93,6 @@ class OfTokens(StageGenerator):
         return self.tokenizer.net.part
 
     @property
-    def group_tokens(self) -> dict[str, int]:
-        return {stream.name: stream.per_group for stream in self.tokenizer.net.streams}
-
-    @property
     def unit_frames(self) -> int:
         return self.tokenizer.net.group_frames
 
@@ -113,11 +107,6 @@ class OfTokens(StageGenerator):
         if frames is None:
             return motions
         return [motion[:count] for motion, count in zip(motions, frames, strict=True)]
-
-    def token_frames(self, streaming: StreamConfig) -> Decoding:
-        """The tokenizer's decoder for a stream (`Streaming.frames`)."""
-        least = -(-streaming.chunk_frames // self.tokenizer.net.group_frames)
-        return StreamDecoder(self.tokenizer.net, least), lambda made: self.tokenizer.own_units(made[0])
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -12,19 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.sampling import Drawing, generate, sample_seeds
-from motionloom.models.gpt.streaming import TokenStream
-from motionloom.models.gpt.tokens import as_codes
-from motionloom.pipeline.contract.generation import (
-    Capabilities,
-    Decoding,
-    GenerationRequest,
-    Streaming,
-    TokenFlow,
-)
-from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.contract.generation import GenerationRequest
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.generators.base import OfTokens
 from motionloom.pipeline.store.evaluator import embed_motions
 from motionloom.pipeline.store.networks import LoadedGpt, LoadedTma, device_of
@@ -55,10 +46,6 @@ class GptGenerator(OfTokens):
         """TMA used to rank candidates: the one behind the text prior, if it models the same body part."""
         tma: LoadedTma | None = self.given.get("tma") if self.gpt.prior == "tma" else None
         return tma if tma is not None and tma.part == self.part else None
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return Capabilities(streaming=Streaming(self.group_tokens, self.flow, self.decoding))
 
     @property
     def max_frames(self) -> int:
@@ -105,38 +92,6 @@ class GptGenerator(OfTokens):
             seed=list(seeds),
         )
         return self.decoded(codes, frames)
-
-    def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
-        """Tokens as they come; a full block, or another text, goes on from the last frames."""
-        tokens = TokenStream(
-            self.gpt.net,
-            how=Drawing(sampling.temperature, sampling.top_k or None, sampling.top_p),
-            context=streaming.context_frames // self.unit_frames,
-            cfg_scale=sampling.guidance_of(self.part),
-            seed=seed,
-        )
-        return GptFlow(tokens, lambda conditions: self.prior(GenerationRequest(conditions, None, [seed])))
-
-    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> Decoding:
-        if streaming.decoder == "diffusion":
-            raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
-        return self.token_frames(streaming)
-
-
-@dataclass(frozen=True)
-class GptFlow:
-    """One motion's tokens, one group at a time."""
-
-    tokens: TokenStream
-    prior: Callable[[Conditions], Tensor]
-    """First input of the GPT [1, E] of conditions of one row."""
-
-    def condition(self, conditions: Conditions) -> None:
-        self.tokens.condition(self.prior(conditions))
-
-    def draw(self, left: int | None) -> Mapping[str, Tensor]:
-        group = self.tokens.draw()
-        return as_codes(group[:, None], self.tokens.gpt.pattern, group.new_ones(1)).codes
 
 
 def candidate_seeds(seeds: Sequence[int], count: int) -> list[int]:

@@ -28,58 +28,40 @@ _TURNS = {
 """Axis and radians by which joints of the rest pose are turned: lowered arms, bent a little."""
 
 
-class IdleBlend:
-    """Blends the idle pose into a motion that comes piece by piece.
-
-    Args:
-        layout: Layout of whole frames.
-        part: The columns of it that the pieces have.
-    """
-
-    def __init__(self, layout: MotionLayout, part: Part) -> None:
-        self._fps, columns = layout.fps, layout.part(part)
-        pose, posed, held = (values[columns] for values in _standing(layout))
-        self._posed, self._held = np.flatnonzero(posed), np.flatnonzero(held)
-        self._pose = pose[self._posed]
-        self._level: float | None = None
-        """Share of the idle pose, 0..1, before the next frame."""
-        self._place: NDArray[np.float32] | None = None
-        """The held columns, as they were when the idle stretch began."""
-
-    def __call__(self, motion: NDArray[np.float32], idle: bool) -> NDArray[np.float32]:
-        """The next frames [T, C] in their own units, towards the idle pose or away from it.
-
-        Idle frames at the very start are so from the first one on; frames that are neither idle nor near an
-        idle stretch are returned as they are.
-        """
-        level = float(idle) if self._level is None else self._level
-        change = np.arange(1, len(motion) + 1) / (EASE * self._fps)
-        levels = np.clip(level + (change if idle else -change), 0.0, 1.0)
-        if len(motion):
-            self._level = float(levels[-1])
-        if not levels.any():
-            self._place = None
-            return motion
-        if self._place is None:
-            # The figure must not wander off or turn while it is idle.
-            self._place = motion[0, self._held].copy()
-        # A smooth step leaves and arrives at speed 0, so that neither end of the blend jerks.
-        weight = (levels * levels * (3 - 2 * levels))[:, None]
-        goal = motion.copy()
-        goal[:, self._posed] = self._pose
-        goal[:, self._held] = self._place
-        return np.asarray(motion + weight * (goal - motion), dtype=np.float32)
-
-
 def blend_to_idle(
     motion: NDArray[np.float32], idle: Sequence[bool], frames: Sequence[int], layout: MotionLayout, part: Part
 ) -> NDArray[np.float32]:
-    """A motion [T, C] of a part, idle in those of its stretches, so many frames each, that `idle` says."""
+    """A motion [T, C] of a part in its own units, idle in those of its stretches, so many frames each, that
+    `idle` says.
+
+    Idle frames at the very start are so from the first one on; frames that are neither idle nor near an idle
+    stretch are returned as they are.
+    """
     if not any(idle):
         return motion
-    blend = IdleBlend(layout, part)
-    pieces = np.split(motion, np.cumsum(frames)[:-1])
-    return np.concatenate([blend(piece, calm) for piece, calm in zip(pieces, idle, strict=True)])
+    columns, out = layout.part(part), []
+    pose, posed, held = (values[columns] for values in _standing(layout))
+    level = float(idle[0])
+    place: NDArray[np.float32] | None = None
+    for piece, calm in zip(np.split(motion, np.cumsum(frames)[:-1]), idle, strict=True):
+        change = np.arange(1, len(piece) + 1) / (EASE * layout.fps)
+        # Share of the idle pose in each frame, 0 to 1.
+        levels = np.clip(level + (change if calm else -change), 0.0, 1.0)
+        level = float(levels[-1])
+        if not levels.any():
+            place = None
+            out.append(piece)
+            continue
+        if place is None:
+            # The figure must not wander off or turn while it is idle.
+            place = piece[0, held]
+        # A smooth step leaves and arrives at speed 0, so that neither end of the blend jerks.
+        weight = (levels * levels * (3 - 2 * levels))[:, None]
+        goal = piece.copy()
+        goal[:, posed] = pose[posed]
+        goal[:, held] = place
+        out.append(np.asarray(piece + weight * (goal - piece), dtype=np.float32))
+    return np.concatenate(out)
 
 
 def _standing(layout: MotionLayout) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:

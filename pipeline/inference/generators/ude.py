@@ -14,26 +14,17 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd
-from motionloom.models.diffusion.dmd_streaming import DmdStream
 from motionloom.models.diffusion.sampling import decode_motions
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.utt.network import ConditionedUtt
-from motionloom.pipeline.contract.generation import (
-    Capabilities,
-    Decoding,
-    GenerationRequest,
-    Streaming,
-    Stretch,
-    TokenFlow,
-)
-from motionloom.pipeline.contract.sampling import SamplingConfig, StreamConfig
+from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest, Stretch
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageConfig
 from motionloom.pipeline.inference.generators.base import OfTokens
-from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
+from motionloom.pipeline.inference.generators.timeline import TokenTimeline
 from motionloom.pipeline.store.networks import LoadedWindowed
 
 
@@ -78,11 +69,7 @@ class UdeGenerator(OfTokens):
 
     @property
     def capabilities(self) -> Capabilities:
-        return Capabilities(
-            streaming=Streaming(self.group_tokens, self.flow, self.decoding),
-            drive=self.drive,
-            denoising=None if self.dmd is None else self.denoising,
-        )
+        return Capabilities(drive=self.drive, denoising=None if self.dmd is None else self.denoising)
 
     @cached_property
     def timeline(self) -> TokenTimeline:
@@ -131,28 +118,6 @@ class UdeGenerator(OfTokens):
         motions = self.decode(codes, noise, sampling, hidden)
         totals = lengths.sum(0).tolist()
         return [motion[:count] for motion, count in zip(motions, totals, strict=True)]
-
-    def flow(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> TokenFlow:
-        """Tokens as they come, those of `drive` where the lengths of all stretches are known."""
-        return TimelineFlow(self.timeline, seed, sampling, hop=max(1, streaming.hop_frames // GROUP_FRAMES))
-
-    def decoding(self, seed: int, sampling: SamplingConfig, streaming: StreamConfig) -> Decoding:
-        """The tokenizer's own decoder, or windows of the diffusion decoder."""
-        if self.dmd is None and streaming.decoder == "diffusion":
-            raise UserError("this model has no diffusion decoder; leave streaming's decoder out")
-        if self.dmd is None or streaming.decoder == "tokenizer":
-            return self.token_frames(streaming)
-        sampler, steps = self.denoising(sampling)
-        decoder = DmdStream(
-            self.dmd.net,
-            self.group_tokens,
-            seed=seed,
-            sampler=sampler,
-            steps=steps,
-            window=self.dmd.window,
-            overlap=self.config.overlap_frames,
-        )
-        return decoder, self.tokenizer.of_coordinates
 
     def denoising(self, sampling: SamplingConfig) -> tuple[Sampler, int]:
         return (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from motionloom.datasets.motion.canonical import canonicalize, ground, retarget
 from motionloom.datasets.motion.features.codec import decode, encode, face_of
 from motionloom.datasets.motion.features.h3d import encode_h3d, uniform_joints
-from motionloom.datasets.motion.features.joints import JointFlow, joints_of, local_joints_of
+from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
 from motionloom.datasets.motion.features.torch_joints import present_joints, torch_joints_of
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
 from motionloom.datasets.schema import UserError
@@ -211,15 +210,6 @@ def test_a_face_loses_the_last_frame_and_one_frame_is_too_short() -> None:
         encode(joints[:1], layout)
 
 
-FLOWING = [
-    MotionLayout.named("body133"),
-    MotionLayout.named("wholebody363"),
-    MotionLayout.named("wholebody363", family="h3d"),
-    MotionLayout.named("h3d263"),
-    MotionLayout.named("smpl75"),
-]
-
-
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_without_face_is_the_layout_of_the_body_and_hand_columns(name: str) -> None:
     layout = MotionLayout.named(name, fps=12.5)
@@ -267,16 +257,6 @@ def test_a_pose_does_not_depend_on_place_and_heading() -> None:
     np.testing.assert_allclose(local[:, 1:], positions, atol=2e-4)
     elsewhere = turn(joints, 1.1) + np.array([3.0, 0.5, -2.0])
     np.testing.assert_allclose(local_joints_of(elsewhere, layout.fps), local, atol=1e-9)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("layout", FLOWING, ids=lambda layout: f"{layout.name} {layout.family}")
-def test_chunks_are_the_whole_to_the_bit(layout: MotionLayout, dtype: type) -> None:
-    features = np.random.default_rng(0).normal(size=(61, layout.dim)).astype(dtype)
-    cuts = [0, 1, 2, 9, 9, 30, 60, 61]
-    flow = JointFlow(layout)
-    made = [flow(features[a:b]) for a, b in pairwise(cuts)]
-    np.testing.assert_array_equal(np.concatenate(made), joints_of(features, layout))
 
 
 # Joints in torch: those of numpy, of every layout that a network writes, and with gradients.

@@ -123,7 +123,7 @@ def test_a_script_says_everything(
     path = write("segments: [{text: a person walks, seconds: 2}]")
     monkeypatch.chdir(path.parent)
     done = call("generate", "nowhere", path.name, *more)
-    assert done.code == 2 and ("show.yaml" in done.err or "--samples 0" in done.err)
+    assert done.code == 2 and ("show.yaml" in done.err or "--samples" in done.err)
 
 
 def driven(sound: Sound | None) -> DrivenSegment:

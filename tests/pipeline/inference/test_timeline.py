@@ -19,7 +19,7 @@ from motionloom.models.utt.network import ConditionedUtt, UttConfig
 from motionloom.models.utt.sampling import draw_z, generate
 from motionloom.pipeline.contract.generation import Stretch
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.generators.timeline import TimelineFlow, TokenTimeline
+from motionloom.pipeline.inference.generators.timeline import TokenTimeline
 
 PATTERN = ("body", "body", "hand")
 STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
@@ -193,32 +193,3 @@ def test_batches_play_no_part(timeline: TokenTimeline, show: list[Stretch], samp
         alone = [Stretch(row_of(s.conditions, row), [list(s.frames or [])[row]]) for s in show]
         mine = codes_of(timeline.tokens(alone, [seed], sampling), 0)
         assert mine == codes_of(together, row) == codes_of(again, row) != codes_of(other, row)
-
-
-@pytest.mark.parametrize("hop", [1, 4, 99])
-@pytest.mark.parametrize("sampling", [GREEDY, SamplingConfig(top_k=3, cfg_scale=1.5)])
-def test_pieces_are_the_whole(timeline: TokenTimeline, hop: int, sampling: SamplingConfig) -> None:
-    """Words, music, and both, of lengths within one window and over several."""
-    drives = [text(1), music(1, [76]), {**text(1, seed=3), **music(1, [20])}]
-    groups = [8, 19, 5]
-    stretches = [Stretch(drive, [4 * n]) for drive, n in zip(drives, groups, strict=True)]
-    whole = timeline.tokens(stretches, SEEDS[1:2], sampling)
-    flow = TimelineFlow(timeline, SEEDS[1], sampling, hop)
-    pieces = []
-    for drive, count in zip(drives, groups, strict=True):
-        flow.condition(drive)
-        while count:
-            pieces.append(flow.draw(count))
-            count -= pieces[-1]["hand"].shape[1]
-            assert 1 <= pieces[-1]["hand"].shape[1] <= min(hop, WINDOW)
-        assert count == 0
-    assert int(whole.groups[0]) == sum(groups)
-    for stream in STREAMS:
-        assert torch.equal(torch.cat([piece[stream.name] for piece in pieces], 1), whole.codes[stream.name])
-
-
-def test_without_an_end_it_listens_after_each_hop(timeline: TokenTimeline) -> None:
-    flow = TimelineFlow(timeline, SEEDS[0], GREEDY, 2)
-    flow.condition(text(1))
-    assert [flow.draw(None)["hand"].shape[1] for _ in range(20)] == [2] * 20
-    assert int(flow._before.groups[0]) <= CONTEXT + 2  # and keeps no more than a window sees

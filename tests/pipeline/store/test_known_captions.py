@@ -12,7 +12,6 @@ import pytest
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.inference.script import Script, ScriptSegment
 from motionloom.pipeline.store.known_captions import (
     FALSE_ALARMS,
     KNOWN_FILES,
@@ -154,25 +153,3 @@ def test_a_motion_without_what_is_said_is_noted(
     model = MotionModel.from_pretrained(small_run.folder, device="cpu")
     with pytest.warns(UserWarning, match="in 1 of 2"):
         model.generate(["a person punches"] * 2, seconds=1.5)
-
-
-def test_a_stream_says_so_when_the_captions_turn_comes(small_run: Any, call: Any, tmp_path: Path) -> None:
-    """By the command, from Python, and of a caption that comes on the way; each caption once."""
-    known, strange = "a person walks forward", VIOLIN
-    options = ["-f", "jsonl", "--seconds", "0.8", "-o", tmp_path / "made.jsonl"]
-    said = call("generate", small_run.folder, known, strange, known, strange, *options).err
-    assert said.count("note: ") == 1 and f"note: '{strange}' is unlike" in said
-    model = MotionModel.from_pretrained(small_run.folder, device="cpu")
-    stream = model.stream(
-        Script(segments=[ScriptSegment(text=text, seconds=0.8) for text in (known, strange, known)]), seed=1
-    )
-    with pytest.warns(UserWarning, match="violin.*The nearest it knows") as warned:
-        list(stream)
-    assert len(warned) == 1 and warned[0].filename == __file__
-    stream = model.stream(known, seed=1)
-    next(stream)
-    stream.say("stock prices fell sharply", seconds=0.4)
-    with pytest.warns(UserWarning, match="stock prices"):
-        for chunk in stream:
-            if chunk.caption != known:
-                break
