@@ -1,6 +1,6 @@
 """Reading a shard's directory without trusting it.
 
-Only plain files, contiguous per key, are accepted; a path that leaves the shard, a link, a device, a repeated
+Only plain files, contiguous per key, are accepted; a path, a link, a device, a repeated
 or interleaved key or an object array stops the read with the shard's and the member's name. Nothing is ever
 extracted, and nothing is unpickled.
 """
@@ -32,11 +32,10 @@ class TarClip:
     members: dict[str, tuple[int, int]] = field(default_factory=dict)
 
 
-def scan_tar(path: Path, *, foreign: bool = False, most: int = MOST_CLIPS) -> list[TarClip]:
+def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
     """The clips of a shard in the order they stand; `UserError` names what is wrong with the file.
 
-    Our members only, unless the shard is `foreign`: then names may hold folders, the metadata may be called
-    `json`, and files that belong to no clip are passed over. `most` is how many clips it may have.
+    `most` is how many clips it may have.
     """
     clips: list[TarClip] = []
     seen: set[str] = set()
@@ -49,16 +48,14 @@ def scan_tar(path: Path, *, foreign: bool = False, most: int = MOST_CLIPS) -> li
                 archive.members = []  # type: ignore[attr-defined]  # tarfile keeps every entry
                 # Contents fill whole blocks; behind the last one nothing but zeros may follow (`_check_end`).
                 end = info.offset_data + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
-                key, member = _checked_name(path, info, foreign)
-                if not key or not member:
-                    continue
+                key, member = _checked_name(path, info)
                 if info.offset_data + info.size > size:
                     last = f"the last whole key is '{clips[-1].key}'" if clips else "no key is whole"
                     raise UserError(f"{path}: truncated inside '{info.name}'; {last}")
                 # A new key ends the clip before it, which must be whole; a key may not come again later.
                 if not clips or clips[-1].key != key:
                     if clips:
-                        _require_whole(path, clips, foreign)
+                        _require_whole(path, clips)
                     if key in seen:
                         raise UserError(
                             f"{path}: duplicate key '{key}': it comes again after others, or its members "
@@ -73,29 +70,19 @@ def scan_tar(path: Path, *, foreign: bool = False, most: int = MOST_CLIPS) -> li
                 clips[-1].members[member] = (info.offset_data, info.size)
     except (tarfile.TarError, EOFError, OSError, ValueError) as error:
         raise UserError(f"{path}: not a readable tar file ({error}); convert the dataset again") from None
-    if not clips and foreign:
-        raise UserError(f"{path}: holds no clips")
     if clips:
-        _require_whole(path, clips, foreign)
+        _require_whole(path, clips)
     _check_end(path, end)
     return clips
 
 
-def _checked_name(path: Path, info: tarfile.TarInfo, foreign: bool) -> tuple[str, str]:
+def _checked_name(path: Path, info: tarfile.TarInfo) -> tuple[str, str]:
     """(key, member) of one entry, refused when it is anything but a plain file with a harmless name."""
-    name, parts = info.name, info.name.split("/")
-    if name.startswith("/") or ".." in parts or ":" in parts[0] or {"\\", "\0"} & set(name):
-        raise UserError(
-            f"{path}: '{name}' is a path that leaves the shard (path traversal); shards hold plain names only"
-        )
+    name = info.name
+    if name.startswith(".") or {"/", "\\", ":", "\0"} & set(name):
+        raise UserError(f"{path}: '{name}' is a path (path traversal); shards hold plain names only")
     if not info.isreg():
         raise UserError(f"{path}: '{name}' is a link, folder or device; shards hold plain files only")
-    if foreign:
-        folder, slash, last = name.rpartition("/")
-        stem, _, member = last.partition(".")
-        return (folder + slash + stem if stem else ""), member
-    if "/" in name or name.startswith("."):
-        raise UserError(f"{path}: '{name}' is a path; shards hold plain names only")
     key, _, member = name.partition(".")
     if member not in MEMBERS:
         discover()  # a worker may not have met the modalities of other packages
@@ -104,11 +91,9 @@ def _checked_name(path: Path, info: tarfile.TarInfo, foreign: bool) -> tuple[str
     return key, member
 
 
-def _require_whole(path: Path, clips: list[TarClip], foreign: bool) -> None:
+def _require_whole(path: Path, clips: list[TarClip]) -> None:
     clip = clips[-1]
     missing = {"motion.npy", "meta.json"} - clip.members.keys()
-    if foreign and "json" in clip.members:
-        missing.discard("meta.json")
     if missing:
         last = f" (truncated? the last whole key is '{clips[-2].key}')" if len(clips) > 1 else ""
         raise UserError(f"{path}: missing field: key '{clip.key}' has no {sorted(missing)[0]}{last}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated, cast
 
 import typer
 from rich.console import Console
@@ -22,9 +22,6 @@ from motionloom.pipeline.cli.options import (
 )
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place, require_folder
-
-if TYPE_CHECKING:
-    from motionloom.datasets.check.files import FileRules
 
 _SUSPECTS = 60
 """Suspects on the page, at most: the worst."""
@@ -125,60 +122,26 @@ def remove(
 
 @data_app.command()
 def check(
-    paths: Annotated[
-        list[Path],
-        typer.Argument(help="Folders with manifest.json; or source files, or folders of such files."),
-    ],
-    sets: Annotated[
-        list[str] | None,
-        set_option(
-            "Of files: layout of .npy arrays, or joints22, joints52 (default smplx322, Motion-X's); fps; "
-            "seconds, the length of the clips of captions."
-        ),
-    ] = None,
+    paths: Annotated[list[Path], typer.Argument(help="Folders with manifest.json.")],
     strict: Annotated[bool, typer.Option("--strict", help="Warnings count as problems.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Checksums, schema, finite values, ranges, people on a floor, duplicates, leaks. Exit code 1 and a list.
 
-    Without manifest.json, single files are checked: .tar, .npy, .npz, .pkl, .bvh, .amc, .wav, .txt. Several
-    data sets are also compared with each other: no clip of one may be in another split of the next.
+    Several data sets are also compared with each other: no clip of one may be in another split of the next.
 
     Example: `motionloom data check shards`
-
-    Example: `motionloom data check HumanML3D/new_joint_vecs --set layout=h3d263`
     """
-    from motionloom.datasets.check.files import FileRules
-
-    rules, console = FileRules.parse(fields_of(sets, "--set"), "data check"), make_console(aside=as_json)
-    records = [_check_one(path, rules, strict, console) for path in paths]
+    console = make_console(aside=as_json)
+    records = [_check_dataset(path, strict, console) for path in paths]
     record, count = records[0], sum(cast(int, one["problems"]) for one in records)
     if len(paths) > 1:
-        leaks = _leaks(
-            [path for path, one in zip(paths, records, strict=True) if "files" not in one], console
-        )
+        leaks = _leaks(paths, console)
         count += len(leaks)
         record = {"paths": records, "problems": count, "leaks": leaks}
     if as_json:
         print_json(record)
     raise typer.Exit(1 if count else 0)
-
-
-def _check_one(path: Path, rules: FileRules, strict: bool, console: Console) -> dict[str, object]:
-    """The record of a data set, a file or a folder of files: `problems` and what was found."""
-    if not path.exists():
-        raise UserError(f"{path}: no such folder or file")
-    files = path.is_file() or _holds_files(path)
-    if rules.model_fields_set and not files:
-        raise UserError(
-            f"{path}: --set {', '.join(sorted(rules.model_fields_set))} is for single files; a data set says "
-            f"this in its manifest.json; leave it out"
-        )
-    count, warned, found = _check_files(path, rules, console) if files else _check_dataset(path, console)
-    if strict:
-        count += warned
-    console.print(f"{path}: {count} problems" if count else f"{path}: no problems", markup=False)
-    return {"path": path, "problems": count, **found}
 
 
 def _leaks(folders: list[Path], console: Console) -> list[str]:
@@ -188,8 +151,7 @@ def _leaks(folders: list[Path], console: Console) -> list[str]:
     found = leaks_across(folders)
     for leak in found:
         say(console, f"leak: {leak}")
-    if len(folders) > 1:
-        console.print(f"{len(found) or 'no'} clips of one data set are in another split of the next")
+    console.print(f"{len(found) or 'no'} clips of one data set are in another split of the next")
     return found
 
 
@@ -263,18 +225,12 @@ def clean(
     say(console, f"{page}: {len(found)} suspects{f' ({kinds})' if kinds else ''}")
 
 
-def _holds_files(folder: Path) -> bool:
-    """Whether a folder is no dataset, finished or not, but holds files that can be checked one by one."""
-    from motionloom.datasets.check.files import FILE_SUFFIXES
-
-    if (folder / "manifest.json").exists() or any(folder.glob("*.index.json")):
-        return False
-    return any(path.suffix.lower() in FILE_SUFFIXES for path in folder.rglob("*"))
-
-
-def _check_dataset(root: Path, console: Console) -> tuple[int, int, dict[str, object]]:
+def _check_dataset(root: Path, strict: bool, console: Console) -> dict[str, object]:
+    """The record of a data set: `problems`, their number, and what was found."""
     from motionloom.datasets.check.dataset import examine
 
+    if not root.exists():
+        raise UserError(f"{root}: no such folder")
     report = examine(root, progress=console.is_terminal)
     for title, problems in (("warning: ", report.warnings), ("", report.errors)):
         findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
@@ -288,19 +244,6 @@ def _check_dataset(root: Path, console: Console) -> tuple[int, int, dict[str, ob
     if report.warning_kinds:
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
         say(console, f"{root}: warnings: {counts}")
-    errors, warnings = sum(report.error_kinds.values()), sum(report.warning_kinds.values())
-    return errors, warnings, plain(report)
-
-
-def _check_files(path: Path, rules: FileRules, console: Console) -> tuple[int, int, dict[str, object]]:
-    from motionloom.datasets.check.files import check_file, check_folder
-
-    bad, warned, found = 0, 0, []
-    for verdict in [check_file(path, rules)] if path.is_file() else check_folder(path, rules):
-        say(console, str(verdict))
-        for note in verdict.notes:
-            say(console, f"{verdict.path}: note: {note}")
-        bad += not verdict.ok
-        warned += bool(verdict.ok and verdict.notes)
-        found.append({**plain(verdict), "ok": verdict.ok})
-    return bad, warned, {"files": found}
+    count = sum(report.error_kinds.values()) + strict * sum(report.warning_kinds.values())
+    console.print(f"{root}: {count} problems" if count else f"{root}: no problems", markup=False)
+    return {"path": root, "problems": count, **plain(report)}

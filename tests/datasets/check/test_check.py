@@ -1,4 +1,4 @@
-"""`check` beyond checksums: ranges, captions, sound, duplicates and leaks; and shards that others wrote."""
+"""`check` beyond checksums: ranges, captions, sound, duplicates and leaks; and damaged tars."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import re
 import tarfile
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from rich.console import Console
 
 from motionloom.datasets.check.clip import ABSURD, beyond, human_limits
 from motionloom.datasets.check.dataset import CheckReport, examine
-from motionloom.datasets.check.files import FileRules, check_file, check_folder
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.check.leaks import find_leaks, leaks_across
 from motionloom.datasets.motion.canonical import canonicalize, mirror
@@ -27,13 +27,13 @@ from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards import sample as sample_module
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
+from motionloom.datasets.shards.tar import scan_tar
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.runs.api import run_recipe
 
 LAYOUT = MotionLayout.named("body133")
-RULES = FileRules(layout="body133")
 
 
 def walk(seed: int, frames: int = 40) -> np.ndarray:
@@ -232,16 +232,13 @@ def test_findings_are_bounded_and_counted() -> None:
         assert len(listed) == LISTED + 1 and str(listed[-1]).startswith("root: 500 more: ")
 
 
-# ---- shards without a manifest
+# ---- damaged shards
 
 
 def npy(values: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, values)
     return buffer.getvalue()
-
-
-MOTION = npy(np.zeros((4, 133), np.float32))
 
 
 def tar(path: Path, *members: tuple[str, bytes], kind: bytes = tarfile.REGTYPE) -> Path:
@@ -253,35 +250,27 @@ def tar(path: Path, *members: tuple[str, bytes], kind: bytes = tarfile.REGTYPE) 
     return path
 
 
-def sample(key: str, motion: bytes = MOTION) -> tuple[tuple[str, bytes], ...]:
-    return (f"{key}.motion.npy", motion), (f"{key}.json", b"{}")
-
-
-def test_strange_but_good_shards(tmp_path: Path) -> None:
-    for number, key in enumerate(("./000", "walks/fast/000", "ä" * 120)):
-        verdict = check_file(tar(tmp_path / f"{number}.tar", *sample(key), ("README", b"x")), RULES)
-        assert verdict.ok and verdict.what == "shard of 1 samples", verdict
+def sample(key: str) -> tuple[tuple[str, bytes], ...]:
+    return (f"{key}.motion.npy", npy(np.zeros((4, 133), np.float32))), (f"{key}.meta.json", b"{}")
 
 
 @pytest.mark.parametrize(
     ("members", "word"),
     [
-        (sample("a", npy(np.array([object()]))), "object array"),
-        (sample("a", MOTION[:-4]), "truncated array"),
-        (sample("a", npy(np.full((4, 133), np.nan, np.float32))), "NaN or infinity in row 0"),
-        (sample("a", npy(np.zeros((4, 263), np.float32))), "263 columns, layout body133 has 133"),
-        (sample("a", npy(np.full((4, 133), 5e4, np.float32))), "wrong unit"),
-        (sample("a", npy(np.full((4, 133), 1e308))), "absurd"),
-        (sample("a", npy(np.zeros((4, 133), np.int64))), "int64"),
-        (sample("a", npy(np.zeros((0, 133), np.float32))), "T >= 1"),
+        (sample("../../a"), "path traversal"),
+        (sample("/tmp/a"), "path traversal"),
         (sample("a\\b"), "path traversal"),
-        (sample("C:/a"), "path traversal"),
-        ((*sample("a"), ("a.x.json", b"[" * 100_000)), "not valid JSON"),
-        ((), "holds no clips"),
+        (sample("C:a"), "path traversal"),
+        ((*sample("a"), ("a.motion.npy", b"")), "twice"),
+        ((*sample("a"), *sample("b"), *sample("a")), "duplicate key 'a'"),
+        ((*sample("a")[:1], *sample("b"), *sample("a")[1:]), "key 'a' has no meta.json"),
+        ((*sample("a"), *sample("b")[1:]), "key 'b' has no motion.npy"),
+        ((*sample("a"), ("a.x.json", b"[]")), "not a known member"),
     ],
 )
-def test_bad_foreign_shards(tmp_path: Path, members: tuple[tuple[str, bytes], ...], word: str) -> None:
-    assert word in " ".join(check_file(tar(tmp_path / "x.tar", *members), RULES).problems)
+def test_tars_that_are_no_shards(tmp_path: Path, members: tuple[tuple[str, bytes], ...], word: str) -> None:
+    with pytest.raises(UserError, match=re.escape(word)):
+        scan_tar(tar(tmp_path / "x.tar", *members))
 
 
 def test_cut_joined_and_packed_shards(tmp_path: Path) -> None:
@@ -289,46 +278,22 @@ def test_cut_joined_and_packed_shards(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for cut in range(512, len(whole) - 10240, 700):
         path.write_bytes(whole[:cut])
-        verdict = check_file(path)  # wherever it is cut, a shard is refused or whole samples are left
-        assert not verdict.ok or verdict.what in ("shard of 1 samples", "shard of 2 samples")
-    path.write_bytes(whole + whole)
-    assert "two archives" in str(check_file(path))
+        with suppress(UserError):  # wherever it is cut, a shard is refused or whole clips are left
+            assert all(len(clip.members) == 2 for clip in scan_tar(path))
     header = whole.index(b"b.motion.npy")
-    path.write_bytes(whole[:header] + b"damage" * 20 + whole[header + 120 :])
-    assert "are no tar entries" in str(check_file(path))
-    path.write_bytes(gzip.compress(whole))
-    assert "not a readable tar" in str(check_file(path))
-    for kind in (tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE):
-        assert "plain files" in str(check_file(tar(path, ("a.motion.npy", b""), kind=kind)))
-
-
-# ---- single files
-
-
-def test_layouts_of_arrays(tmp_path: Path) -> None:
-    path = tmp_path / "a.npy"
-    np.save(path, np.zeros((40, 263), np.float32))
-    assert "--set layout=h3d263" in str(check_file(path))
-    assert check_file(path, FileRules(layout="h3d263")).ok
-    np.save(path, walk(0).astype(np.float32))
-    assert "--set layout=joints22" in str(check_file(path))
-    assert check_file(path, FileRules(layout="joints22")).ok
-    np.save(path, 100 * walk(0))
-    assert "length unit" in str(check_file(path, FileRules(layout="joints22")))
-    np.save(path, np.full((4, 322), 7.0, np.float32))
-    assert check_file(path).ok and len(check_file(path).notes) == 1
-
-
-def test_files_that_nothing_reads(tmp_path: Path) -> None:
-    (tmp_path / "a.fbx").write_bytes(b"")
-    (tmp_path / "folder.npy").mkdir()
-    with pytest.raises(UserError, match=r"'\.fbx'.* \.tar"):
-        check_file(tmp_path / "a.fbx")
-    assert "not a plain file" in str(check_file(tmp_path / "folder.npy"))
-    assert "no such file" in str(check_file(tmp_path / "none.npy"))
-    assert list(check_folder(tmp_path)) == []
-    with pytest.raises(UserError, match="smplx322"):
-        FileRules(layout="smpl76")
+    for content, word in (
+        (b"", "0 bytes"),
+        (whole + whole, "two archives"),
+        (whole[:header] + b"damage" * 20 + whole[header + 120 :], "are no tar entries"),
+        (gzip.compress(whole), "not a readable tar"),
+        (whole[: header + 700], "the last whole key is 'a'"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(UserError, match=word):
+            scan_tar(path)
+    for kind in (tarfile.SYMTYPE, tarfile.LNKTYPE, tarfile.FIFOTYPE, tarfile.DIRTYPE, tarfile.CHRTYPE):
+        with pytest.raises(UserError, match="plain files"):
+            scan_tar(tar(path, ("a.motion.npy", b""), kind=kind))
 
 
 class Clips:

@@ -18,7 +18,6 @@ import typer
 from bvh_clips import write_clip, write_map
 from rich.console import Console
 
-from motionloom.datasets.check.files import FileRules
 from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.schema import Manifest
 from motionloom.datasets.shards.index import ShardIndex
@@ -66,7 +65,7 @@ def test_every_option_and_setting_that_a_string_of_the_sources_names_exists() ->
             command = command.get_command(None, word)
         known |= {option for each in command.params for option in (*each.opts, *each.secondary_opts)}
     known |= {option for each in typer.main.get_command(app).params for option in each.opts}
-    configs = [kind.config_class for kind in converters()] + [SynthConfig, FileRules, ServeConfig]
+    configs = [kind.config_class for kind in converters()] + [SynthConfig, ServeConfig]
     configs += [SamplingConfig, FigureOptions, EditTask]
     settings = {"seed_motion", *(key for config in configs for key in config.model_fields)}
     for path in (path for top in ("pipeline", "datasets", "models") for path in (ROOT / top).rglob("*.py")):
@@ -126,7 +125,6 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "synth of a wrong layout": (["data", "synth", "out", "--set", "layout=body13"], "layout"),
     "generate before a model is opened": (["generate", "nowhere", "jump", "-o", "file/sub"], "file: "),
     "report": (["report", "nowhere", "-o", "folder"], "folder: "),
-    "options of files": (["data", "check", "SHARDS", "--set", "layout=h3d263"], "layout"),
     "run of an empty recipe": (["evaluate", "empty"], "empty/recipe.yaml: "),
     "model of an empty recipe": (["generate", "empty", "jump"], "empty/recipe.yaml: "),
     "model of no YAML": (["export", "broken", "-o", "new"], "broken/recipe.yaml: "),
@@ -314,17 +312,12 @@ def test_a_plan(call: Call, tmp_path: Path) -> None:
     assert refused.code == 2 and "give --dry-run too" in refused.err and not refused.out
 
 
-def test_a_check_of_shards_and_of_files(call: Call, shards: Path, damaged: Path, tmp_path: Path) -> None:
+def test_a_check_of_shards(call: Call, shards: Path, damaged: Path) -> None:
     bad = call("data", "check", damaged)
     assert bad.code == 1 and "-train-" in bad.out and "sha256" in bad.out
     shown = call("data", "check", shards, "--json")
     found = loaded(shown.out)
     assert shown.code == 0 and found["problems"] == 0 and found["clips"] == 24 and "no problems" in shown.err
-    (tmp_path / "bad.bvh").write_text("no BVH")
-    shown = call("data", "check", tmp_path / "bad.bvh", "--json")
-    found = loaded(shown.out)
-    assert shown.code == 1 and found["problems"] == 1
-    assert found["files"][0]["ok"] is False and found["files"][0]["problems"]
 
 
 def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:

@@ -146,13 +146,3 @@ def test_commands(call: Callable[..., Any], nasty: Path, tmp_path: Path) -> None
     assert call("data", "check", copied).code == 0  # the page does not disturb the set
     strict = call("data", "check", copied, "--strict")
     assert strict.code == 1 and "warning: " in strict.out and "40 licence" in strict.out
-
-
-def test_loose_files_are_checked(call: Callable[..., Any], tmp_path: Path) -> None:
-    np.save(tmp_path / "good.npy", np.zeros((4, 263), np.float32))
-    good = call("data", "check", tmp_path / "good.npy", "--set", "layout=h3d263")
-    assert good.code == 0 and "good.npy: ok, h3d263" in good.out
-    assert call("data", "check", tmp_path / "good.npy").code == 1
-    (tmp_path / "bad\x1b[2Jname\n.txt").write_text("")
-    bad = call("data", "check", tmp_path, "--set", "layout=h3d263")
-    assert bad.code == 1 and "\x1b" not in bad.out and r"bad\x1b[2Jname\n.txt: no usable text" in bad.out
