@@ -68,20 +68,20 @@ def words() -> CaptionWords:
 
 
 def body_captions(
-    truth: Truth, rng: np.random.Generator, number: int = 3, hands: bool = True, wordings: Wordings = "few"
+    truth: Truth, rng: np.random.Generator, hands: bool = True, wordings: Wordings = "few"
 ) -> list[str]:
-    """`number` different captions of the body, or as many as there are wordings.
+    """Three different captions of the body, or as many as there are wordings.
 
     `hands`: whether the motion holds hands that a caption may be about. Dances to songs have few wordings.
     """
     if isinstance(truth, DanceTruth):
-        return _different(lambda: _dance(truth, rng), number)
+        return _different(lambda: _dance(truth, rng), 3)
+    if wordings == "few":
+        return _different(lambda: _plain(truth, rng, hands), 3)
     if wordings == "many":
-        return _different(lambda: _varied(truth, rng, hands), number)
-    if wordings == "everyday":
-        said = _different(lambda: _varied(truth, rng, hands), max(number - 1, 1))
-        return [*said, *_different(lambda: _varied(truth, rng, False, bare=True), number - len(said))]
-    return _different(lambda: _plain(truth, rng, hands), number)
+        return _different(lambda: _varied(truth, rng, hands), 3)
+    said = _different(lambda: _varied(truth, rng, hands), 2)
+    return [*said, *_different(lambda: _varied(truth, rng, False, bare=True), 3 - len(said))]
 
 
 def face_captions(

@@ -15,7 +15,7 @@ from pydantic import Field, field_validator, model_validator
 from motionloom.datasets.actions.dances import Record
 from motionloom.datasets.schema import Config, Split
 from motionloom.datasets.synth.actions.pose import Track
-from motionloom.datasets.synth.actions.truth import Span, Truth, require_known
+from motionloom.datasets.synth.actions.truth import Span, Truth
 from motionloom.datasets.synth.choreography import choreograph
 from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.song import BEATS, Song, draw_song
@@ -57,16 +57,11 @@ class DanceConfig(Config):
     """Length of a song."""
     in_a_row: int = Field(1, ge=1)
     """Dances, one after another, to the same song, each from its own start; more save playing it again."""
-    genres: list[str] | None = None
-    """None = all; otherwise names of `genres.GENRES`. A genre decides the style of its dances."""
     tempo: tuple[int, int] = (80, 160)
     """Slowest and fastest song, beats a minute."""
     music: Literal["even", "played"] = "even"
     """Metronomes of the built-in synthesiser, or songs that a band plays and a studio records: with a form,
     breaks, drifting tempi and real instruments. Those need FluidSynth and a sound font (`music/band.py`)."""
-    hold_out_songs: float | None = Field(None, ge=0, lt=1)
-    """Share of the songs that only test clips dance to; None = the config's `test_fraction`. Validation has
-    songs of its own too, `val_fraction` of them."""
     hold_out_tempi: list[tuple[int, int]] = Field(default_factory=list)
     """Ranges of beats a minute whose songs are kept for testing, for example `[[110, 119]]`."""
     share: float | None = Field(None, gt=0, le=1)
@@ -74,15 +69,6 @@ class DanceConfig(Config):
     conditions: DanceConditions = DanceConditions()
     columns: Literal["public", "rhythm"] = "public"
     """Features of the music: the 438 published ones, or those of `audio/rhythm_features.py`."""
-    sound: bool = True
-    """Store the sound beside its features."""
-    sample_rate: int = Field(16_000, ge=8_000, le=48_000)
-    """Hz."""
-
-    @field_validator("genres")
-    @classmethod
-    def _known(cls, names: list[str] | None) -> list[str] | None:
-        return require_known(names, tuple(GENRES), "genre")
 
     @field_validator("tempo", "hold_out_tempi")
     @classmethod
@@ -101,17 +87,16 @@ class DanceConfig(Config):
         return DIM if self.columns == "public" else RHYTHM_DIM
 
     def song(self, number: int, seed: int) -> Song:
-        names = tuple(self.genres or GENRES)
-        played = self.music == "played"
         return draw_song(
-            number, seed, genres=names, tempo=self.tempo, seconds=self.song_seconds, played=played
+            number, seed, tempo=self.tempo, seconds=self.song_seconds, played=self.music == "played"
         )
 
     def split(self, song: Song, test: float, val: float) -> Split:
-        """Split of all clips of a song. Songs come in rounds of all genres, so the first are balanced."""
+        """Split of all clips of a song; these shares of songs are kept. Songs come in rounds of all genres,
+        so the first are balanced."""
         if any(low <= song.bpm <= high for low, high in self.hold_out_tempi):
             return "test"
-        tested = round(self.songs * (test if self.hold_out_songs is None else self.hold_out_songs))
+        tested = round(self.songs * test)
         if song.number < tested:
             return "test"
         return "val" if song.number < tested + round(self.songs * val) else "train"

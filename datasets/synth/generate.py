@@ -41,6 +41,10 @@ from motionloom.datasets.synth.music.recording import render_song, song_features
 
 CONVERTER_VERSION = 2  # the face's words are about the body's person
 LICENCE = "CC0-1.0"
+SIZE_SPREAD = 0.02
+"""Standard deviation of body size, as a fraction; `smpl75` holds no shape."""
+SAMPLE_RATE = 16_000
+"""Hz of the sound of dances."""
 _GOLDEN = 0.6180339887498949
 _REST_ROOT = Skeleton.named("smpl22").rest_joints[0]
 
@@ -85,14 +89,9 @@ class SynthConfig(Config):
     max_seconds: float = Field(6.0, le=60.0)
     val_fraction: float = Field(0.05, ge=0, lt=1)
     test_fraction: float = Field(0.15, ge=0, lt=1)
-    captions: int = Field(3, ge=1, le=8)
-    """Different wordings per clip."""
     wordings: Wordings = "few"
     """Words that captions are made of: two or three for each thing in sentences of one form, or a dozen in
     many forms, for models that shall take more words than their training's. Dances of `dances` have few."""
-    size_spread: float = Field(0.02, ge=0, le=0.15)
-    """Standard deviation of body size, as a fraction; 0 = all clips on the uniform skeleton, as always in
-    `smpl75`, which holds no shape."""
     hold_out: list[Record] = Field(default_factory=list)
     """Combinations of truth values kept for testing, for example `[{"action": "kick", "side": "left"}]`."""
     hold_out_val: list[Record] = Field(default_factory=list)
@@ -187,7 +186,7 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
         track.fingers = np.stack([shape_hand(truth.hand(side), track.t, shape) for side in (0, 1)])
     # The shape's generator goes on after the hands: its order is part of what a seed means.
     solved = track.solve()
-    size = float(np.clip(1 + config.size_spread * shape.standard_normal(), 0.8, 1.2))
+    size = float(np.clip(1 + SIZE_SPREAD * shape.standard_normal(), 0.8, 1.2))
     smpl = None
     if layout.name == "smpl75":
         size, smpl = 1.0, smpl75_of(track.rotations(), solved, _REST_ROOT)
@@ -196,11 +195,10 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
     )
     audio = wav = None
     if planned and config.dances and planned.comes in ("audio", "both"):
-        rate, end = config.dances.sample_rate, planned.start + planned.frames
-        audio = song_features(planned.song, rate, layout.fps, config.dances.width)[planned.start : end]
-        if config.dances.sound:
-            first, samples = round(begin * rate), round(planned.frames / layout.fps * rate)
-            wav = render_song(planned.song, rate)[first : first + samples], rate
+        song, rate, end = planned.song, SAMPLE_RATE, planned.start + planned.frames
+        audio = song_features(song, rate, layout.fps, config.dances.width)[planned.start : end]
+        first, samples = round(begin * rate), round(planned.frames / layout.fps * rate)
+        wav = render_song(song, rate)[first : first + samples], rate
     texts, face_texts = captions_of(index, config)
     return Clip(
         joints=canonicalize(solved[:, : layout.num_joints] * size),
@@ -221,7 +219,7 @@ def captions_of(index: int, config: SynthConfig) -> tuple[list[str], list[str]]:
         return [], []
     truth = planned.truth if planned else truth_of(index, config)
     layout, words = config.motion_layout, np.random.default_rng([config.seed, index, 3])
-    texts = body_captions(truth, words, config.captions, layout.num_joints > BODY_JOINTS, config.wordings)
+    texts = body_captions(truth, words, layout.num_joints > BODY_JOINTS, config.wordings)
     face_texts = face_captions(truth, words, body=texts, wordings=config.wordings)
     return texts, face_texts if layout.has("face") else []
 

@@ -12,9 +12,8 @@ unevenness of hands. In a break one chord rings. Beats are those of the song's g
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,9 +30,6 @@ DRUMS = 9
 """The channel of drums."""
 _DRUM_BANK = 128
 
-Stroke = tuple[float, int, Callable[[], object]]
-"""When in seconds, what comes first of what is at one time (the lower), and what is done."""
-
 _KICK, _SNARE, _CLAP, _HAT, _OPEN_HAT, _CRASH, _RIDE, _SHAKER, _RIM = 36, 38, 39, 42, 46, 49, 51, 70, 37
 _TOMS = (50, 48, 45, 43)
 _BASS, _CHORDS, _PAD, _LEAD = range(4)
@@ -46,41 +42,6 @@ _PROGRAMS = {
 }
 _SOFT_HANDS = 0.006
 """Seconds that hands are early or late, standard deviation."""
-
-
-class Instruments:
-    """Sixteen players, dry and at the rate of the samples."""
-
-    def __init__(self, rate: int) -> None:
-        engine, font = _fluidsynth(), sound_font()
-        dry = {"synth.reverb.active": 0, "synth.chorus.active": 0}
-        self.rate = rate
-        self.synth: Any = engine.Synth(gain=0.5, samplerate=rate, channels=16, **dry)
-        self._font = self.synth.sfload(str(font))
-
-    def select(self, channel: int, program: int) -> None:
-        """Give a channel the instrument of a General MIDI number from 0; that of drums a kit."""
-        self.synth.program_select(channel, self._font, _DRUM_BANK if channel == DRUMS else 0, program)
-
-    def play(self, strokes: Iterable[Stroke], seconds: float) -> NDArray[np.float32]:
-        """Strokes in any order -> dry mono samples [seconds * rate], loudest 1. The players then go home."""
-        total = round(seconds * self.rate)
-        timed = sorted(
-            ((round(at * self.rate), first, do) for at, first, do in strokes), key=lambda one: one[:2]
-        )
-        blocks, now = [], 0
-        for at, _, do in timed:
-            if at >= total:
-                break
-            if at > now:
-                blocks.append(self.synth.get_samples(at - now))
-                now = at
-            do()
-        if now < total:
-            blocks.append(self.synth.get_samples(total - now))
-        self.synth.delete()
-        sound = np.concatenate(blocks).reshape(-1, 2).mean(axis=1)
-        return np.asarray(sound / max(1.0, float(np.abs(sound).max())), dtype=np.float32)
 
 
 def band_version() -> str:
@@ -187,18 +148,37 @@ def score(song: Song) -> list[Note]:
 
 def play_band(song: Song, rate: int) -> NDArray[np.float32]:
     """The song as dry mono samples [seconds * rate], loudest 1; `UserError` where there is no band."""
-    band = Instruments(rate)
+    font = sound_font()
+    dry = {"synth.reverb.active": 0, "synth.chorus.active": 0}
+    synth = _fluidsynth().Synth(gain=0.5, samplerate=rate, channels=16, **dry)
+    number = synth.sfload(str(font))
     rng = np.random.default_rng([song.seed, song.number, 251])
     line_up = LineUp.drawn(song, np.random.default_rng([song.seed, song.number, 241]))
     for part, program in line_up.programs.items():
-        band.select(part, program)
-    band.select(DRUMS, int(rng.choice([0, 8, 16, 24, 25, 32, 40])))
-    strokes = []
+        synth.program_select(part, number, 0, program)
+    synth.program_select(DRUMS, number, _DRUM_BANK, int(rng.choice([0, 8, 16, 24, 25, 32, 40])))
+    strokes: list[tuple[int, bool, Note]] = []
     for note in score(song):
         at = max(0.0, note.at + _SOFT_HANDS * rng.standard_normal())
-        strokes.append((at, 1, partial(band.synth.noteon, note.channel, note.pitch, note.loud)))
-        strokes.append((at + note.seconds, 0, partial(band.synth.noteoff, note.channel, note.pitch)))
-    return band.play(strokes, song.seconds)
+        strokes.append((round(at * rate), True, note))
+        strokes.append((round((at + note.seconds) * rate), False, note))
+    total, blocks, now = round(song.seconds * rate), [], 0
+    # Of what is at one time, notes end before others begin.
+    for at, begins, note in sorted(strokes, key=lambda stroke: stroke[:2]):
+        if at >= total:
+            break
+        if at > now:
+            blocks.append(synth.get_samples(at - now))
+            now = at
+        if begins:
+            synth.noteon(note.channel, note.pitch, note.loud)
+        else:
+            synth.noteoff(note.channel, note.pitch)
+    if now < total:
+        blocks.append(synth.get_samples(total - now))
+    synth.delete()
+    sound = np.concatenate(blocks).reshape(-1, 2).mean(axis=1)
+    return np.asarray(sound / max(1.0, float(np.abs(sound).max())), dtype=np.float32)
 
 
 # ---- who plays what

@@ -143,15 +143,10 @@ class Song:
 
 
 def draw_song(
-    number: int,
-    seed: int,
-    *,
-    genres: tuple[str, ...],
-    tempo: tuple[int, int],
-    seconds: float,
-    played: bool = False,
+    number: int, seed: int, *, tempo: tuple[int, int], seconds: float, played: bool = False
 ) -> Song:
     """Song `number` of a pool: genres in shuffled rounds, each genre's tempi spread evenly over the range."""
+    genres = tuple(GENRES)
     rounds, place = divmod(number, len(genres))
     order = np.random.default_rng([seed, rounds, 211]).permutation(len(genres))
     which = int(order[place])

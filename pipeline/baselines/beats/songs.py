@@ -16,7 +16,6 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.synth.music.genres import GENRES
 from motionloom.datasets.synth.music.recording import render_song
 from motionloom.datasets.synth.music.song import Song, draw_song
 from motionloom.pipeline.contract.stage import (
@@ -47,14 +46,7 @@ class SongsConfig(StageConfig):
 
     def song(self, number: int) -> Song:
         """Return one of the band's songs."""
-        return draw_song(
-            number,
-            self.seed,
-            genres=tuple(GENRES),
-            tempo=self.tempo,
-            seconds=self.song_seconds,
-            played=self.played,
-        )
+        return draw_song(number, self.seed, tempo=self.tempo, seconds=self.song_seconds, played=self.played)
 
     def split(self, validation: bool) -> range:
         """Return the numbers of the songs that are kept back, or of the others."""

@@ -24,14 +24,14 @@ from motionloom.datasets.audio.beat_net import (
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.recording import render_song
-from motionloom.datasets.synth.music.song import draw_song
+from motionloom.datasets.synth.music.song import Song
 from motionloom.pipeline.contract.generation import Prompt
 
 RATE = 16_000
 
 
 def even_song(genre: str, bpm: int) -> Sound:
-    song = draw_song(0, 1, genres=(genre,), tempo=(bpm, bpm), seconds=20.0)
+    song = Song(0, 1, genre, bpm, 3, 20.0)
     return Sound(render_song(song, RATE), RATE)
 
 

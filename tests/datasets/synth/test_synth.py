@@ -235,7 +235,6 @@ def test_held_out_combinations_are_in_their_own_split_only() -> None:
         ({"hold_out": [{"colour": "red"}]}, "colour"),
         ({"hold_out_val": [{"shape": "round"}]}, "shape"),
         ({"val_fraction": 0.6, "test_fraction": 0.5}, "nothing to train"),
-        ({"dances": {"genres": ["polka"]}}, "polka"),
         ({"dances": {"tempo": [90, 300]}}, "tempi"),
         ({"dances": {"hold_out_tempi": [[120, 100]]}}, "tempi"),
         ({"dances": {"conditions": {"both": 0}}}, "weight"),

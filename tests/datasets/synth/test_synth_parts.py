@@ -29,7 +29,7 @@ def test_every_caption_says_what_decides_the_motion(action: str, wordings: Wordi
     for seed in range(60):
         rng = np.random.default_rng(seed)
         truth = draw(action, rng)
-        texts = body_captions(truth, rng, 3, wordings=wordings)
+        texts = body_captions(truth, rng, wordings=wordings)
         assert len(texts) == len(set(texts)) >= 2
         for number, text in enumerate(texts):
             assert not re.search(r"[{}|]|None|  ", text), text
