@@ -63,19 +63,10 @@ _TEMPO_SECONDS = 8.0
 
 
 class AudioSettings(Config):
-    """Settings of audio features; the defaults are Bailando's and UDE's at 60 frames a second."""
+    """Settings of audio features."""
 
     fps: float = Field(default=60.0, ge=5, le=240)
-    """Frames a second: 60 (published), 7.5 (Bailando's GPT), or a motion's own 20 or 30."""
-
-    octaves: int | None = Field(default=None, ge=1, le=7)
-    """Octaves of chroma from C1. Default: 7, or as many as fit below half the sample rate (5 at 7.5 fps)."""
-
-    start_bpm: float = Field(default=120.0, gt=0)
-    """Tempo that beat tracking leans to."""
-
-    tightness: float = Field(default=100.0, gt=0)
-    """How evenly beats must be spaced."""
+    """Frames a second: 60 (Bailando, UDE), 7.5 (Bailando's GPT), or a motion's own 20 or 30."""
 
     @field_validator("fps")
     @classmethod
@@ -95,16 +86,11 @@ def audio_features(
 ) -> NDArray[np.float32]:
     """Return features of mono samples [n] at `rate` Hz, [1 + n' // 512, 438], n' at the settings' rate.
 
-    `UserError` for sound of fewer than three frames, or more octaves than fit.
+    `UserError` for sound of fewer than three frames. Chroma has 7 octaves from C1 on, or as many as fit below
+    half the sample rate (5 at 7.5 frames a second).
     """
     settings = settings or AudioSettings()
-    samples = _prepared(samples, rate, settings)
-    fitting = fitting_octaves(settings.rate)
-    octaves = settings.octaves or fitting
-    if octaves > fitting:
-        raise UserError(
-            f"octaves: {octaves} do not fit at {settings.fps:g} frames a second; at most {fitting}"
-        )
+    samples, octaves = _prepared(samples, rate, settings), fitting_octaves(settings.rate)
     librosa = load_librosa()
     with _no_remarks():
         spectra = separate(samples, settings.rate)
@@ -116,7 +102,7 @@ def audio_features(
             librosa.feature.delta(mfcc, width=3),
             librosa.feature.chroma_cqt(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
             onsets[None],
-            np.bincount(_beat_frames(onsets, settings), minlength=len(onsets))[None],
+            np.bincount(track_beats(onsets, settings.rate), minlength=len(onsets))[None],
             tempogram(onsets, DIM - 54),
         ]
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
@@ -128,7 +114,7 @@ def beats(samples: NDArray[np.float32], rate: int) -> NDArray[np.float64]:
     samples = _prepared(samples, rate, settings)
     with _no_remarks():
         onsets = onset_strength(separate(samples, settings.rate).percussive_mel)
-        return np.asarray(_beat_frames(onsets, settings) / settings.fps)
+        return np.asarray(track_beats(onsets, settings.rate) / settings.fps)
 
 
 def features_of(sound: Sound, fps: float, width: int = DIM, rate: float | None = None) -> NDArray[np.float32]:
@@ -234,10 +220,6 @@ def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArra
     return np.asarray(magnitude)
 
 
-def _beat_frames(onsets: NDArray[np.float32], settings: AudioSettings) -> NDArray[np.int64]:
-    return track_beats(onsets, settings.rate, start_bpm=settings.start_bpm, tightness=settings.tightness)
-
-
 def onset_strength(mel: NDArray[np.float32]) -> NDArray[np.float32]:
     """Mel power [128, T] -> [T]: the median rise over the bands."""
     librosa = load_librosa()
@@ -250,20 +232,16 @@ def tempogram(onsets: NDArray[np.float32], width: int) -> NDArray[np.float32]:
     return np.concatenate([block.astype(np.float32) for block in _tempograms(onsets, width)], axis=1)
 
 
-def track_beats(
-    onsets: NDArray[np.float32], rate: int, *, start_bpm: float, tightness: float
-) -> NDArray[np.int64]:
+def track_beats(onsets: NDArray[np.float32], rate: int) -> NDArray[np.int64]:
     """`librosa.beat.beat_track`: frames of the beats of onset strengths [T], ascending."""
     librosa = load_librosa()
     if not onsets.any():
         return np.empty(0, dtype=np.int64)
     width = int(librosa.time_to_frames(_TEMPO_SECONDS, sr=rate, hop_length=HOP))
     mean = sum(block.sum(axis=1, keepdims=True) for block in _tempograms(onsets, width)) / len(onsets)
-    tempo = librosa.feature.tempo(tg=mean, sr=rate, hop_length=HOP, start_bpm=start_bpm)
+    tempo = librosa.feature.tempo(tg=mean, sr=rate, hop_length=HOP)
     with np.errstate(divide="ignore"):  # at 5 frames a second a beat can be a frame, and 0 a step it refuses
-        _, frames = librosa.beat.beat_track(
-            onset_envelope=onsets, sr=rate, hop_length=HOP, bpm=tempo, tightness=tightness
-        )
+        _, frames = librosa.beat.beat_track(onset_envelope=onsets, sr=rate, hop_length=HOP, bpm=tempo)
     return np.asarray(frames)
 
 

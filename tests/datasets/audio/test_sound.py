@@ -22,34 +22,6 @@ def tone() -> np.ndarray:
     return (0.5 * np.sin(2 * np.pi * 220 * np.arange(RATE) / RATE)).astype(np.float32)
 
 
-@pytest.mark.parametrize(
-    ("name", "subtype", "error"),
-    [
-        ("a.wav", "PCM_U8", 2**-7),
-        ("a.wav", "PCM_16", 2**-15),
-        ("a.wav", "PCM_24", 2**-23),
-        ("RF64", "PCM_24", 2**-23),
-        ("WAVEX", "PCM_24", 2**-23),
-        ("a.wav", "PCM_32", 1e-7),
-        ("a.wav", "FLOAT", 0.0),
-        ("a.wav", "DOUBLE", 0.0),
-        ("a.flac", "PCM_16", 2**-15),
-        ("a.ogg", "VORBIS", 0.05),
-        ("a.mp3", "MPEG_LAYER_III", 0.05),
-    ],
-)
-def test_every_encoding_gives_the_same_sound(
-    tmp_path: Path, tone: np.ndarray, name: str, subtype: str, error: float
-) -> None:
-    path = tmp_path / (name if "." in name else "a.wav")
-    soundfile.write(path, tone, RATE, subtype=subtype, format=None if "." in name else name)
-    samples, rate = read_sound(path)
-    assert (rate, samples.dtype, samples.shape) == (RATE, np.float32, tone.shape)
-    assert np.abs(samples).max() <= 1
-    assert np.abs(samples - tone).max() <= error
-    assert sound_seconds(path) == pytest.approx(1.0)
-
-
 def test_what_libsndfile_reads_is_read_whatever_its_suffix(tmp_path: Path, tone: np.ndarray) -> None:
     stereo, suffixes = np.stack([tone, 0.5 * tone], axis=1), (".wav", ".mp3", ".flac", ".dat")
     for form in soundfile.available_formats():
@@ -61,7 +33,11 @@ def test_what_libsndfile_reads_is_read_whatever_its_suffix(tmp_path: Path, tone:
             except (soundfile.SoundFileError, ValueError):  # a kind that libsndfile cannot write so
                 continue
             samples, own_rate = read_sound(path)
-            assert (own_rate, len(samples)) == (rate, len(expected)), (form, subtype)
+            assert (own_rate, len(samples), samples.dtype) == (rate, len(expected), np.float32), (
+                form,
+                subtype,
+            )
+            assert sound_seconds(path) == len(samples) / rate
             assert np.abs(samples - expected.mean(axis=1).clip(-1, 1)).max() < 1e-5, (form, subtype)
 
 
@@ -94,21 +70,6 @@ def test_stereo_is_averaged_overshoot_clipped_and_another_unit_refused(
         read_sound(path)
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"),
-    [
-        ("zero_samples.wav", "0 samples"),
-        ("truncated.wav", "1600 bytes of sound, 16000 expected"),
-        ("sample_rate_zero.wav", "no sample rate"),
-        ("not_riff.wav", "of no known format"),
-        ("float_nan.wav", "NaN or infinity at sample 2"),
-    ],
-)
-def test_broken_wavs(shared: Path, name: str, reason: str) -> None:
-    with pytest.raises(UserError, match=f"{name}: .*{reason}"):
-        read_sound(shared / "data/broken/wav" / name)
-
-
 def test_damage_anywhere_in_a_wav_is_told(tmp_path: Path, tone: np.ndarray) -> None:
     whole = tmp_path / "whole.wav"
     soundfile.write(whole, tone[:200], RATE, subtype="FLOAT")
@@ -118,20 +79,6 @@ def test_damage_anywhere_in_a_wav_is_told(tmp_path: Path, tone: np.ndarray) -> N
         path.write_bytes(raw[:size])
         with pytest.raises(UserError, match=r"cut\.wav: "):
             read_sound(path)
-
-
-def test_damaged_flac_and_unknown_files(tmp_path: Path, tone: np.ndarray) -> None:
-    path = tmp_path / "a.flac"
-    soundfile.write(path, tone, RATE)
-    path.write_bytes(path.read_bytes()[:-500])
-    with pytest.raises(UserError, match=r"a\.flac: "):
-        read_sound(path)
-    path.write_bytes(b"not sound at all")
-    for read in (read_sound, sound_seconds):
-        with pytest.raises(UserError, match=r"a\.flac: "):
-            read(path)
-    with pytest.raises(UserError, match="no such file"):
-        read_sound(tmp_path / "absent.wav")
 
 
 def test_resampling_equals_the_golden_vectors(shared: Path) -> None:
@@ -215,15 +162,6 @@ def mp3(path: Path, samples: np.ndarray, rate: int = 44100, **how: Any) -> bytes
     return path.read_bytes()
 
 
-@pytest.mark.parametrize("rate", [8000, 22050, 48000])
-@pytest.mark.parametrize("channels", [1, 2])
-def test_mp3s_of_every_rate(tmp_path: Path, tone: np.ndarray, rate: int, channels: int) -> None:
-    path = tmp_path / "a.mp3"
-    mp3(path, np.repeat(tone[:, None], channels, axis=1), rate)
-    samples, found = read_sound(path)
-    assert (found, samples.shape) == (rate, tone.shape)
-
-
 ID3 = b"ID3\x04\0\0\0\0\x10\0" + bytes(2048)
 
 
@@ -269,7 +207,7 @@ def test_a_whole_file_may_lack_its_last_block(
             read_sound(path)
 
 
-def test_damaged_mp3s_and_oggs(tmp_path: Path, tone: np.ndarray) -> None:
+def test_damaged_files_of_every_kind(tmp_path: Path, tone: np.ndarray) -> None:
     path = tmp_path / "a.mp3"
     raw = mp3(path, np.tile(tone, 5))
     half = len(raw) // 2
@@ -283,11 +221,18 @@ def test_damaged_mp3s_and_oggs(tmp_path: Path, tone: np.ndarray) -> None:
         path.write_bytes(damaged)
         with pytest.raises(UserError, match=rf"a\.mp3: {reason}"):
             read_sound(path)
-    path = tmp_path / "a.ogg"
-    soundfile.write(path, np.tile(tone, 5), RATE)
-    path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(UserError, match=r"a\.ogg: .*cut short"):
-        read_sound(path)
+    for name in ("a.ogg", "a.flac"):
+        path = tmp_path / name
+        soundfile.write(path, np.tile(tone, 5), RATE)
+        path.write_bytes(path.read_bytes()[:-2000])
+        with pytest.raises(UserError, match=f"{name}: "):
+            read_sound(path)
+    path.write_bytes(b"not sound at all")
+    for read in (read_sound, sound_seconds):
+        with pytest.raises(UserError, match=r"a\.flac: "):
+            read(path)
+    with pytest.raises(UserError, match="no such file"):
+        read_sound(tmp_path / "absent.wav")
 
 
 # Parts of sound files by name.
