@@ -17,7 +17,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +113,8 @@ def build_with_encoder(
     if not wanted:
         raise UserError("no captions to encode: the dataset has none")
     old = _reusable(folder, encoder)
-    new = sorted(wanted.keys() - (old.keys() if old else set()))
+    rows = old.find(list(wanted.values())).tolist() if old else [-1] * len(wanted)
+    new = sorted(key for key, row in zip(wanted, rows, strict=True) if row < 0)
     if old is not None and not new:
         return old
     place = folder / "parts"
@@ -130,7 +131,7 @@ def build_with_encoder(
         for _ in track(done, "encoding captions", total=len(parts), disable=not progress):
             pass
     texts = {**(old.captions_by_key() if old else {}), **wanted}
-    _merge(folder, texts, new, parts, old, encoder)
+    _merge(folder, texts, parts, old, encoder)
     shutil.rmtree(place)
     return TextCache.open(folder)
 
@@ -188,18 +189,13 @@ def _encode_part(part: _Part, encoder: TextEncoder) -> None:
 
 
 def _merge(
-    folder: Path,
-    texts: dict[bytes, str],
-    new: Sequence[bytes],
-    parts: Sequence[_Part],
-    old: TextCache | None,
-    encoder: TextEncoder,
+    folder: Path, texts: dict[bytes, str], parts: Sequence[_Part], old: TextCache | None, encoder: TextEncoder
 ) -> None:
     """Stream everything into the five files; they replace the old ones together, `cache.json` last."""
     # Parts are ranges of ascending keys, so one pass over all keys takes each entry in its turn.
-    keys, fresh = sorted(texts), set(new)
+    keys = sorted(texts)
     # Row in the old cache, or -1: the next of the parts.
-    rows = [-1 if old is None or key in fresh else cast(int, old.row(key)) for key in keys]
+    rows = old.find([texts[key] for key in keys]).tolist() if old else [-1] * len(keys)
     known = old.lengths() if old else np.empty(0, dtype=np.int64)
     measured = (int(n) for part in parts for n in _load(part, "lengths"))
     lengths = [next(measured) if row < 0 else int(known[row]) for row in rows]

@@ -26,6 +26,8 @@ from numpy.typing import NDArray
 from motionloom.datasets.schema import Config, UserError
 
 SIMILARITY = "similarity"
+_KEY = np.dtype("S32")
+"""A sha256; numpy compares all of its bytes, those after a zero too."""
 
 
 class CacheInfo(Config):
@@ -63,8 +65,6 @@ class TextCache:
             raise UserError(f"{folder}/offsets.npy: damaged; run the text stage again")
         other = folder / SIMILARITY
         self._other = TextCache(other) if (other / "cache.json").exists() else None
-        # The first eight bytes of the ascending keys as numbers: searched first, then the whole key is.
-        self._heads = np.ascontiguousarray(self._keys[:, :8]).view(">u8").reshape(n).astype(np.uint64)
 
     @staticmethod
     def open(folder: Path | str) -> TextCache:
@@ -101,10 +101,6 @@ class TextCache:
         out[mask] = torch.from_numpy(found).float().numpy()  # four times as fast as numpy's
         return out, mask
 
-    def keys(self) -> set[bytes]:
-        """sha256 of every caption here."""
-        return {row.tobytes() for row in self._keys}
-
     def captions_by_key(self) -> dict[bytes, str]:
         lines = (self.folder / "captions.jsonl").read_text(encoding="utf-8").splitlines()
         return {key_of(text): text for text in map(json.loads, lines)}
@@ -112,32 +108,24 @@ class TextCache:
     def lengths(self) -> NDArray[np.int64]:
         return np.asarray(np.diff(self._offsets))
 
-    def row(self, key: bytes) -> int | None:
-        head = np.uint64(int.from_bytes(key[:8], "big"))
-        first = int(np.searchsorted(self._heads, head, side="left"))
-        while first < len(self._heads) and self._heads[first] == head:
-            if self._keys[first].tobytes() == key:
-                return first
-            first += 1
-        return None
-
     def entry(self, row: int) -> tuple[NDArray[np.float32], NDArray[np.float16]]:
         """(sentence [E], tokens [S, E]) of one row."""
         return self._sentence[row], self._tokens[self._offsets[row] : self._offsets[row + 1]]
 
+    def find(self, captions: Sequence[str]) -> NDArray[np.int64]:
+        """Rows [n] of captions, -1 where one is not here."""
+        wanted = np.frombuffer(b"".join(map(key_of, captions)), dtype=_KEY)
+        known = self._keys.view(_KEY)[:, 0]
+        rows = np.searchsorted(known, wanted).clip(max=len(known) - 1)
+        return np.where(known[rows] == wanted, rows, -1)
+
     def _rows(self, captions: Sequence[str]) -> NDArray[np.int64]:
-        keys = np.frombuffer(b"".join(map(key_of, captions)), dtype=np.uint8).reshape(-1, 32)
-        heads = np.ascontiguousarray(keys[:, :8]).view(">u8").reshape(-1).astype(np.uint64)
-        rows = np.searchsorted(self._heads, heads).clip(max=len(self._keys) - 1)
-        # Where the whole key is another, two keys begin alike or the caption is not here.
-        for i in np.flatnonzero((self._keys[rows] != keys).any(axis=1)).tolist():
-            row = self.row(keys[i].tobytes())
-            if row is None:
-                raise UserError(
-                    f"caption '{captions[i][:80]}' is not in the text cache {self.folder}; run the text "
-                    "stage again"
-                )
-            rows[i] = row
+        rows = self.find(captions)
+        if len(rows) and rows.min() < 0:
+            raise UserError(
+                f"caption '{captions[int(rows.argmin())][:80]}' is not in the text cache {self.folder}; run "
+                f"the text stage again"
+            )
         return rows
 
     def __getstate__(self) -> Path:

@@ -14,7 +14,6 @@ from torch import Tensor
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import PRESENT_ALL, UserError
-from motionloom.datasets.text.cache import key_of
 from motionloom.models.evaluator.network import PART, Evaluator
 from motionloom.pipeline.store.networks import LoadedTma, device_of
 from motionloom.pipeline.store.text import TextSource
@@ -58,7 +57,7 @@ class StageWords:
                 f"{self.where}: this evaluator was trained on captions as {self.encoder} encodes them and is "
                 f"given those of {cache.encoder}; give it its own text stage, or train it again"
             )
-        unknown = [caption for caption in captions if cache.row(key_of(caption)) is None]
+        unknown = [captions[i] for i in np.flatnonzero(cache.find(captions) < 0).tolist()]
         if unknown:
             raise UserError(
                 f"{cache.folder}: {len(unknown)} of the {len(captions)} captions to be judged are not here, "

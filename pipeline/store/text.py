@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.places import hub_is_away
 from motionloom.datasets.schema import Config, UserError
-from motionloom.datasets.text.cache import CacheInfo, TextCache, key_of
+from motionloom.datasets.text.cache import CacheInfo, TextCache
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json
 from motionloom.pipeline.store.known_captions import (
@@ -107,7 +107,7 @@ class TextSource:
         """Token features [n, S, E] and the mask [n, S] of captions: as the cache has them, or, where one is
         missing there (captions of another run's data, an export), by the encoder.
         """
-        if not self.exported and all(self.cache.row(key_of(text)) is not None for text in captions):
+        if not self.exported and (self.cache.find(captions) >= 0).all():
             return self.cache.tokens(captions)
         encoded = self.encoder.encode(captions)
         return encoded.tokens, encoded.mask
