@@ -74,9 +74,8 @@ class BodyModel:
     def load(path: Path, skeleton: SkeletonName) -> BodyModel:
         """The user's SMPL, SMPL-H or SMPL-X model (.npz), reduced to the joints of `skeleton`.
 
-        Reads `J_regressor` [J, V] (or its non-zeros as `J_regressor_row`, `_col`, `_data`), `v_template`
-        [V, 3], `shapedirs` [V, 3, B] and `kintree_table` [2, J]. Refuses pickles, and trees that are not
-        SMPL's.
+        Reads `J_regressor` [J, V], `v_template` [V, 3], `shapedirs` [V, 3, B] and `kintree_table` [2, J].
+        Refuses pickles, and trees that are not SMPL's.
         """
         if path.suffix.lower() in (".pkl", ".pickle"):
             raise UserError(f"{path} {_PICKLE}")
@@ -180,18 +179,8 @@ def _shapes(file: NpzFile, vertices: int, kind: str) -> NDArray[np.float64]:
 
 
 def _regressor(file: NpzFile, joints: int, vertices: int) -> NDArray[np.float64]:
-    """Joint regressor [J, V], from its dense form or its non-zeros."""
-    shape = (joints, vertices)
-    parts = [f"J_regressor_{part}" for part in ("row", "col", "data")]
-    if "J_regressor" not in file.names and file.names.issuperset(parts):
-        row, column, data = (file.numbers(part, limit=_MODEL_BYTES) for part in parts)
-        inside = row.shape == column.shape == data.shape and row.ndim == 1 and row.size
-        if not inside or row.min() < 0 or column.min() < 0 or row.max() >= joints or column.max() >= vertices:
-            raise UserError(f"{file.label}: J_regressor's non-zeros do not fit {list(shape)}")
-        dense = np.zeros(shape)
-        np.add.at(dense, (row.astype(np.int64), column.astype(np.int64)), data)
-        return dense
+    """Joint regressor [J, V]."""
     regressor = file.numbers("J_regressor", limit=_MODEL_BYTES)
-    if regressor.shape != shape:
-        raise UserError(f"{file.label}: J_regressor is {list(regressor.shape)}, not {list(shape)}")
+    if regressor.shape != (joints, vertices):
+        raise UserError(f"{file.label}: J_regressor is {list(regressor.shape)}, not {[joints, vertices]}")
     return regressor

@@ -179,20 +179,6 @@ def test_shape_values_may_be_fewer_or_more_than_the_model_has(tmp_path: Path) ->
         body.rest_joints(betas[None, :10])
 
 
-def test_regressor_as_non_zeros(tmp_path: Path) -> None:
-    model = made_up_model(24)
-    np.savez(tmp_path / "dense.npz", **model)
-    dense = model.pop("J_regressor")
-    row, column = np.nonzero(dense)
-    parts = {"J_regressor_row": row, "J_regressor_col": column, "J_regressor_data": dense[row, column]}
-    np.savez_compressed(tmp_path / "sparse.npz", **model, **parts)
-    loaded = [BodyModel.load(tmp_path / name, "smpl22") for name in ("dense.npz", "sparse.npz")]
-    np.testing.assert_array_equal(loaded[0].template, loaded[1].template)
-    np.savez(tmp_path / "wrong.npz", **model, **(parts | {"J_regressor_row": row + 24}))
-    with pytest.raises(UserError, match="J_regressor"):
-        BodyModel.load(tmp_path / "wrong.npz", "smpl22")
-
-
 def test_pickles_are_never_opened(tmp_path: Path) -> None:
     path = tmp_path / "basicModel_neutral.pkl"
     path.write_bytes(b"anything")

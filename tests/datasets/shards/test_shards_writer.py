@@ -19,9 +19,6 @@ import pytest
 
 from motionloom.datasets.base.lock import LOCK_FILE, folder_lock
 from motionloom.datasets.check.dataset import check
-from motionloom.datasets.motion.canonical import canonicalize
-from motionloom.datasets.motion.features.codec import decode, encode
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards import tasks
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, kind_of_reason, tally, write_left_out
@@ -54,23 +51,6 @@ def test_manifest_and_drops(made: ModuleType, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "manifest.json").read_text())["shards"][0]["samples"] == 8
     with pytest.raises(UserError, match=r"^8: RuntimeError: unreadable"):
         made.write(tmp_path / "strict", convert=made.Convert(drop=(3,), bad=(8,)), strict=True)
-
-
-def test_webdataset_reads_the_same_contents(made: ModuleType, tmp_path: Path) -> None:
-    import webdataset
-
-    made.write(tmp_path)
-    dataset = ShardDataset.open(tmp_path, "train")
-    names = [str(tmp_path / shard.name) for shard in dataset.manifest.shards if shard.split == "train"]
-    pipeline = webdataset.WebDataset(names, shardshuffle=False).decode()
-    seen = list(pipeline)
-    assert len(seen) == len(dataset) == 36
-    assert len({sample["__key__"] for sample in seen}) == 36
-    for i, sample in enumerate(seen):
-        assert sample["meta.json"]["id"] == dataset.ids[i]
-        np.testing.assert_array_equal(sample["motion.npy"], dataset.motion(i))
-        assert sample["texts.json"] == [caption.dump() for caption in dataset.texts(i)]
-        assert ("face_texts.json" in sample) == bool(dataset.has("face_texts.json")[i])
 
 
 def test_clips_are_shuffled_over_shards_by_the_seed(made: ModuleType, tmp_path: Path) -> None:
@@ -254,24 +234,6 @@ def test_a_file_system_without_locks_is_written_with_a_warning(
     with pytest.warns(UserWarning, match="locks"):
         made.write(tmp_path, count=5)
     assert (tmp_path / "manifest.json").exists()
-
-
-@pytest.mark.parametrize("name", ["body133", "wholebody313"])
-def test_ten_seconds_of_joints_move_by_millimetres(name: str) -> None:
-    """The heading and the place on the ground are sums over all frames before, so errors there add up."""
-    layout = MotionLayout.named(name)
-    time = np.arange(int(10 * layout.fps)) / layout.fps
-    rng = np.random.default_rng(0)
-    shape = (layout.num_joints, 3)
-    sway = 0.1 * np.sin(rng.uniform(1, 9, shape) * time[:, None, None] + rng.uniform(0, 6, shape))
-    joints = layout.skeleton.rest_joints + sway
-    joints[..., 2] += 1.4 * time[:, None]
-    joints = canonicalize(joints)
-    features = encode(joints, layout)
-    moved = decode(features.astype(np.float16).astype(np.float32), layout) - decode(features, layout)
-    local = np.abs(moved - moved[:, :1]).max()
-    print(f"{name}: {1e3 * np.abs(moved).max():.2f} mm, {1e3 * local:.2f} mm beside the root")
-    assert np.abs(moved).max() < 0.01 and local < 0.002
 
 
 def drops(*reasons: str) -> list[Dropped]:
