@@ -17,7 +17,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.convert.bvh.joint_guess.guess import JointGuess, guess_joint_map
+from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map, summary
 from motionloom.datasets.convert.bvh.read import read_header, read_motion
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.captions.humanml_index import (
@@ -103,12 +103,14 @@ def choose_maps(
         kept = _kept(guess, key, joints[key], folder)
         if kept is None:
             cure = _cure(key, target, folder)
-            doubts[key] = f"the joint map of {guess.source} is not certain: {guess.doubts()}; {cure}"
+            label = motions[0].name
+            doubts[key] = f"the joint map of {label} is not certain: no joint for {guess.doubts()}; {cure}"
             continue
         maps[key] = kept
-        same = kept.sources == tuple(row.sources for row in guess.rows)
-        how = f"guessed from {guess.source}; {guess.summary()}" if same else f"read from {kept.where}"
-        plan.notes.append(f"joint map {how}")
+        same = kept.sources == guess.sources
+        plan.notes.append(
+            f"joint map {guess.where}; {summary(guess)}" if same else f"joint map read from {kept.where}"
+        )
     # A map that fits no file is a mistake, unless it lies in a folder with the maps of other sources.
     used = {one.where for one in maps.values()}
     for one in own_maps:
@@ -163,22 +165,22 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
     return found
 
 
-def _kept(guess: JointGuess, key: str, joints: Sequence[str], folder: Path | None) -> JointMap | None:
+def _kept(guess: JointMap, key: str, joints: Sequence[str], folder: Path | None) -> JointMap | None:
     """Return a skeleton's map that lies in `folder`, as an earlier run guessed it or a hand completed it,
     so that files that come later change nothing for the others. Where there is none, the guess is written
     there, and returned if it is certain.
     """
-    where = _place(key, guess.target)
+    where, certain = _place(key, guess.target), not guess.open_rows
     if folder is not None:
         path = folder / where
         if not path.exists():
-            write_text(path, guess.text(key))
+            todo = "" if certain else ". NOT CERTAIN: fill in the rows that say null"
+            write_text(path, guess.text(f"{guess.where}: {summary(guess)}{todo}", key))
         with suppress(UnfinishedMapError):
             kept = replace(JointMap.load(path, target=guess.target.name), where=where)
-            if guess.certain or kept.sources != tuple(row.sources for row in guess.rows):
-                kept.require_fit(joints, guess.source)
-                return kept
-    return guess.joint_map(where) if guess.certain else None
+            kept.require_fit(joints, guess.where)
+            return kept
+    return replace(guess, where=where) if certain else None
 
 
 def _place(key: str, target: Skeleton) -> str:

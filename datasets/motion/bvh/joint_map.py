@@ -7,7 +7,7 @@ purpose), `unit` and `up` of the files it is for, and `skeleton`: a map with thi
 skeleton alone. The End Site of joint `Foot` is named `End Site of Foot`; `ends` places it for figures that
 have none, in multiples of the distance from the joint's parent. Only positions cross the map: rest poses and
 bone axes of the two skeletons differ.
-Guessed ones come from `convert/bvh/joint_guess`.
+Guessed ones come from `convert/bvh/joint_guess.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +73,7 @@ class JointMap:
     where: str
     target: Skeleton
     sources: tuple[tuple[str, ...], ...]
-    """Per target joint the source names whose mean is taken."""
+    """Per target joint the source names whose mean is taken; none in an open row of a guess."""
     unmapped: tuple[str, ...] = ()
     skeleton: str = ""
     """`skeleton_key` of the only files that it is for; empty for all that have its joints."""
@@ -84,6 +84,18 @@ class JointMap:
     """End Sites that the files do not have, by their joints."""
     measured: bool = False
     """Whether the unit was measured on the figures, and not stated."""
+
+    @property
+    def open_rows(self) -> tuple[str, ...]:
+        """Joints of the target for which a guess has no certain source."""
+        return tuple(
+            joint for joint, names in zip(self.target.joints, self.sources, strict=True) if not names
+        )
+
+    def doubts(self) -> str:
+        """The open rows, of many the first eight."""
+        more = len(self.open_rows) - 8
+        return ", ".join(self.open_rows[:8]) + (f" and {more} more" if more > 0 else "")
 
     def read_as(self) -> list[object]:
         """Return all that positions depend on, as plain JSON: nothing of where the map came from."""
@@ -175,23 +187,23 @@ class JointMap:
                 joints[:, joint] = world[:, [index[name] for name in names]].mean(axis=1)
         return joints
 
+    def text(self, note: str, skeleton: str = "") -> str:
+        """The map file, one row a line so that it can be corrected by hand; open rows are null."""
 
-def map_text(
-    target: Skeleton,
-    sources: Sequence[tuple[str, ...] | None],
-    *,
-    note: str,
-    unmapped: Sequence[str] = (),
-    **more: Any,
-) -> str:
-    """A map file with one row a line, so that it can be corrected by hand; None is a row to be filled in."""
+        def row(index: int, names: tuple[str, ...]) -> str:
+            source = names[0] if len(names) == 1 else names or None
+            return json.dumps([index, self.target.joints[index], source], ensure_ascii=False)
 
-    def row(index: int, names: tuple[str, ...] | None) -> str:
-        source = names[0] if names is not None and len(names) == 1 else names
-        return json.dumps([index, target.joints[index], source], ensure_ascii=False)
-
-    rows = ",\n  ".join(row(index, names) for index, names in enumerate(sources))
-    fields = {"note": note, **more, "unmapped": list(unmapped)}
-    rest = [f"{json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}" for key, value in fields.items()]
-    body = ",\n ".join([*rest[:-1], f'"{target.name}": [\n  {rows}]', rest[-1]])
-    return "{" + body + "}\n"
+        rows = ",\n  ".join(row(index, names) for index, names in enumerate(self.sources))
+        fields = {
+            "note": note,
+            "skeleton": skeleton,
+            "ends": dict(self.ends),
+            "unmapped": list(self.unmapped),
+        }
+        lines = [
+            f"{json.dumps(key)}: {json.dumps(value, ensure_ascii=False)}"
+            for key, value in fields.items()
+            if value
+        ]
+        return "{" + ",\n ".join([*lines, f'"{self.target.name}": [\n  {rows}]']) + "}\n"

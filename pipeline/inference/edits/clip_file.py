@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.bvh.joint_guess.guess import guess_joint_map
+from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
@@ -85,13 +85,12 @@ def _read_bvh(path: Path) -> RecordedClip:
     """The joints that are known by their names; hands only where all fingers are found."""
     motion = read_bvh(path)
     guesses = [guess_joint_map(motion, Skeleton.named(name)) for name in ("smplx52", "smpl22")]
-    guess = next((one for one in guesses if one.certain), None)
-    if guess is None:
+    joint_map = next((one for one in guesses if not one.open_rows), None)
+    if joint_map is None:
         raise UserError(
-            f"{path}: not a skeleton that is known ({guesses[1].doubts()}); convert it with a joint map of "
-            f"its own: motionloom data convert bvh --set joint_map=FILE"
+            f"{path}: not a skeleton that is known (no joint for {guesses[1].doubts()}); convert it with a "
+            f"joint map of its own: motionloom data convert bvh --set joint_map=FILE"
         )
-    joint_map = guess.joint_map(str(path))
     unit, up, _ = settled(joint_map, [motion])
     joints = joint_map.apply(motion, unit=unit, up=up)
     return RecordedClip(str(path), joints[added_frames(joints) :], motion.fps)

@@ -1,1 +1,0 @@
-"""Guessing a joint map: which joints of a foreign skeleton stand for ours."""
