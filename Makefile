@@ -28,7 +28,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "motionloom needs Python 3.11 or newer; name one: make PYTHON=python3.12 demo"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip -c constraints.txt
-	$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[band,film,glb,remote,tensorboard]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[band,glb,remote,tensorboard]'
 	@touch $(STAMP)
 
 # On a CPU, two processes of one thread train these small networks faster than one of two threads, and do not slow

@@ -1,33 +1,32 @@
-"""The pictures of the documentation: one row of poses per caption or song.
+"""The pictures of the documentation: one row of poses per caption or song, as the page draws them.
 
 python docs/pictures.py runs/humantomato-tiny docs/pictures/demo.png
 python docs/pictures.py runs/bvh-body walk.png "a person walks and turns left" --seed 3
-python docs/pictures.py synthetic docs/pictures/demo.png
 python docs/pictures.py runs/ude-tiny docs/pictures/dance.png --dances 3
 
-The first argument is a run folder, an exported folder, or the word `synthetic` (clips of the synthetic
-source). With `--dances` rows are dances to songs of the run's test split, each pose on a beat of the music.
+The first argument is a run folder or an exported folder. With `--dances` rows are dances to songs of the
+run's test split, each pose on a beat of the music. Chromium draws (`playwright`).
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from contact_sheet import contact_sheet
-from numpy.typing import NDArray
 
-from motionloom.datasets.motion.body.rigid import RigidMotion
-from motionloom.datasets.synth.generate import SynthConfig, make_clip
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.shown import shown
-from motionloom.pipeline.render.body.face import synthetic_face_controls
+from motionloom.pipeline.inference.outputs import clip_of
+from motionloom.pipeline.inference.writers import cell_of
+from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
 CAPTIONS = (
     "a person waves with the left hand",
@@ -35,41 +34,43 @@ CAPTIONS = (
     "a person kicks with the right leg",
     "a person does a squat",
 )
-SYNTHETIC = SynthConfig(seed=7)
-SYNTHETIC_CLIPS = (44, 11, 10, 12)
-"""A wave, a circle, two kicks and a seat, each with a hand shape that can be seen."""
+CELL = 180
+"""Pixels across one pose."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One row of a picture: joints [T, N, 3] in metres, what to call them, and their caption."""
+def poses(motion: GeneratedMotion, caption: str, at: Sequence[int]) -> list[ViewerMotion]:
+    """Frames of a generated motion as still cells of one row, each with its time."""
+    whole = cell_of(clip_of(motion))
+    figure, face = whole.figure, whole.face_controls
+    assert figure is not None
+    row = []
+    for k in at:
+        part = slice(k, k + 1)
+        still = replace(
+            figure, rotations=figure.rotations[part], root=figure.root[part], joints=figure.joints[part]
+        )
+        row.append(
+            ViewerMotion(
+                still.joints,
+                whole.fps,
+                whole.parents,
+                f"{k / whole.fps:.1f} s",
+                group=caption,
+                face_controls=None if face is None else face[part],
+                figure=still,
+            )
+        )
+    return row
 
-    joints: NDArray[np.floating]
-    label: str
-    caption: str
-    fps: float
-    at: list[int] | None = None
-    """Frames to show; None = spread evenly."""
-    figure: RigidMotion | None = None
-    """The rigid figure whose joints these are."""
-    face: NDArray[np.floating] | None = None
-    """The face's controls [T, 5]."""
 
-    @staticmethod
-    def of(motion: GeneratedMotion, label: str, caption: str, at: list[int] | None = None) -> Row:
-        """A generated motion, as page and film show it."""
-        seen = shown(motion)
-        face = None if motion.face is None else synthetic_face_controls(motion.face)
-        return Row(seen.joints, label, caption, seen.fps, at, seen.figure, face)
-
-
-def generated_rows(run: Path, captions: tuple[str, ...], seed: int) -> list[Row]:
-    """Motions that a trained run makes of the captions."""
+def generated_rows(run: Path, captions: tuple[str, ...], frames: int, seed: int) -> list[list[ViewerMotion]]:
+    """Motions that a trained run makes of the captions, at times that are spread evenly."""
     motions = Bundle.open(run).generate(captions, seed=seed)
-    return [Row.of(motion, "generated", motion.caption) for motion in motions]
+    spread = [np.linspace(0, len(m.joints) - 1, frames).round().astype(int).tolist() for m in motions]
+    return [poses(motion, motion.caption, at) for motion, at in zip(motions, spread, strict=True)]
 
 
-def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[Row]:
+def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[list[ViewerMotion]]:
     """Dances that a trained run makes to songs of its test split, of different kinds first, on the beats."""
     stages, bundle = finished_stages(run), Bundle.open(run)
     dataset = StageCache().get(stages["data"]).split("test")
@@ -91,50 +92,50 @@ def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[Row]:
         at = [min(round(beat * fps), len(motion.joints) - 1) for beat in clip.beats[:frames].tolist()]
         truth = clip.truth or {}
         words = f"{truth.get('genre', clip.song)}, {truth.get('bpm', '?')} beats a minute"
-        rows.append(Row.of(motion, "to music", words, at))
+        rows.append(poses(motion, words, at))
     return rows
 
 
-def synthetic_rows() -> list[Row]:
-    """Clips of the synthetic source, in the captions' own words."""
-    clips = [make_clip(index, SYNTHETIC) for index in SYNTHETIC_CLIPS]
-    fps = SYNTHETIC.motion_layout.fps
-    faces = [None if c.face is None else synthetic_face_controls(c.face) for c in clips]
-    return [Row(c.joints, "synthetic", c.texts[0], fps, face=f) for c, f in zip(clips, faces, strict=True)]
+def draw(path: Path, rows: Sequence[Sequence[ViewerMotion]]) -> None:
+    """Write the rows, equally long, as one PNG: the board of a viewer page, each row in a line of its own."""
+    from playwright.sync_api import sync_playwright
 
-
-def draw(path: Path, rows: list[Row], frames: int) -> None:
-    """Write the rows as one PNG; they must share a frame rate, as the clips of one run do."""
-    contact_sheet(
-        path,
-        [row.joints for row in rows],
-        [row.label for row in rows],
-        [row.caption for row in rows],
-        frames,
-        at=None if rows[0].at is None else [row.at or [] for row in rows],
-        figures=[row.figure for row in rows],
-        face_controls=[row.face for row in rows],
-        fps=rows[0].fps,
+    columns = len(rows[0])
+    style = (
+        f".mlv-row {{ grid-template-columns: repeat({columns}, {CELL}px) !important; }} "
+        ".mlv-count, .mlv-bar, .mlv-more { display: none !important; } "
+        ".mlv-stage { height: 240px !important; }"
     )
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    webgl = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        page_file = Path(folder) / "page.html"
+        write_viewer(page_file, [cell for row in rows for cell in row], "")
+        browser = playwright.chromium.launch(executable_path=chromium, args=webgl)
+        size = {"width": (CELL + 12) * columns + 56, "height": 320 * len(rows)}
+        page = browser.new_page(viewport=size, bypass_csp=True, color_scheme="light", reduced_motion="reduce")
+        page.goto(page_file.as_uri())
+        page.add_style_tag(content=style)
+        page.wait_for_timeout(1000)
+        page.locator(".mlv-board").screenshot(path=path)
+        browser.close()
 
 
 def main() -> None:
     """Read the command line and write the picture."""
     parser = argparse.ArgumentParser(description="A picture of generated motions for the documentation.")
-    parser.add_argument("run", help="a run folder, an exported folder, or the word 'synthetic'")
+    parser.add_argument("run", type=Path, help="a run folder or an exported folder")
     parser.add_argument("out", type=Path, help="the PNG to write")
     parser.add_argument("captions", nargs="*", help="one row each; default: four of the docs' own")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--dances", type=int, default=0, help="rows of dances, in place of captions")
     parser.add_argument("--frames", type=int, default=6, help="poses in a row")
     args = parser.parse_args()
-    if args.run == "synthetic":
-        rows = synthetic_rows()
-    elif args.dances:
-        rows = dance_rows(Path(args.run), args.dances, args.frames, args.seed)
+    if args.dances:
+        rows = dance_rows(args.run, args.dances, args.frames, args.seed)
     else:
-        rows = generated_rows(Path(args.run), tuple(args.captions) or CAPTIONS, args.seed)
-    draw(args.out, rows, args.frames)
+        rows = generated_rows(args.run, tuple(args.captions) or CAPTIONS, args.frames, args.seed)
+    draw(args.out, rows)
     print(args.out)
 
 

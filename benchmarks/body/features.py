@@ -59,7 +59,7 @@ CONTROLS: dict[str, Look] = {
     "eye_shut": Look(eye_open=0.0),
     "mouth_open": Look(mouth_open=1.0),
 }
-"""One look for each end of the drawn face's controls: what page, film and pictures move the face by."""
+"""One look for each end of the drawn face's controls: what the page moves the face by."""
 
 _EYE_WIDTH, _EYE_HEIGHT, _EYE_X, _EYE_Y = 0.0165, 0.0108, 0.0325, 0.006
 _RING = 24

@@ -1,4 +1,4 @@
-"""Makes the figure that pages, films and GLB files show: pipeline/render/body/body.npz.
+"""Makes the figure that pages and GLB files show: pipeline/render/body/body.npz.
 
 python benchmarks/body/make_body.py pipeline/render/body/body.npz
 
@@ -76,7 +76,7 @@ SHAPES = {
     "far": CONTROL_SHAPES,
     "shadow": {},
 }
-"""The face's shapes of each detail: the page and the film only use the controls."""
+"""The face's shapes of each detail: the page only uses the controls."""
 Paint = Callable[[Floats], list[tuple[Floats, str, str]]]
 
 

@@ -157,20 +157,11 @@ def print_note(console: Console, note: object) -> None:
 def write_files(
     out: Path, motions: Sequence[GeneratedMotion], formats: Sequence[str], **options: Any
 ) -> None:
-    """Write motions as `write_motions` does, show how far a film is, and list the files."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
+    """Write motions as `write_motions` does and list the files."""
     from motionloom.pipeline.inference.outputs import write_motions
 
     console, aside = make_console(), make_console(aside=True)
-    columns = TextColumn("film, frame"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=aside, transient=True, disable=not aside.is_terminal) as bar:
-        task = bar.add_task("film", visible=False)
-
-        def progress(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total, visible=done < total)
-
-        paths = write_motions(out, motions, formats, progress=progress, **options)
+    paths = write_motions(out, motions, formats, **options)
     for path in paths:
         say(console, str(path))
     if "html" in formats:

@@ -57,7 +57,7 @@ class DanceClip:
         return f"{genre}, song {self.song}" if genre else self.song
 
     def score(self) -> Score:
-        """The music for a page or a film."""
+        """The music for a page."""
         return Score(self.sound, self.beats.tolist(), (Segment(0.0, self.seconds, self.title, "music"),))
 
     def cut(self, frames: int) -> DanceClip:

@@ -44,17 +44,15 @@ def write_motions(
     labels: Sequence[str] | None = None,
     figure: FigureOptions | None = None,
     say: Callable[[str], None] | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
     """Write every motion in every format; the page holds all of them. Returns the paths.
 
     What was written there before is removed. `title` and `note` are the page's. `scores`, one for each
-    motion: sound for the film and the page, beats and segments for the page. Without them each motion comes
+    motion: sound, beats and segments for the page. Without them each motion comes
     with what drove it. `names` are what files are called after, instead of the captions; `labels` are what
     the page says above each. `figure` says how
     the shown figure follows the generated joints, and `say` is given a line on each motion that it is far
     from.
-    `progress` is called with frames done and all frames of a film.
     """
     require_folder(folder)
     options = figure or FigureOptions()
@@ -77,11 +75,11 @@ def write_motions(
         for _, writer in writers:
             if writer.alone:
                 out.append(folder / f"{name}{writer.suffix}")
-                writer.write(out[-1], Outputs(clips[-1:], title, note, progress))
+                writer.write(out[-1], Outputs(clips[-1:], title, note))
     for _, writer in writers:
         if writer.together and (len(clips) > 1 or not writer.alone):
             out.append(folder / writer.together)
-            writer.write(out[-1], Outputs(clips, title, note, progress))
+            writer.write(out[-1], Outputs(clips, title, note))
     write_text(folder / WRITTEN, "".join(f"{path.name}\n" for path in out))
     return out
 

@@ -1,6 +1,6 @@
 """The figure that all outputs show of a generated motion: one rigid skeleton, its feet planted.
 
-Page, film, pictures, BVH, GLB and npz take it from here, so they show the same. Evaluation and metrics never
+Page, BVH, GLB and npz take it from here, so they show the same. Evaluation and metrics never
 do: they read the features' own joints (`GeneratedMotion.joints`).
 """
 
@@ -44,7 +44,7 @@ class ShownMotion:
 
     @property
     def joints(self) -> NDArray[np.float64]:
-        """Joints that page, film and npz show [T, N, 3], metres."""
+        """Joints that page and npz show [T, N, 3], metres."""
         return self.figure.joints
 
     @property

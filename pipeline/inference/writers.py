@@ -72,8 +72,6 @@ class Outputs:
     clips: Sequence[OutputClip]
     title: str = ""
     note: str = ""
-    progress: Callable[[int, int], None] | None = None
-    """Called with frames done and all frames while a film is made."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +95,6 @@ class Writer:
     """Whether each motion has a file of its own."""
     default: bool = False
     """Whether it is written where nobody names formats."""
-    slow: bool = False
-    """Takes seconds or minutes, so that a server does not offer it."""
     needs_face: bool = False
     """Left out of what a server offers for motions without a face."""
 
@@ -151,24 +147,6 @@ def write_html(path: Path, outputs: Outputs) -> None:
     from motionloom.pipeline.render.viewer import write_viewer
 
     write_viewer(path, [cell_of(clip, clip.label) for clip in outputs.clips], outputs.title, outputs.note)
-
-
-def write_mp4(path: Path, outputs: Outputs) -> None:
-    """A film with the face, and with the sound where there is any."""
-    from motionloom.pipeline.render.film import write_mp4 as write
-
-    [clip] = outputs.clips
-    write(
-        path,
-        clip.shown.joints,
-        clip.shown.motion.layout.skeleton,
-        clip.shown.fps,
-        clip.shown.motion.caption,
-        sound=clip.score.sound,
-        figure=clip.shown.figure,
-        face_controls=clip.controls,
-        progress=outputs.progress,
-    )
 
 
 def write_glb(path: Path, outputs: Outputs) -> None:
@@ -235,7 +213,6 @@ WRITERS: Table[Writer] = Table(Writer, "writer")
 for _writer in (
     Writer("npz", ".npz", _BYTES, "joints and features as numpy arrays", write_npz, default=True),
     Writer("bvh", ".bvh", "text/plain; charset=utf-8", "bones for animation tools", write_bvh),
-    Writer("mp4", ".mp4", "video/mp4", "a film", write_mp4, slow=True),
     Writer("glb", ".glb", "model/gltf-binary", "the skinned body for 3-D tools", write_glb, "motions.glb"),
     Writer("smplx", "_smplx.npz", _BYTES, "SMPL-X parameters", write_smplx),
     Writer(

@@ -1,4 +1,4 @@
-"""Sound beside pictures: cut to a motion's length, compressed for a page, or as a WAV for the film's muxer.
+"""Sound beside pictures: cut to a motion's length, compressed for a page.
 
 Pages carry MP3 at a constant bit rate. Why this format **[ours]**:
 
@@ -24,7 +24,7 @@ from motionloom.datasets.audio.sound import Sound, resample_sound
 from motionloom.datasets.schema import UserError
 
 RATE = 44_100
-"""Hz of every sound written: one that MP3, AAC and all players know, whatever rate the features asked for."""
+"""Hz of every sound written: one that MP3 and all players know, whatever rate the features asked for."""
 BIT_RATE = 96_000
 """Bits a second in a page: transparent enough for mono, 0.7 MB a minute (0.96 MB as base64)."""
 _BLOCK = 2**16
@@ -58,19 +58,6 @@ def embed_sounds(
         data = base64.b64encode(_mp3(part)).decode("ascii")
         sounds.append({"mime": "audio/mpeg", "seconds": len(part) / RATE, "data": data})
     return sounds, chosen
-
-
-def film_sound(sound: Sound, seconds: float) -> bytes:
-    """A 16-bit mono WAV of exactly `seconds`: cut, or filled up with silence."""
-    import soundfile  # only pages and films with sound pay for the import
-
-    samples = playable(sound)
-    wanted = round(seconds * RATE)
-    out = np.zeros(wanted, np.float32)
-    out[: len(samples)] = samples[:wanted]
-    file = io.BytesIO()
-    soundfile.write(file, out, RATE, format="WAV", subtype="PCM_16")
-    return file.getvalue()
 
 
 def playable(sound: Sound) -> NDArray[np.float32]:

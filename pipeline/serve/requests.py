@@ -71,7 +71,7 @@ class ServeConfig(Config):
 
 def known_answer(name: str) -> str:
     """The name of a format that a server gives; ValueError for others."""
-    known = ["joints", "viewer", *(name for name, writer in WRITERS.items() if not writer.slow)]
+    known = ["joints", "viewer", *WRITERS]
     if name not in known:
         raise ValueError(f"no format '{name}'; known: {', '.join(known)}")
     return name
@@ -101,7 +101,7 @@ class MotionRequest(Config):
     temperature: float = Field(1.0, ge=0, le=10, allow_inf_nan=False)
     top_p: float = Field(0.95, gt=0, le=1)
     format: Annotated[str, AfterValidator(known_answer)] = "joints"
-    """Numbers (`joints`), the viewer's data (`viewer`), or a file of a quick format of `WRITERS`."""
+    """Numbers (`joints`), the viewer's data (`viewer`), or a file of a format of `WRITERS`."""
 
     def require_within(self, limits: ServeConfig, model: MotionModel) -> None:
         """Refuse what is too much; `UserError` in one sentence."""

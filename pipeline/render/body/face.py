@@ -4,7 +4,7 @@ Only the basis of `datasets/motion/body/expressions.py` has a public meaning (ha
 blink). FLAME coefficients of licensed data follow another basis: their faces stay neutral unless the caller
 brings controls.
 
-Pages and films move the face by five controls [T, 5]: smile, brow (-1 lowered, 1 raised), eye-open (0 closed,
+Pages move the face by five controls [T, 5]: smile, brow (-1 lowered, 1 raised), eye-open (0 closed,
 1 neutral), mouth-open and frown (mouth corners down, inner brows up). GLB files carry the synthetic basis'
 own expressions, or ARKit's 52 shapes.
 
@@ -41,7 +41,6 @@ _EYE_OPEN = np.array([0.75, 0.7, 0.8, 1.6])
 """Opening of the eye at the apex of each emotion, 1 being neutral (fitted to the synthetic basis)."""
 BLINK_HEIGHT = 1.6
 """Length of a full blink along its column of the synthetic basis."""
-_WIDE_EYE = 1.6
 
 
 def synthetic_face_controls(expression: Values) -> Floats:
@@ -56,23 +55,6 @@ def synthetic_face_controls(expression: Values) -> Floats:
             open_eyes * (1 - blink),
             np.clip(0.9 * surprised + 0.25 * happy, 0, 1.2),
             np.maximum(sad, 0.6 * angry),
-        ],
-        axis=-1,
-    )
-
-
-def control_weights(controls: Values) -> Floats:
-    """Controls [T, 5] -> weights [T, 7] of `CONTROLS`."""
-    smile, brow, eye, mouth, frown = np.asarray(controls, np.float64).T
-    return np.stack(
-        [
-            np.clip(smile, -0.5, 1.5),
-            np.clip(frown, -0.5, 1.5),
-            np.clip(brow, 0, 1.5),
-            np.clip(-brow, 0, 1.5),
-            np.clip((eye - 1) / (_WIDE_EYE - 1), 0, 1.2),
-            np.clip(1 - eye, 0, 1),
-            np.clip(mouth, 0, 1.5),
         ],
         axis=-1,
     )

@@ -3,19 +3,18 @@
 `benchmarks/body/make_body.py` makes the file and describes its arrays. A motion has its own bone lengths: the
 mesh is stretched along each bone, and girth goes with the figure's size. Orange is right, blue is left.
 
-A rigid figure brings its rotations, so page, film and pictures show the same body as its GLB file. Bare
+A rigid figure brings its rotations, so the page shows the same body as its GLB file. Bare
 joints get rotations by the rule that starts a figure's fit (the smallest turn that points each bone the right
 way, a hand's twist shared with its forearm), and their bones may change length from frame to frame: then the
-body is stretched along the bone, so that its joints are exactly where the motion has them **[ours]**.
+page stretches the body along the bone, so that its joints are exactly where the motion has them **[ours]**.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache
 from importlib import resources
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +26,6 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS, ArkitBases, expression_weights
 
 Floats = NDArray[np.float64]
-Detail = Literal["near", "far", "shadow"]
-"""Fineness of the mesh: for files and large figures, for many or small ones, for shadows."""
 
 FIRST_OF_HEAD = 3
 """Swatches: right, trunk, left, and from here on those of the head: skin, hair and the face."""
@@ -54,36 +51,6 @@ class Body:
     shapes: dict[str, Floats]
     """Displacement [V, 3] of every vertex for each shape of the face at weight 1."""
 
-    @cached_property
-    def weights(self) -> NDArray[np.float32]:
-        """`shares` as a matrix over all joints [V, N]."""
-        out = np.zeros((len(self.vertices), len(self.skeleton)), np.float32)
-        np.add.at(out, (np.arange(len(out))[:, None], self.joints), self.shares)
-        return out
-
-    @cached_property
-    def _rest(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-        """Vertices and normals [V, 3], displacements [S, V * 3], as skinning takes them."""
-        moves = np.reshape(list(self.shapes.values()), (len(self.shapes), self.vertices.size))
-        return (self.vertices.astype(np.float32), self.normals.astype(np.float32), moves.astype(np.float32))
-
-    def skinned(
-        self, bones: Floats, joints: Floats, face: Floats | None = None
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Vertices and normals [V, 3] of one pose by linear blend skinning.
-
-        `bones` [N, 3, 3] turn (and may stretch) what hangs on a joint, `joints` [N, 3] is where it hangs;
-        `face` [S] are weights of the face's shapes. Normals are not of unit length where bones are stretched.
-        """
-        still, normals, moves = self._rest
-        if face is not None and face.any():
-            still = still + (face.astype(np.float32) @ moves).reshape(-1, 3)
-        shift = joints - np.einsum("nij,nj->ni", bones, self.skeleton.rest_joints)
-        rows = np.concatenate([bones, shift[..., None]], axis=2).astype(np.float32)
-        mixed = (self.weights @ rows.reshape(len(rows), 12)).reshape(-1, 3, 4)
-        turn = mixed[..., :3]
-        return np.einsum("vij,vj->vi", turn, still) + mixed[..., 3], np.einsum("vij,vj->vi", turn, normals)
-
 
 @cache
 def asset() -> dict[str, NDArray[np.generic]]:
@@ -99,9 +66,9 @@ def colours() -> NDArray[np.uint8]:
 
 
 @cache
-def neutral_body(name: str = "smplx52", detail: Detail = "near") -> Body:
+def neutral_body(name: str = "smplx52") -> Body:
     """The body on `smplx52` or `smpl22`, whose hands are stiff."""
-    raw = {key.removeprefix(f"{detail}_"): value for key, value in asset().items() if key.startswith(detail)}
+    raw = {key.removeprefix("near_"): value for key, value in asset().items() if key.startswith("near_")}
     skeleton, whole = Skeleton.named(name), Skeleton.named("smplx52")
     moves = np.zeros((len(raw["shapes"]), len(raw["places"]), 3))
     moves[:, raw["moving"].astype(np.int64)] = raw["moves"].swapaxes(0, 1) * raw["move_step"].astype(float)
@@ -121,7 +88,7 @@ def neutral_body(name: str = "smplx52", detail: Detail = "near") -> Body:
     )
 
 
-def body_for(skeleton: Skeleton, shapes: Sequence[str] = (), detail: Detail = "near") -> Body:
+def body_for(skeleton: Skeleton, shapes: Sequence[str] = ()) -> Body:
     """The body on a skeleton with the joints of `smplx52` or `smpl22`, whatever its bone lengths.
 
     `shapes` are those of the face that it keeps; names that the file lacks leave the face as it is.
@@ -129,7 +96,7 @@ def body_for(skeleton: Skeleton, shapes: Sequence[str] = (), detail: Detail = "n
     known = human_skeleton(skeleton.parents)
     if known is None or skeleton.joints != known.joints:
         raise UserError(f"skeleton {skeleton.name}: there is a body for smplx52 and smpl22 only")
-    body = neutral_body(known.name, detail)
+    body = neutral_body(known.name)
     still = np.zeros_like(body.vertices)
     return _on(replace(body, shapes={s: body.shapes.get(s, still) for s in shapes}), skeleton)
 
@@ -195,11 +162,6 @@ def _girth(old: Skeleton, new: Skeleton, joint: int, size: float) -> float:
     return float(np.clip(after / before, 0.5 * size, 1.5 * size)) if after > 0 else size
 
 
-LONGEST, SHORTEST = 2.0, 0.5
-"""A bone is shown no longer or shorter than so many times its own length; beyond it, only joints follow."""
-_NO_BONE = 1e-6
-
-
 @dataclass(frozen=True, eq=False)
 class Posing:
     """T frames of a body on N joints."""
@@ -210,30 +172,6 @@ class Posing:
     """[T, N, 3], metres."""
     turns: Floats
     """Rotations from the rest pose to the world [T, N, 3, 3]."""
-
-    def bones(self) -> Floats:
-        """`turns`, stretched along those bones that are not as long as they were at rest [T, N, 3, 3]."""
-        ends, starts = single_bones(self.skeleton)
-        rest = self.skeleton.offsets[ends]
-        length = np.linalg.norm(rest, axis=-1)
-        known = length > _NO_BONE
-        ends, starts, rest, length = ends[known], starts[known], rest[known], length[known]
-        along = rest / length[:, None]
-        now = np.linalg.norm(self.joints[:, ends] - self.joints[:, starts], axis=-1)
-        more = np.clip(now / length, SHORTEST, LONGEST) - 1
-        out = self.turns.copy()
-        line = np.einsum("tnij,nj->tni", self.turns[:, starts], along)
-        out[:, starts] += more[..., None, None] * line[..., None] * along[:, None]
-        return out
-
-
-def single_bones(skeleton: Skeleton) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Joints that are their parent's only child, and these parents."""
-    parents = np.asarray(skeleton.parents)
-    ends = np.array(
-        [j for j, p in enumerate(parents) if p >= 0 and (parents == p).sum() == 1], dtype=np.int64
-    )
-    return ends, parents[ends]
 
 
 def posing_of(joints: NDArray[np.floating], skeleton: Skeleton, figure: RigidMotion | None = None) -> Posing:

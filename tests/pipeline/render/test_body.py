@@ -17,17 +17,14 @@ from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
-from motionloom.datasets.motion.body.rigid import fit_rigid, with_offsets
-from motionloom.datasets.motion.kinematics import forward_kinematics
+from motionloom.datasets.motion.body.rigid import with_offsets
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.face import (
     ARKIT,
-    CONTROLS,
     EXPRESSIONS,
     ArkitBases,
     bounded_least_squares,
-    control_weights,
     expression_weights,
     synthetic_face_controls,
 )
@@ -35,14 +32,11 @@ from motionloom.pipeline.render.body.mesh import (
     Body,
     asset,
     body_for,
-    human_skeleton,
     neutral_body,
     own_bases,
     posing_of,
-    single_bones,
     synthetic_arkit,
 )
-from motionloom.pipeline.render.scene import Actor
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
     has_bodies,
@@ -65,48 +59,6 @@ def dense(body: Body) -> NDArray[np.float64]:
     out = np.zeros((len(body.vertices), len(body.skeleton)))
     np.add.at(out, (np.arange(len(out))[:, None], body.joints), body.shares)
     return out
-
-
-@pytest.mark.parametrize("name", ["smplx52", "smpl22"])
-def test_skinning_agrees_with_a_slow_loop(walk: Walk, name: str) -> None:
-    skeleton = Skeleton.named(name)
-    figure = fit_rigid(walk(6, wave=True)[:, : len(skeleton)], skeleton)
-    actor = Actor.of(figure.joints, skeleton, figure, np.tile([0.5, 0, 1, 1, 0], (6, 1)))
-    vertices, normals = actor.at(4, "near")
-    body, face = actor.body("near"), control_weights(np.array([[0.5, 0, 1, 1, 0]]))[0]
-    joints, world = forward_kinematics(
-        figure.rotations, figure.root, figure.skeleton.offsets, skeleton.parents
-    )
-    rest, weights = figure.skeleton.rest_joints, dense(body)
-    for vertex in np.random.default_rng(1).integers(0, len(vertices), 40):
-        still = body.vertices[vertex] + sum(
-            share * body.shapes[shape][vertex] for shape, share in zip(CONTROLS, face, strict=True)
-        )
-        place, normal = np.zeros(3), np.zeros(3)
-        for joint, weight in enumerate(weights[vertex]):
-            place += weight * (joints[4, joint] + world[4, joint] @ (still - rest[joint]))
-            normal += weight * world[4, joint] @ body.normals[vertex]
-        np.testing.assert_allclose(vertices[vertex], place, atol=1e-5)
-        np.testing.assert_allclose(normals[vertex], normal, atol=1e-4)
-    # Bare joints of the same motion give the same body: nothing in them is twisted.
-    bare = Actor.of(figure.joints, skeleton, None, np.tile([0.5, 0, 1, 1, 0], (6, 1)))
-    np.testing.assert_allclose(bare.at(4, "near")[0], vertices, atol=5e-3)
-
-
-@pytest.mark.parametrize("joints", [52, 22])
-def test_bones_that_change_length_still_end_at_the_joints(walk: Walk, joints: int) -> None:
-    skeleton = SMPLX if joints == 52 else Skeleton.named("smpl22")
-    loose = walk(5)[:, :joints] + np.random.default_rng(0).normal(0, 0.01, (5, joints, 3))
-    posing = posing_of(loose, skeleton)
-    ends, starts = single_bones(skeleton)
-    bones, own = posing.bones(), posing.skeleton
-    for end, start in zip(ends, starts, strict=True):
-        now = np.linalg.norm(loose[:, end] - loose[:, start], axis=-1) / np.linalg.norm(own.offsets[end])
-        reached = loose[:, start] + bones[:, start] @ own.offsets[end]
-        kept = (now > 0.5) & (now < 2)
-        # A wrist's share of the twist turns forearms about themselves: that moves no end.
-        np.testing.assert_allclose(reached[kept], loose[kept, end], atol=1e-9)
-    assert human_skeleton(skeleton.parents) == skeleton and human_skeleton([-1, 0]) is None
 
 
 def test_the_body_takes_other_bones() -> None:
@@ -136,13 +88,7 @@ def test_the_body_takes_other_bones() -> None:
 
 
 def test_the_synthetic_basis_moves_the_face_as_it_means() -> None:
-    shapes = neutral_body().shapes
-    moves = np.stack([shapes[name] for name in CONTROLS])
-    for k, name in enumerate(EXPRESSIONS[:4]):
-        apex = (APEX * BASIS[:, k])[None]
-        np.testing.assert_allclose(expression_weights(apex)[0], np.eye(8)[k], atol=1e-9)
-        by_controls = np.einsum("e,evc->vc", control_weights(synthetic_face_controls(apex))[0], moves)
-        assert np.linalg.norm(by_controls - shapes[name], axis=1).max() < 2.5e-3, name
+    np.testing.assert_allclose(expression_weights(APEX * BASIS[:, :4].T), np.eye(8)[:4], atol=1e-9)
     happy, sad, angry, surprised = (synthetic_face_controls(APEX * BASIS[None, :, k])[0] for k in range(4))
     np.testing.assert_allclose(synthetic_face_controls(np.zeros((1, 50)))[0], [0, 0, 1, 0, 0])
     assert happy[0] > 0.9 and sad[4] > 0.9 and angry[1] < -0.5 < 0.5 < surprised[1] and surprised[2] > 1.3

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import bvhio
-import imageio_ffmpeg
 import numpy as np
 import pytest
 import yaml
@@ -54,11 +53,11 @@ def copy(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def motions(copy: Path, tmp_path_factory: pytest.TempPathFactory, start: Callable[..., Any]) -> Path:
     """What `generate` writes for one caption."""
     folder = tmp_path_factory.mktemp("motions")
-    process = start("generate", copy, *WAVE, "--seed", 5, "-o", folder, "-f", "npz,bvh,mp4,html")
+    process = start("generate", copy, *WAVE, "--seed", 5, "-o", folder, "-f", "npz,bvh,html")
     output, _ = process.communicate(timeout=120)
     assert process.returncode == 0, output
     written = [Path(line) for line in output.splitlines() if Path(line).is_file()]
-    assert {path.suffix for path in written} == {".npz", ".bvh", ".mp4", ".html"}
+    assert {path.suffix for path in written} == {".npz", ".bvh", ".html"}
     return folder
 
 
@@ -99,7 +98,7 @@ def test_npz_says_what_it_holds(motions: Path) -> None:
     assert all(np.isfinite(stored[name]).all() for name in ("joints", "features", "face"))
 
 
-def test_bvh_film_and_page_show_the_same_motion(motions: Path) -> None:
+def test_bvh_and_page_show_the_same_motion(motions: Path) -> None:
     path = only(motions, ".bvh")
     stored = arrays(only(motions, ".npz"))
     names, joints = json.loads(str(stored["metadata"]))["joint_names"], stored["joints"]
@@ -110,8 +109,6 @@ def test_bvh_film_and_page_show_the_same_motion(motions: Path) -> None:
     root = bvhio.readAsHierarchy(str(path)).loadPose(7)
     found = {joint.Name: np.array(joint.PositionWorld) / 100 for joint, _, _ in root.layout()}
     np.testing.assert_allclose([found[name] for name in names], positions[7], atol=2e-4)
-    counted, seconds = imageio_ffmpeg.count_frames_and_secs(str(only(motions, ".mp4")))
-    assert counted == len(joints) and seconds > 1
     assert WAVE[0] in (motions / "index.html").read_text()
 
 
