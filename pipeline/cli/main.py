@@ -74,25 +74,11 @@ def _program(
 
 
 @app.command()
-def info(
-    recipe_schema: Annotated[
-        bool, typer.Option("--recipe-schema", help="Print the JSON schema of recipes, for editors.")
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
+def info(as_json: AsJson = False) -> None:
     """Versions, devices, text encoder, shipped models and recipes.
 
     Example: `motionloom info`
-
-    Example: `motionloom info --recipe-schema > recipe.schema.json`
     """
-    if recipe_schema:
-        import json
-
-        from motionloom.pipeline.runs.recipe import recipe_schema as schema
-
-        typer.echo(json.dumps(schema(), indent=1))
-        return
     from motionloom.pipeline.cli import info as facts
 
     if as_json:
@@ -135,10 +121,6 @@ def run(
             help="Go on in this folder even where that replaces trainings, or another recipe's run.",
         ),
     ] = False,
-    verify: Annotated[
-        bool, typer.Option("--verify", help="First compare all files of finished stages with their sha256.")
-    ] = False,
-    as_json: AsJson = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
@@ -154,17 +136,8 @@ def run(
 
     Example: `motionloom run humantomato-tiny --set gpt.optim.lr=1e-4 --go-on gpt`
     """
-    from motionloom.pipeline.runs.plan import Selection
-
-    if as_json:
-        if not dry_run:
-            raise UserError("--json is for the plan: give --dry-run too")
-        from motionloom.pipeline.runs.dry_run import plan_record
-
-        select = Selection(first, until)
-        print_json(plan_record(recipe, out, overrides=sets or (), select=select, go_on=go_on or ()))
-        return
     from motionloom.pipeline.runs.api import run_recipe
+    from motionloom.pipeline.runs.plan import Selection
 
     run_recipe(
         recipe,
@@ -174,7 +147,6 @@ def run(
         go_on=go_on or (),
         dry_run=dry_run,
         replace=replace,
-        verify=verify,
         console=make_console(),
     )
 

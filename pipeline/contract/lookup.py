@@ -95,15 +95,15 @@ def _loadable(record: StageRecord, made: dict[Path, CompletedStage]) -> Complete
     inputs = {role: _finished(source, made) for role, source in record.inputs.items()}
     if exported:
         _require_roles(kind, inputs, where)
+    config = kind.config.parse(dict(record.config), f"{where}: config")
+    for role, place in record.gone.items():
+        if role in kind.exported(config):
+            raise UserError(
+                f"{run}: stage '{folder.name}' was made from {place}, where no finished stage is; put "
+                f"it back there (a run finds it by the way from its own folder: move both together)"
+            )
     return CompletedStage(
-        record.name,
-        kind,
-        kind.config.parse(dict(record.config), f"{where}: config"),
-        folder,
-        inputs,
-        exported=exported,
-        outside=record.outside,
-        gone={role: say_gone(run, folder.name, place) for role, place in record.gone.items()},
+        record.name, kind, config, folder, inputs, exported=exported, outside=record.outside
     )
 
 
@@ -116,15 +116,6 @@ def _require_roles(kind: StageKind, inputs: Mapping[str, CompletedStage], where:
                 f"{where}: inputs: '{source.name}' of kind {source.kind.name} is no {role}; "
                 f"export the run again"
             )
-
-
-def say_gone(run: Path, stage: str, place: Path) -> str:
-    """Return the message for a stage outside a run that is gone, where one of the run was made from it."""
-    return (
-        f"{run}: stage '{stage}' was made from {place}, where no finished stage is any more; put it back "
-        f"there (a run finds it by the way from its own folder: move both together), or run the recipe again "
-        f"with another one in inputs"
-    )
 
 
 def _gives(kind: StageKind, record: StageRecord) -> frozenset[str]:

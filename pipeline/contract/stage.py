@@ -12,10 +12,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, NoReturn, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from pydantic import BaseModel, model_validator
@@ -100,8 +100,6 @@ class CompletedStage:
     """In an exported folder, which may come from anywhere: nothing outside `folder` is followed."""
     outside: bool = False
     """Whether it belongs to another run or to an export; then `name` names both."""
-    gone: Mapping[str, str] = field(default_factory=dict)
-    """Roles whose stages have gone since, and what to say where one of them is needed."""
 
     def gives(self, what: str) -> bool:
         """Whether other stages may ask this one for `what`."""
@@ -129,28 +127,19 @@ class StageCache:
     def get(self, stage: CompletedStage) -> Any:
         if stage.folder not in self._loaded:
             require_unchanged(stage.folder)
-            self._loaded[stage.folder] = stage.kind.load(stage, self.given_to(stage), self.device)
+            self._loaded[stage.folder] = stage.kind.load(stage, self.given(stage.inputs), self.device)
         return self._loaded[stage.folder]
 
     def given(self, inputs: Mapping[str, CompletedStage]) -> Inputs:
         return Inputs({role: partial(self.get, stage) for role, stage in inputs.items()})
 
-    def given_to(self, stage: CompletedStage) -> Inputs:
-        """Return the inputs of a completed stage; reading one that is gone raises its message."""
-        makers = {role: partial(self.get, source) for role, source in stage.inputs.items()}
-        return Inputs({**{role: partial(_refuse, said) for role, said in stage.gone.items()}, **makers})
-
     def generator(self, stage: CompletedStage) -> MotionGenerator:
         require_unchanged(stage.folder)
-        return stage.kind.generator(stage, self.given_to(stage), self.device)
+        return stage.kind.generator(stage, self.given(stage.inputs), self.device)
 
     def captioner(self, stage: CompletedStage) -> MotionCaptioner:
         require_unchanged(stage.folder)
-        return stage.kind.captioner(stage, self.given_to(stage), self.device)
-
-
-def _refuse(said: str) -> NoReturn:
-    raise UserError(said)
+        return stage.kind.captioner(stage, self.given(stage.inputs), self.device)
 
 
 @dataclass(frozen=True)

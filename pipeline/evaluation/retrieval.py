@@ -109,8 +109,7 @@ def alignment_stage(run: Path, name: str | None = None) -> CompletedStage:
     needed = [role.name for role in stage.kind.roles() if isinstance(role, Role) and not role.optional]
     missing = [role for role in needed if role not in stage.inputs]
     if missing:
-        message = f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first"
-        raise UserError(stage.gone.get(missing[0], message))
+        raise UserError(f"{run}: no finished '{missing[0]}' stage; run the recipe up to it first")
     require_consistent(run, [name])
     return stage
 

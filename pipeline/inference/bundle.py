@@ -115,7 +115,7 @@ class Bundle:
 
     def _open(self, stage: CompletedStage) -> None:
         """Load a stage's inputs, and theirs, as far as generation needs them."""
-        needed, inputs = stage.kind.exported(stage.config), self.stage_cache.given_to(stage)
+        needed, inputs = stage.kind.exported(stage.config), self.stage_cache.given(stage.inputs)
         for role in stage.kind.roles():
             if role.name in needed and (role.name in inputs or not role.optional):
                 inputs[role.name]  # looking it up loads it, so a broken one is found before anything is made

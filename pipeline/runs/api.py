@@ -34,7 +34,7 @@ from motionloom.pipeline.runs.execute import context_of, execute, perform
 from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.snapshot import run_at
-from motionloom.pipeline.store.artifact import require_consistent, require_unchanged
+from motionloom.pipeline.store.artifact import require_consistent
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import hint_at, owner_of, require_own, require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, run_state
@@ -49,12 +49,9 @@ def run_recipe(
     go_on: Collection[str] = (),
     dry_run: bool = False,
     replace: bool = False,
-    verify: bool = False,
     console: Console | None = None,
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
-
-    With `verify` all files of finished stages are compared with their checksums first.
 
     Without `replace`, a run that would replace work that took long (`dry_run.py`), or that would write into
     the folder of another recipe's run, is refused. Trainings in `go_on` go on from their newest checkpoints
@@ -63,10 +60,6 @@ def run_recipe(
     console = console or make_console()
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
-    if verify:
-        folders = [stage_folder(run, stage.name) for stage in loaded.stages]
-        count = sum(require_unchanged(folder, again=True) for folder in folders)
-        say(console, f"{run}: {count} files have the sha256 that their stages noted")
     try:
         plan = make_plan(loaded, run, select, go_on)
     except UserError:
@@ -134,7 +127,7 @@ def _stages_again(
     """
     require_run(folder)
     require_own(folder)
-    recipe = load_recipe(folder / "recipe.yaml", strict=False)
+    recipe = load_recipe(folder / "recipe.yaml")
     team = Team.start(recipe.hardware) if share and device == "auto" else Team()
     stage_cache = StageCache(recipe.hardware.device() if device == "auto" else choose_device(device))
     stages = [s for s in recipe.stages if what in s.kind.gives(s.config)]
@@ -164,13 +157,12 @@ def _inputs_again(
     stages = {**recipe.outside, **finished_stages(folder)}
     inputs = {role: stages[name] for role, name in stage.inputs.items() if name in stages}
     if state is None:
-        gone = [message for (name, _), message in recipe.gone.items() if name == stage.name]
-        unfinished = [
+        missing = [
             f"{folder}: stage '{name}' (role {role}) is not finished; run the recipe first{hint_at(folder)}"
             for role, name in stage.inputs.items()
             if role not in inputs
         ]
-        if missing := gone + unfinished:
+        if missing:
             raise UserError(missing[0])
     else:
         lacking = {

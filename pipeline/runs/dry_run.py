@@ -30,9 +30,8 @@ from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.lookup import preview_of, previews
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.continuation import newest_step
-from motionloom.pipeline.runs.doubts import doubts
-from motionloom.pipeline.runs.plan import PlannedStage, Selection, make_plan, require_fit
-from motionloom.pipeline.runs.recipe import Recipe, load_recipe
+from motionloom.pipeline.runs.plan import PlannedStage
+from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import fingerprint_of, read_record
 from motionloom.pipeline.store.run_folder import stage_folder
@@ -185,51 +184,6 @@ def say_estimate(
     lines = [f"disk: {_size(sum(card.checkpoint_bytes for card in cards.values()))} for checkpoints"]
     lines += [f"trainings: about {duration(total)} on {recipe.hardware.describe()}"] if times else []
     console.print("; ".join(lines), markup=False)
-
-
-def plan_record(
-    recipe: str | Path,
-    out: Path | None = None,
-    *,
-    overrides: Sequence[str] = (),
-    select: Selection | None = None,
-    go_on: Collection[str] = (),
-) -> dict[str, object]:
-    """The stages in order, each with what happens to it and why, and what its training takes.
-
-    `replaces` are stages that the run would delete, which it refuses without `--replace`, and trainings that
-    it would start over. Refuses what the run would refuse.
-    """
-    loaded = load_recipe(recipe, overrides)
-    run = out or Path("runs") / loaded.name
-    plan = make_plan(loaded, run, select, go_on)
-    todo = [row for row in plan if row.action in {"run", "resume"}]
-    require_fit((row.stage for row in todo), loaded.hardware)  # before the estimate, which takes seconds
-    cards = estimate(loaded, {row.stage.name for row in todo}, todo)
-    times = training_times(run, todo)
-    return {
-        "recipe": loaded.name,
-        "folder": run,
-        "hardware": loaded.hardware,
-        "stages": [
-            {
-                "stage": row.stage.name,
-                "kind": row.stage.kind.name,
-                "action": row.action,
-                "reason": row.reason,
-                "inputs": row.stage.inputs,
-                "fingerprint": row.fingerprint,
-                "training": cards.get(row.stage.name),
-                "time": times.get(row.stage.name),
-            }
-            for row in plan
-        ],
-        "doubts": doubts(loaded, run, (row.stage for row in todo)),
-        "replaces": {
-            "guarded": [one.stage for one in replaced_stages(run, plan)],
-            "started": started_trainings(run, plan),
-        },
-    }
 
 
 # What a run would replace.

@@ -152,9 +152,7 @@ def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, Completed
         if name not in stages:
             source = recipe.stage(name)
             inputs = {role: finished(above) for role, above in source.inputs.items()}
-            gone = {role: message for (needing, role), message in recipe.gone.items() if needing == name}
-            folder = stage_folder(run, name)
-            stages[name] = CompletedStage(name, source.kind, source.config, folder, inputs, gone=gone)
+            stages[name] = CompletedStage(name, source.kind, source.config, stage_folder(run, name), inputs)
         return stages[name]
 
     return {role: finished(name) for role, name in stage.inputs.items()}

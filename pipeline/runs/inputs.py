@@ -29,10 +29,8 @@ class Sources:
     where: str
     """The recipe, for messages."""
     strict: bool = True
-    """Refuse what is gone; else it is noted, since what was made of it may still be used."""
+    """Refuse what is not there; else it is left out, for who only reads the settings."""
     outside: dict[str, CompletedStage] = field(default_factory=dict)
-    gone: dict[tuple[str, str], str] = field(default_factory=dict)
-    """Stage and role -> what to say where an input from outside is not there any more."""
 
     def resolve(self, stage: Stage, written: object) -> dict[str, str]:
         """Role -> stage; a role that is filled by several stages has one entry for each (`Every.key`)."""
@@ -84,10 +82,9 @@ class Sources:
         try:
             if place not in self.outside:
                 self.outside[place] = find_outside(place, at)
-        except UserError as error:
+        except UserError:
             if self.strict:
                 raise
-            self.gone[stage.name, role] = str(error)
             return None
         return self.outside[place]
 

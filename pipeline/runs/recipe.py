@@ -26,20 +26,12 @@ from pydantic import Field, field_validator
 
 from motionloom.datasets.base.register import VARIABLE
 from motionloom.datasets.schema import Config, UserError, nearest
-from motionloom.pipeline.contract.stage import (
-    CompletedStage,
-    Every,
-    Stage,
-    StageConfig,
-    StageKind,
-    stage_kinds,
-)
+from motionloom.pipeline.contract.stage import CompletedStage, Every, Stage, stage_kinds
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.inputs import Sources, as_stages
-from motionloom.pipeline.runs.resolve import PUBLISHED, TRAINED, Tree, find_recipe, resolve
+from motionloom.pipeline.runs.resolve import Tree, find_recipe, resolve
 from motionloom.pipeline.store.run_folder import STAGE_NAME, place_from
 from motionloom.pipeline.store.yaml import dump_yaml
-from motionloom.pipeline.training.config import TrainedStageConfig
 
 
 class RecipeFile(Config):
@@ -79,8 +71,6 @@ class Recipe:
     data_seed: int | None = None
     outside: Mapping[str, CompletedStage] = field(default_factory=dict)
     """Stages of other runs and of exports that its stages read, by the names that `Stage.inputs` has."""
-    gone: Mapping[tuple[str, str], str] = field(default_factory=dict, compare=False)
-    """Stage and role -> what to say of an input from outside that is not there any more."""
 
     def stage(self, name: str, asked: str = "") -> Stage:
         """A stage by name, or an error with the nearest one; `asked` is the option that names it."""
@@ -152,7 +142,7 @@ class Recipe:
 def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, strict: bool = True) -> Recipe:
     """Read, extend, override and check a recipe.
 
-    Unless `strict`, inputs from outside may be gone: what a run has made of them may still be used.
+    Unless `strict`, inputs from outside that are not there are left out, for who only reads the settings.
     """
     path = find_recipe(str(name_or_path))
     where = f"{path} with --set" if overrides else str(path)
@@ -160,11 +150,11 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, stri
     parsed = _parse(file.stages, where)
     sources = Sources([stage for stage, _ in parsed], where, strict)
     stages = [replace(stage, inputs=sources.resolve(stage, written)) for stage, written in parsed]
-    if not sources.gone:
+    if strict:
         _check(stages, sources, where)
     return Recipe(
         file.name, file.description, file.seed, file.hardware, _in_order(stages, sources, where),
-        data_seed=file.data_seed, outside=sources.outside, gone=sources.gone,
+        data_seed=file.data_seed, outside=sources.outside,
     )  # fmt: skip
 
 
@@ -211,63 +201,3 @@ def _in_order(stages: Sequence[Stage], sources: Sources, where: str) -> tuple[St
         waiting.remove(ready)
         out.append(ready)
     return tuple(out)
-
-
-def recipe_schema() -> Tree:
-    """JSON schema (draft 2020-12) of a recipe file, from the config classes that check it.
-
-    On a recipe's first line, `# yaml-language-server: $schema=recipe.schema.json` has editors complete and
-    check it.
-    """
-    schema = RecipeFile.model_json_schema()
-    definitions: Tree = schema.setdefault("$defs", {})
-    branches, kinds = [], stage_kinds()
-    defaults: Tree = {TRAINED: _fields(TrainedStageConfig, definitions), PUBLISHED: {"type": "boolean"}}
-    for name, kind in kinds.items():
-        stage = _fields(kind.config, definitions)
-        defaults[name] = dict(stage)
-        stage["title"] = f"{name}: {kind.summary}"
-        stage["properties"] = {
-            "kind": {"const": name},
-            "inputs": _inputs(kind),
-            **stage.get("properties", {}),
-        }
-        branches.append(
-            {"if": {"properties": {"kind": {"const": name}}, "required": ["kind"]}, "then": stage}
-        )
-    entry = {"type": "object", "properties": {"kind": {"enum": list(kinds)}}, "allOf": branches}
-    removed = {"type": "null", "description": "Leaves out a stage of the recipe that this one extends."}
-    schema["properties"]["stages"]["additionalProperties"] = {"anyOf": [entry, removed]}
-    schema["properties"]["defaults"] = {
-        "type": "object",
-        "description": f"What stages of a kind share, or all that train ({TRAINED}).",
-        "properties": defaults,
-        "additionalProperties": False,
-    }
-    schema["properties"]["extends"] = {"type": "string", "description": "A recipe to start from, by name."}
-    schema["required"] = ["name"]
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    schema["title"] = "motionloom recipe"
-    return schema
-
-
-def _fields(config: type[StageConfig], definitions: Tree) -> Tree:
-    """The schema of a stage's fields, none of them required: a base recipe or defaults may give them."""
-    schema = config.model_json_schema(ref_template="#/$defs/{model}")
-    definitions.update(schema.pop("$defs", {}))
-    schema.pop("required", None)
-    return schema
-
-
-def _inputs(kind: StageKind) -> Tree:
-    one: Tree = {"type": ["string", "null"]}
-    several: Tree = {"type": "array", "items": {"type": "string"}}
-    return {
-        "type": "object",
-        "description": (
-            "Which stage feeds a role; without it the stage of the role's own name. A path is a stage of "
-            "another run or of an export: runs/other/stages/gpt."
-        ),
-        "properties": {role.name: several if isinstance(role, Every) else one for role in kind.roles()},
-        "additionalProperties": False,
-    }

@@ -62,7 +62,7 @@ def run_at(run: P, at: str | None, what: str = GENERATOR) -> Iterator[P]:
         return
     folder = Path(run)
     require_run(folder)
-    recipe, finished = load_recipe(folder / "recipe.yaml", strict=False), finished_stages(folder)
+    recipe, finished = load_recipe(folder / "recipe.yaml"), finished_stages(folder)
     chosen = _chosen(folder, recipe, finished, at, what)
     if not chosen:
         yield run  # all trainings are finished
@@ -135,7 +135,7 @@ def _write(
             own.append(replace(stage, inputs=given))
             names[stage.name] = stage.name
     name = f"{recipe.name}-{label}"
-    new = replace(recipe, name=name, stages=tuple(own), outside=outside, gone={})
+    new = replace(recipe, name=name, stages=tuple(own), outside=outside)
     write_text(folder / "recipe.yaml", new.to_yaml(folder))
     for stage in own:
         if not stage.kind.trains and _gives(stage, GENERATOR, CAPTIONER):

@@ -99,7 +99,9 @@ class ReportStage(StageKind):
         _watch(page, context, said, danced)
         stages = context.every("shown")
         shown = [
-            thing for stage in stages for thing in stage.kind.show(stage, context.stage_cache.given_to(stage))
+            thing
+            for stage in stages
+            for thing in stage.kind.show(stage, context.stage_cache.given(stage.inputs))
         ]
         draw_showings(page, "Figures on held-out clips", FigureTable, shown)
         draw_showings(page, "Worst and best", Clips, shown)

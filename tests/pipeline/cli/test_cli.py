@@ -296,22 +296,6 @@ def test_json_has_no_nan() -> None:
     assert plain(SynthConfig(clips=3))["clips"] == 3
 
 
-def test_a_plan(call: Call, tmp_path: Path) -> None:
-    recipe = tmp_path / "dry.yaml"
-    recipe.write_text(DRY)
-    shown = call("run", recipe, "--out", tmp_path / "run", "--dry-run", "--json")
-    plan = loaded(shown.out)
-    assert [(row["stage"], row["action"], row["reason"]) for row in plan["stages"]] == [
-        ("data", "run", "never run"),
-        ("stats", "run", "never run"),
-    ]
-    assert plan["stages"][1]["inputs"] == {"data": "data"}
-    assert plan["replaces"] == {"guarded": [], "started": []} and plan["doubts"] == []
-    assert not (tmp_path / "run").exists()
-    refused = call("run", recipe, "--out", tmp_path / "run", "--json")
-    assert refused.code == 2 and "give --dry-run too" in refused.err and not refused.out
-
-
 def test_a_check_of_shards(call: Call, shards: Path, damaged: Path) -> None:
     bad = call("data", "check", damaged)
     assert bad.code == 1 and "-train-" in bad.out and "sha256" in bad.out

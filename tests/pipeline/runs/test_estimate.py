@@ -20,8 +20,9 @@ from motionloom.models.tokenizer.single import VqConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.dry_run import Sizes, estimate, estimate_table, plan_record
-from motionloom.pipeline.runs.plan import Selection
+from motionloom.pipeline.runs.doubts import doubts
+from motionloom.pipeline.runs.dry_run import Sizes, estimate, estimate_table, training_times
+from motionloom.pipeline.runs.plan import Selection, make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.slurm import launch_recipe
 from motionloom.pipeline.store.data import Data
@@ -98,13 +99,13 @@ def test_time_is_known_from_the_run_itself(tmp_path: Path) -> None:
     """And a time limit that cannot be enough is refused."""
     path, flight = tmp_path / "small.yaml", tmp_path / "run/stages/tokenizer/flight/rank_0.jsonl"
     path.write_text(SMALL)
-    (row,) = [row for row in plan_record(path, tmp_path / "run")["stages"] if row["training"]]  # type: ignore[attr-defined]
-    assert row["time"] is None and row["training"].steps == 7
+    recipe, run = load_recipe(path), tmp_path / "run"
+    plan, card = make_plan(recipe, run), estimate(recipe)["tokenizer"]
+    assert training_times(run, plan) == {} and card.steps == 7
     # Weights and two moments in float32, of the two checkpoints that are kept.
-    assert row["training"].checkpoint_bytes >= 2 * 3 * 4 * row["training"].parameters
+    assert card.checkpoint_bytes >= 2 * 3 * 4 * card.parameters
     write_text(flight, "".join(json.dumps({"step": k, "step_seconds": 3600.0}) + "\n" for k in range(3)))
-    (row,) = [row for row in plan_record(path, tmp_path / "run")["stages"] if row["training"]]  # type: ignore[attr-defined]
-    assert row["time"] == 7 * 3600.0
+    assert training_times(run, plan) == {"tokenizer": 7 * 3600.0}
     quiet = Console(quiet=True)
     for minutes, requeues in ((300, 1), (300, 0)):
         words = [f"time_minutes={minutes}", f"requeues={requeues}"]
@@ -119,7 +120,8 @@ def test_what_will_hardly_do_what_is_meant_is_said(tmp_path: Path) -> None:
     path, run = tmp_path / "small.yaml", tmp_path / "run"
     path.write_text(SMALL)
     sets = ["tokenizer.optim.warmup_steps=8", "tokenizer.train.batch_size=16"]
-    (doubt,) = plan_record(path, run, overrides=sets)["doubts"]  # type: ignore[misc]
+    recipe = load_recipe(path, sets)
+    (doubt,) = doubts(recipe, run, recipe.stages)
     assert doubt.startswith("tokenizer: optim.warmup_steps 8 ") and " 7 steps" in doubt
     run_recipe(path, run, select=Selection(until="data"), console=Console(quiet=True))
     clips = Data(run / "stages/data").clips("train")
@@ -147,12 +149,13 @@ def test_sizes_are_remembered_until_something_changes(
 
     monkeypatch.setattr(TrainedStage, "estimate", counted)
     for sets in ([], [], ["tokenizer.train.batch_size=4"], ["tokenizer.train.keep_every=2"], []):
-        plan = plan_record(path, tmp_path / "run", overrides=sets)
-        (card,) = [row["training"] for row in plan["stages"] if row["training"]]  # type: ignore[attr-defined]
+        recipe = load_recipe(path, sets)
+        card = estimate(recipe, plan=make_plan(recipe, tmp_path / "run"))["tokenizer"]
         assert card.batch == (4 if "batch" in str(sets) else 8)
     assert asked == [8, 4, 8]
     Sizes.place().write_text("{")
-    plan_record(path, tmp_path / "run")
+    recipe = load_recipe(path)
+    estimate(recipe, plan=make_plan(recipe, tmp_path / "run"))
     assert asked == [8, 4, 8, 8]
 
 

@@ -202,7 +202,7 @@ def test_every_weight_comes_from_the_export(mine: Mine, name: str) -> None:
     start = recipe.outside[stage.inputs["start"]]
     torch.manual_seed(5)
     kind: Any = stage.kind
-    net = kind.network(load_facts(start.folder), kind.inputs.of(stage_cache.given_to(start)))
+    net = kind.network(load_facts(start.folder), kind.inputs.of(stage_cache.given(start.inputs)))
     kind.prepare(stage.config, net, kind.inputs.of(stage_cache.given({"start": start})))
     wanted, state = load_file(start.folder / "model.safetensors"), net.state_dict()
     assert state.keys() == wanted.keys()
