@@ -34,7 +34,7 @@ def cost(*words: object) -> float:
 
 def launch(cluster: Cluster, recipe: Path, run: Path, kill: str = "") -> None:
     """Submit and wait; the part `kill` is killed once it runs."""
-    words = ["--cluster", f"parts={PARTS}", "--cluster", "light_cpus=1", "--cluster", "light_memory_gb=2"]
+    words = ["--cluster", f"parts={PARTS}", "--cluster", "cpus=1", "--cluster", "memory_gb=2"]
     cost("launch", recipe, "--gpus-per-node", "0", "-o", run, *words)
     while queue := cluster.ask("squeue", "-h", "-t", "PD,R,CG", "-o", "%F_%K %T"):
         for job, state in (line.split() for line in queue.splitlines()):

@@ -165,7 +165,8 @@ def launch(
     cluster: Annotated[
         list[str] | None,
         typer.Option(
-            "--cluster", help="What to ask for: KEY=VALUE (partition, account, parts, ...). May be repeated."
+            "--cluster",
+            help="What to ask for: KEY=VALUE (partition, extra.account, parts, ...). May be repeated.",
         ),
     ] = None,
     dry_run: Annotated[

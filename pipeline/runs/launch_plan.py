@@ -42,22 +42,14 @@ class SlurmOptions(Config):
     cluster's."""
     light_partition: Line | None = None
     """Partition of the groups without GPUs."""
-    account: Line | None = None
-    """Account that is charged."""
     time_minutes: int = Field(1440, ge=1)
-    """Time limit of a group that takes all machines."""
-    light_minutes: int = Field(240, ge=1)
-    """Time limit of the other groups."""
-    cpus_per_gpu: int = Field(8, ge=1)
-    """CPU cores for each process that trains."""
-    memory_gb_per_gpu: float = Field(64, gt=0)
-    """Memory for each process that trains."""
-    light_cpus: int = Field(8, ge=1)
-    """CPU cores, and processes of a conversion, in a group of one process."""
+    """Time limit of each group."""
+    cpus: int = Field(8, ge=1)
+    """CPU cores for each process; a conversion uses all of its one."""
+    memory_gb: float = Field(64, gt=0)
+    """Memory for each process."""
     parts: int = Field(1, ge=1)
     """Jobs, of an array, that make a part of every conversion each."""
-    light_memory_gb: float = Field(32, gt=0)
-    """Memory of a group of one process."""
     warn_seconds: int = Field(120, ge=60)
     """Seconds before its time limit at which a job is queued again."""
     requeues: int = Field(100, ge=0)
@@ -67,7 +59,7 @@ class SlurmOptions(Config):
     on an H100 (docs/results.md, "One GPU"): with 30 clips those of TMA and GPT end as soon as their 2,000
     kernels are launched at 10 us each, so that more GPUs are no faster."""
     extra: dict[str, Line] = Field(default_factory=dict)
-    """More options of sbatch: `extra.constraint=h100`, `extra.qos=high`."""
+    """More options of sbatch: `extra.account=me`, `extra.constraint=h100`."""
 
     @field_validator("extra")
     @classmethod
@@ -79,10 +71,10 @@ class SlurmOptions(Config):
 
     @model_validator(mode="after")
     def _warned_in_time(self) -> Self:
-        if 2 * self.warn_seconds > 60 * min(self.time_minutes, self.light_minutes):
+        if 2 * self.warn_seconds > 60 * self.time_minutes:
             raise ValueError(
-                f"warn_seconds {self.warn_seconds} is more than half of a time limit: jobs would be "
-                f"queued again before they have done anything; raise time_minutes and light_minutes"
+                f"warn_seconds {self.warn_seconds} is more than half of the time limit: jobs would be "
+                f"queued again before they have done anything; raise time_minutes"
             )
         return self
 
@@ -104,15 +96,12 @@ class SlurmOptions(Config):
 
 @dataclass(frozen=True)
 class Machines:
-    """Nodes, processes and limits of a group."""
+    """Nodes and processes of a group."""
 
     nodes: int
     processes: int
-    """On each node, as `gpus`, `cpus` and `memory_gb` are."""
+    """On each node, as `gpus` are."""
     gpus: int
-    cpus: int
-    memory_gb: float
-    minutes: int
 
 
 @dataclass(frozen=True)
@@ -168,15 +157,16 @@ class LaunchPlan:
             *sets,
         ]
 
-    def lines(self) -> list[str]:
+    def lines(self, options: SlurmOptions) -> list[str]:
         """A line for each group: its stages, its machines and their time limit."""
         out = []
         for group in self.groups:
             at = group.machines
-            each = f"{at.processes} processes, {at.gpus} GPUs, {at.cpus} cores"
+            each = f"{at.processes} processes, {at.gpus} GPUs, {options.cpus * at.processes} cores"
             stages = ", ".join(group.stages) + (f" in {group.parts} parts" if group.parts > 1 else "")
             after = f", after {', '.join(group.after)}" if group.after else ""
-            out.append(f"{group.name}: {stages}; {at.nodes} x ({each}), at most {at.minutes} min{after}")
+            limit = f"at most {options.time_minutes} min"
+            out.append(f"{group.name}: {stages}; {at.nodes} x ({each}), {limit}{after}")
         return out
 
 
@@ -201,8 +191,10 @@ def make_launch_plan(
     names: dict[str, str] = {}  # stage -> its group
     waits: dict[str, set[str]] = {}  # group -> all groups before it
     for job in jobs:
-        machines = _machines(options, job, gpus_per_node)
-        settings = _settings(job, machines)
+        each = min(job.processes, max(gpus_per_node, 1))
+        on_node = int(job.gpu) if job.light else each if gpus_per_node else 0
+        machines = Machines(job.processes // each, each, on_node)
+        settings = _settings(job, machines, options)
         first: tuple[str, ...] = ()
         if options.parts > 1 and (cut := tuple(stage.name for stage in job.stages if stage.kind.parts)):
             # The group behind it finds the parts made, and joins them.
@@ -238,19 +230,10 @@ def make_launch_plan(
     return LaunchPlan(name, recipe, shipped, tuple(overrides), str(out), tuple(groups), tuple(go_on))
 
 
-def _machines(options: SlurmOptions, job: _Job, gpus: int) -> Machines:
-    if job.light:
-        light = options.light_cpus, options.light_memory_gb, options.light_minutes
-        return Machines(1, 1, int(job.gpu), *light)
-    each = min(job.processes, max(gpus, 1))
-    cpus, memory = options.cpus_per_gpu * each, options.memory_gb_per_gpu * each
-    return Machines(job.processes // each, each, each if gpus else 0, cpus, memory, options.time_minutes)
-
-
-def _settings(job: _Job, machines: Machines) -> tuple[str, ...]:
+def _settings(job: _Job, machines: Machines, options: SlurmOptions) -> tuple[str, ...]:
     fields = [f"nodes={machines.nodes}", f"devices={machines.processes}"]
     if job.light:
-        fields.append(f"convert_workers={machines.cpus}")
+        fields.append(f"convert_workers={options.cpus}")
     # A node whose driver is broken must not do a GPU's work on its CPU.
     fields.append(f"accelerator={'gpu' if job.gpu else 'cpu'}")
     return tuple(f"hardware.{field}" for field in fields)

@@ -166,7 +166,7 @@ def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
     facts = {
         "kind": stage.kind.name,
         "version": stage.kind.version,
-        "seed": recipe.seed_of(stage),
+        "seed": recipe.seed,
         "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
         "external": stage.kind.external(stage.config),
         "inputs": {role: _fingerprint(recipe, name, rows) for role, name in stage.inputs.items()},
@@ -257,10 +257,9 @@ def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[
         old = artifact.inputs.get(role)
         if old is None or old.fingerprint != _fingerprint(recipe, name, rows):
             return f"input {name} changed"
-    if artifact.seed != recipe.seed_of(stage):
-        own = recipe.data_seed is None and not stage.kind.trains
-        keep = f"; data_seed: {artifact.seed} keeps what comes before the trainings" if own else ""
-        return f"seed {artifact.seed} -> {recipe.seed_of(stage)}{keep}"
+    if artifact.seed != recipe.seed:
+        keep = "" if stage.kind.trains else "; defaults.trained.train.seed is that of the trainings alone"
+        return f"seed {artifact.seed} -> {recipe.seed}{keep}"
     return "source files or the order of inputs changed"
 
 

@@ -9,8 +9,8 @@
 
 A stage's inputs are found by role: a stage that needs `data` takes the stage called `data` unless its
 `inputs:` names another (or `null`, for an input it can do without), or the path of a stage of another run or
-of an export (`start: runs/other/stages/gpt`). `seed` is everybody's; `data_seed`, where it is given, is that
-of all that comes before the first training. What else a recipe may say, `extends`, `start`, `defaults`, and
+of an export (`start: runs/other/stages/gpt`). `seed` is everybody's but a training's that
+has its own (`train.seed`). What else a recipe may say, `extends`, `start`, `defaults`, and
 `--set` over it are resolved first (`resolve.py`).
 """
 
@@ -40,8 +40,6 @@ class RecipeFile(Config):
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
     description: str = ""
     seed: int = Field(0, ge=0)
-    data_seed: int | None = Field(None, ge=0)
-    """Seed of everything before the first training; null = `seed`."""
     hardware: Hardware = Hardware()
     start: str | None = None
     """A trained model that stages go on from: one of the package, or the folder of an export or a run."""
@@ -68,7 +66,6 @@ class Recipe:
     seed: int
     hardware: Hardware
     stages: tuple[Stage, ...]
-    data_seed: int | None = None
     outside: Mapping[str, CompletedStage] = field(default_factory=dict)
     """Stages of other runs and of exports that its stages read, by the names that `Stage.inputs` has."""
 
@@ -86,19 +83,6 @@ class Recipe:
         """The stages of the recipe that feed one of them."""
         return [self.stage(name) for name in stage.inputs.values() if name not in self.outside]
 
-    def seed_of(self, stage: Stage) -> int:
-        """The seed of a stage: `data_seed` where nothing trained comes before it, and it trains nothing."""
-        if self.data_seed is None or not self._untrained(stage):
-            return self.seed
-        return self.data_seed
-
-    def _untrained(self, stage: Stage) -> bool:
-        outside = [self.outside[name] for name in stage.inputs.values() if name in self.outside]
-        trained = any(
-            one.kind.trains for stage_outside in outside for one in (stage_outside, *stage_outside.upstream())
-        )
-        return not stage.kind.trains and not trained and all(map(self._untrained, self.above(stage)))
-
     def to_yaml(self, run: Path | None = None) -> str:
         """The resolved recipe; reading it again gives an equal recipe.
 
@@ -113,7 +97,6 @@ class Recipe:
             "name": self.name,
             "description": self.description,
             "seed": self.seed,
-            **({} if self.data_seed is None else {"data_seed": self.data_seed}),
             "hardware": self.hardware.dump(),
             "stages": stages,
         }
@@ -154,7 +137,7 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, stri
         _check(stages, sources, where)
     return Recipe(
         file.name, file.description, file.seed, file.hardware, _in_order(stages, sources, where),
-        data_seed=file.data_seed, outside=sources.outside,
+        outside=sources.outside,
     )  # fmt: skip
 
 

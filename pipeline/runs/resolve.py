@@ -52,7 +52,7 @@ PUBLISHED = "published"
 """The defaults by which baselines take their published settings."""
 
 _DEEPEST = 4
-_TOP = ("name", "description", "seed", "data_seed", "hardware", START, "defaults", "stages")
+_TOP = ("name", "description", "seed", "hardware", START, "defaults", "stages")
 _OWN = ("optim", "train")
 """Settings that a training does not take over from the model it starts from."""
 _COMPLETED_LATER = {"missing", "value_error"}

@@ -162,7 +162,7 @@ def launch_recipe(
         gpus_per_node=gpus_per_node,
         go_on=go_on,
     )
-    for line in plan.lines():
+    for line in plan.lines(slurm):
         say(console, line)
     planned = [row for row in rows if row.action in {"run", "resume"}]
     for doubt in doubts(loaded, run, (row.stage for row in planned)):
@@ -180,9 +180,9 @@ def _require_time(plan: LaunchPlan, options: SlurmOptions, times: Mapping[str, f
     """Refuse a time limit within which, with all its tries, a group's trainings cannot end."""
     for group in plan.groups:
         needed = sum(times[name] for name in group.stages if name in times)
-        if needed > 60 * group.machines.minutes * (options.requeues + 1):
+        if needed > 60 * options.time_minutes * (options.requeues + 1):
             raise UserError(
-                f"group {group.name} takes about {duration(needed)} and has {group.machines.minutes} minutes "
+                f"group {group.name} takes about {duration(needed)} and has {options.time_minutes} minutes "
                 f"{options.requeues + 1} times; raise --cluster time_minutes or requeues"
             )
 
@@ -237,7 +237,7 @@ def _text(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path, c
     lines = ["#!/bin/bash", *(_directive(*one) for one in _options(plan, group, options, folder, cwd))]
     lines += [_SIGNALS.format(requeues=options.requeues).rstrip()]
     part = f' --set hardware.part="$SLURM_ARRAY_TASK_ID/{group.parts}"' if group.parts > 1 else ""
-    lines += [f"{shlex.join(_command(plan, group, folder))}{part} &"]
+    lines += [f"{shlex.join(_command(plan, group, options, folder))}{part} &"]
     lines += [_WAIT.format(saved=SAVED).rstrip()]
     return "\n".join(lines) + "\n"
 
@@ -253,13 +253,12 @@ def _options(
         ("job-name", plan.job(group)),
         ("array", array),
         ("partition", partition),
-        ("account", options.account),
         ("nodes", str(machines.nodes)),
         ("ntasks-per-node", str(machines.processes)),
-        ("cpus-per-task", str(machines.cpus // machines.processes)),
+        ("cpus-per-task", str(options.cpus)),
         ("gpus-per-node", str(machines.gpus) if machines.gpus else None),
-        ("mem", f"{max(1, round(machines.memory_gb * 1024))}M"),
-        ("time", str(machines.minutes)),
+        ("mem", f"{max(1, round(options.memory_gb * machines.processes * 1024))}M"),
+        ("time", str(options.time_minutes)),
         ("chdir", str(cwd)),
         ("output", log),
         ("open-mode", "append"),
@@ -279,12 +278,12 @@ def _directive(name: str, value: str | None) -> str:
     return f"#SBATCH --{name}={value}"
 
 
-def _command(plan: LaunchPlan, group: Group, folder: Path) -> Sequence[str]:
+def _command(plan: LaunchPlan, group: Group, options: SlurmOptions, folder: Path) -> Sequence[str]:
     command, machines = plan.command(group, str(folder / RECIPE_FILE), PROGRAM), group.machines
     if machines.nodes * machines.processes == 1:
         return command
     task_options = [f"--nodes={machines.nodes}", f"--ntasks-per-node={machines.processes}"]
-    task_options += [f"--cpus-per-task={machines.cpus // machines.processes}"]
+    task_options += [f"--cpus-per-task={options.cpus}"]
     if machines.gpus:
         # All GPUs of a node for each of its processes, which choose theirs.
         task_options.append(f"--gpus-per-node={machines.gpus}")

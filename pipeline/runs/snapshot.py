@@ -139,7 +139,7 @@ def _write(
     write_text(folder / "recipe.yaml", new.to_yaml(folder))
     for stage in own:
         if not stage.kind.trains and _gives(stage, GENERATOR, CAPTIONER):
-            home, cache, seed = stage_folder(folder, stage.name), StageCache(), new.seed_of(stage)
+            home, cache, seed = stage_folder(folder, stage.name), StageCache(), new.seed
             home.mkdir(parents=True)
             there = {**outside, **finished_stages(folder)}
             inputs = {role: there[source] for role, source in stage.inputs.items()}

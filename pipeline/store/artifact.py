@@ -210,6 +210,8 @@ def fingerprint_now(folder: Path) -> str | None:
 NOTE = ".compared.json"
 
 State = list[int]
+_MACHINES = 64
+"""States of a file that are noted."""
 
 
 class ComparedFile(Config):
@@ -217,7 +219,7 @@ class ComparedFile(Config):
 
     sha256: str
     states: list[State]
-    """State of the file (`state_of`): one on a shared file system, else one for each machine."""
+    """States of the file (`state_of`), the newest first: machines may have copies of their own."""
 
 
 class Compared(Config):
@@ -239,28 +241,31 @@ class Compared(Config):
         return known is not None and known.sha256 == sha256 and state in known.states
 
     @staticmethod
-    def add(path: Path, compared: Mapping[str, ComparedFile]) -> None:
-        """Note in `path` what has been compared, beside what other jobs of the run note."""
+    def add(path: Path, compared: Mapping[str, tuple[str, State]]) -> None:
+        """Note in `path` the sha256 and the state of what has been compared, beside what other jobs note."""
         with file_lock(path.with_name(LOCK_FILE)):
-            write_json(path, Compared(files=Compared.read(path).files | dict(compared)).dump())
+            files = Compared.read(path).files
+            for name, (sha256, state) in compared.items():
+                before = files.get(name)
+                others = before.states if before is not None and before.sha256 == sha256 else []
+                files[name] = ComparedFile(sha256=sha256, states=[state, *others][:_MACHINES])
+            write_json(path, Compared(files=files).dump())
 
 
-def require_unchanged(folder: Path, *, again: bool = False) -> int:
+def require_unchanged(folder: Path) -> int:
     """Refuse a finished stage one of whose files is not the one that it made; how many were read.
 
-    Those of an export are compared each time.
-
-    Shards are left to whoever reads them (`verify_shards.py`), unless `again` has all compared once more.
+    Those of an export are compared each time. Shards are left to whoever reads them (`verify_shards.py`).
     """
     artifact, run, exported = Artifact.find(folder), owner_of(folder), in_export(folder)
     if artifact is None:
         return 0
-    known = Compared(files={}) if again or exported else Compared.read(run / NOTE)
-    compared: dict[str, ComparedFile] = {}
+    known = Compared(files={}) if exported else Compared.read(run / NOTE)
+    compared: dict[str, tuple[str, State]] = {}
     for name, info in artifact.outputs.items():
         path = folder / name
         # Shards may be terabytes: whoever reads them compares them.
-        if name.endswith(".tar") and not again:
+        if name.endswith(".tar"):
             continue
         key, state = f"stages/{folder.name}/{name}", state_of(path)
         if known.knows(key, info.sha256, state):
@@ -271,7 +276,7 @@ def require_unchanged(folder: Path, *, again: bool = False) -> int:
             again_by = f"motionloom run {run / 'recipe.yaml'} -o {run} --from {folder.name}"
             fix = "copy the folder again" if exported else f"copy it back, or make it again: {again_by}"
             raise UserError(f"{path}: {what}; {fix}")
-        compared[key] = ComparedFile(sha256=info.sha256, states=[state])
+        compared[key] = info.sha256, state
     if compared and not exported:
         with suppress(OSError):  # a run that may only be read
             Compared.add(run / NOTE, compared)

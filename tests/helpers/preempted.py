@@ -47,7 +47,7 @@ GROUPS = ("1-parts", "2-data", "3-tokenizer")
 """What a launch makes of it."""
 
 ASKED = (
-    "partition=main", "light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=1", "memory_gb_per_gpu=1",
+    "partition=main", "cpus=1", "memory_gb=1",
     "clips_per_gpu=4", "parts=2",
 )  # fmt: skip
 

@@ -25,7 +25,7 @@ pytestmark = [
     pytest.mark.timeout(600),
     pytest.mark.skipif(bool(why_not()), reason=why_not()),
 ]
-WORDS = ["light_cpus=1", "cpus_per_gpu=1", "light_memory_gb=0.5", "memory_gb_per_gpu=0.5"]
+WORDS = ["cpus=1", "memory_gb=0.5"]
 OPTIONS = SlurmOptions.from_words([*WORDS, "extra.comment=two words"])
 
 

@@ -239,32 +239,3 @@ def test_jobs_of_two_branches_work_in_one_run(tmp_path: Path, monkeypatch: pytes
     (tmp_path / "run").rename(tmp_path / "old")
     register_toys(monkeypatch, kind("sum", *TAKES))
     assert go(tmp_path) == ALL and made == {path: path.read_bytes() for path in made}
-
-
-def test_a_seed_of_the_data_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With `data_seed` another `seed` keeps all that comes before the first training, byte for byte."""
-
-    def draw(context: StageContext) -> None:
-        write_json(context.folder / "value.json", context.seed)
-
-    drawing = (
-        kind("root", work=draw),
-        kind("sum", *TAKES, work=draw),
-        kind("fit", *TAKES, work=draw, trains=True),
-    )
-    register_toys(monkeypatch, *drawing)
-    assert go(tmp_path, "both.kind=fit", "data_seed=3", "seed=5") == ALL
-    seeds = {name: value(tmp_path, name) for name in ("left", "right", "one", "both", "top")}
-    assert seeds == {"left": 3, "right": 3, "one": 3, "both": 5, "top": 5}, "top is made from a training"
-    assert go(tmp_path, "both.kind=fit", "data_seed=3", "seed=6") == ["both", "top"]
-    assert go(tmp_path, "both.kind=fit", "data_seed=6", "seed=6") == ALL
-    assert go(tmp_path, "both.kind=fit", "seed=6") == [], "it is `seed` where it is not given"
-    plan = make_plan(recipe(tmp_path, "both.kind=fit", "seed=7"), tmp_path / "run")
-    assert "data_seed: 6 keeps" in plan[0].reason
-    again = load_recipe(tmp_path / "run/recipe.yaml")
-    assert again.data_seed is None and "data_seed" not in again.to_yaml()
-    seeded = recipe(tmp_path, "data_seed=3")
-    (tmp_path / "seeded.yaml").write_text(seeded.to_yaml())
-    assert load_recipe(tmp_path / "seeded.yaml") == seeded
-    with pytest.raises(UserError, match="data_seed"):
-        recipe(tmp_path, "data_seed=-1")

@@ -138,7 +138,7 @@ def test_what_cannot_run_is_refused_before_it_waits(call: dict[str, Any], messag
     [
         (["partition"], "write KEY=VALUE"),
         (["partitoin=gpu"], "did you mean 'partition'"),
-        (["account=a\n#SBATCH --wrap=x"], "one line"),
+        (["partition=a\n#SBATCH --wrap=x"], "one line"),
         (["extra.comment=a\nrm -rf x"], "one line"),
         (["time_minutes=3"], "warn_seconds 120 is more than half"),
     ],

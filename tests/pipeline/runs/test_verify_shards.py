@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-import threading
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -42,13 +40,13 @@ def shards(tmp_path: Path) -> list[LocalShard]:
 
 
 @pytest.fixture
-def compared(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[str]]]:
-    """(thread, files) of each comparison."""
-    seen: list[tuple[str, list[str]]] = []
+def compared(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The files of each comparison."""
+    seen: list[list[str]] = []
     problems = sound.problems
 
     def look(todo: Sequence[LocalShard], *rest: Any) -> list[str]:
-        seen.append((threading.current_thread().name, [shard.path.name[8:14] for shard in todo]))
+        seen.append([shard.path.name[8:14] for shard in todo])
         return problems(todo, *rest)
 
     monkeypatch.setattr(sound, "problems", look)
@@ -75,7 +73,7 @@ def test_every_flipped_bit_is_found(shards: list[LocalShard], tmp_path: Path) ->
 
 
 def test_what_has_not_changed_is_compared_once(
-    shards: list[LocalShard], tmp_path: Path, compared: list[tuple[str, list[str]]]
+    shards: list[LocalShard], tmp_path: Path, compared: list[list[str]]
 ) -> None:
     record = tmp_path / NOTE
     assert compare_shards(shards, record, Team(), QUIET) == sum(shard.info.bytes for shard in shards)
@@ -89,7 +87,7 @@ def test_what_has_not_changed_is_compared_once(
     record.write_text("{")
     compare_shards(shards, record, Team(), QUIET)
     everything = [f"{number:06d}" for number in range(5)]
-    assert [files for _, files in compared] == [everything, ["000003"], ["000004"], everything, everything]
+    assert compared == [everything, ["000003"], ["000004"], everything, everything]
 
 
 def test_missing_and_short_shards_are_named_with_how_many_there_are(
@@ -102,64 +100,29 @@ def test_missing_and_short_shards_are_named_with_how_many_there_are(
     assert not (tmp_path / NOTE).exists()
 
 
-class Threads(Team):
-    """A team of three threads, which `gather` brings together."""
-
-    barrier: threading.Barrier
-    given: dict[int, Any]
+class Other(Team):
+    """A team in which another machine has found a mistake."""
 
     def gather(self, mine: Any) -> list[Any]:
-        self.given[self.rank] = mine
-        self.barrier.wait()
-        found = [self.given[rank] for rank in range(self.world)]
-        self.barrier.wait()
-        return found
+        return [mine, ["x-train-000003.tar: the sha256 differs"]]
 
 
-@pytest.fixture
-def together(
+def test_the_first_process_of_each_machine_compares_and_all_refuse(
     shards: list[LocalShard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[], list[int | str]]:
-    """Ranks 0 and 1 see the same files, rank 2 a copy of its own under the same names."""
-    state = LocalShard.state
-
-    def seen(shard: LocalShard) -> list[int]:
-        here = state(shard)
-        return [*here[:3], here[3] + 1] if threading.current_thread().name == "2" else here
-
-    monkeypatch.setattr(LocalShard, "state", seen)
-
-    def go() -> list[int | str]:
-        kind = type("Now", (Threads,), {"barrier": threading.Barrier(3, timeout=30), "given": {}})
-
-        def rank(number: int) -> int | str:
-            threading.current_thread().name = str(number)
-            try:
-                return compare_shards(shards, tmp_path / NOTE, kind(number, 3), QUIET)
-            except JointError as error:
-                return str(error)
-
-        with ThreadPoolExecutor(3) as pool:
-            return list(pool.map(rank, range(3)))
-
-    return go
-
-
-def test_processes_share_the_files_that_they_both_see(
-    together: Callable[[], list[int | str]], shards: list[LocalShard], compared: list[tuple[str, list[str]]]
 ) -> None:
+    record, state = tmp_path / NOTE, LocalShard.state
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert compare_shards(shards, record, Team(1, 2), QUIET) == 0 and not record.exists()
+    for team in (Other(1, 4), Other(0, 4)):
+        with pytest.raises(JointError, match="000003"):
+            compare_shards(shards, record, team, QUIET)
+    monkeypatch.setenv("LOCAL_RANK", "0")
     everything = sum(shard.info.bytes for shard in shards)
-    first = together()
-    assert first[2] == everything and int(first[0]) + int(first[1]) == everything
-    assert sorted(compared) == [
-        ("0", ["000000", "000002", "000004"]),
-        ("1", ["000001", "000003"]),
-        ("2", ["000000", "000001", "000002", "000003", "000004"]),
-    ]
-    assert together() == [0, 0, 0]
-    flip(shards[3].path, 7)
-    ends = together()
-    assert len(set(ends)) == 1 and "000003.tar: the sha256" in str(ends[0])
+    assert compare_shards(shards, record, Team(), QUIET) == everything
+    with monkeypatch.context() as elsewhere:  # a copy of its own under the same names
+        elsewhere.setattr(LocalShard, "state", lambda shard: [*state(shard)[:3], state(shard)[3] + 1])
+        assert [compare_shards(shards, record, Team(), QUIET) for _ in range(2)] == [everything, 0]
+    assert compare_shards(shards, record, Team(), QUIET) == 0
 
 
 def test_processes_look_when_all_are_here(
