@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import Stage
@@ -34,6 +34,10 @@ Line = Annotated[str, AfterValidator(_one_line)]
 """Text of one line: a batch script must not get another."""
 
 
+WARN_SECONDS = 120
+"""Seconds before its time limit at which a job is queued again [ours]: a training saves a step in a few."""
+
+
 class SlurmOptions(Config):
     """Options of SLURM jobs: `motionloom launch --cluster KEY=VALUE`."""
 
@@ -42,7 +46,7 @@ class SlurmOptions(Config):
     cluster's."""
     light_partition: Line | None = None
     """Partition of the groups without GPUs."""
-    time_minutes: int = Field(1440, ge=1)
+    time_minutes: int = Field(1440, ge=2 * WARN_SECONDS // 60)
     """Time limit of each group."""
     cpus: int = Field(8, ge=1)
     """CPU cores for each process; a conversion uses all of its one."""
@@ -50,8 +54,6 @@ class SlurmOptions(Config):
     """Memory for each process."""
     parts: int = Field(1, ge=1)
     """Jobs, of an array, that make a part of every conversion each."""
-    warn_seconds: int = Field(120, ge=60)
-    """Seconds before its time limit at which a job is queued again."""
     requeues: int = Field(100, ge=0)
     """Times that one job may be queued again at its time limit; 0 lets it end there."""
     clips_per_gpu: int = Field(32, ge=1)
@@ -68,15 +70,6 @@ class SlurmOptions(Config):
             if not re.fullmatch(r"[a-z][a-z0-9-]*", name):
                 raise ValueError(f"'{name}': an sbatch option is a word such as 'mail-type'")
         return extra
-
-    @model_validator(mode="after")
-    def _warned_in_time(self) -> Self:
-        if 2 * self.warn_seconds > 60 * self.time_minutes:
-            raise ValueError(
-                f"warn_seconds {self.warn_seconds} is more than half of the time limit: jobs would be "
-                f"queued again before they have done anything; raise time_minutes"
-            )
-        return self
 
     @classmethod
     def from_words(cls, words: Sequence[str]) -> Self:
@@ -129,9 +122,6 @@ class LaunchPlan:
     name: str
     """Name of the jobs: lower-case letters, digits and dashes, a letter first."""
     recipe: Recipe
-    shipped: str | None
-    """A shipped recipe's name; None for a recipe of the user's own, which travels in its resolved form."""
-    overrides: tuple[str, ...]
     out: str
     groups: tuple[Group, ...]
     go_on: tuple[str, ...] = ()
@@ -142,13 +132,12 @@ class LaunchPlan:
         return f"{self.name}-{group.name}"
 
     def command(self, group: Group, recipe: str, program: Sequence[str]) -> list[str]:
-        """The words that run a group: `program` is `motionloom`, `recipe` the file of an own recipe."""
-        overrides = self.overrides if self.shipped else ()  # a resolved recipe has them
-        sets = [word for setting in (*overrides, *group.settings) for word in ("--set", setting)]
+        """The words that run a group: `program` is `motionloom`, `recipe` the file of the resolved recipe."""
+        sets = [word for setting in group.settings for word in ("--set", setting)]
         return [
             *program,
             "run",
-            self.shipped or recipe,
+            recipe,
             "-o",
             self.out,
             "--until",
@@ -174,8 +163,6 @@ def make_launch_plan(
     recipe: Recipe,
     options: SlurmOptions,
     *,
-    shipped: str | None,
-    overrides: Sequence[str],
     out: Path,
     nodes: int,
     gpus_per_node: int,
@@ -227,7 +214,7 @@ def make_launch_plan(
         require_fit(map(recipe.stage, group.stages), recipe.hardware.model_copy(update=there))
     word = _word(recipe.name, 30)
     name = word if word[:1].isalpha() else f"run-{word}"
-    return LaunchPlan(name, recipe, shipped, tuple(overrides), str(out), tuple(groups), tuple(go_on))
+    return LaunchPlan(name, recipe, str(out), tuple(groups), tuple(go_on))
 
 
 def _settings(job: _Job, machines: Machines, options: SlurmOptions) -> tuple[str, ...]:

@@ -38,7 +38,13 @@ from motionloom.pipeline.runs.dry_run import (
     say_estimate,
     training_times,
 )
-from motionloom.pipeline.runs.launch_plan import Group, LaunchPlan, SlurmOptions, make_launch_plan
+from motionloom.pipeline.runs.launch_plan import (
+    WARN_SECONDS,
+    Group,
+    LaunchPlan,
+    SlurmOptions,
+    make_launch_plan,
+)
 from motionloom.pipeline.runs.plan import PlannedStage, make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.files import require_folder
@@ -152,16 +158,7 @@ def launch_recipe(
         say(console, f"time and disk not estimated: {error}")
     if (refusal := explain_replacements(run, loaded.name, replaced_stages(run, rows))) is not None:
         raise UserError(refusal)
-    plan = make_launch_plan(
-        loaded,
-        slurm,
-        shipped=None if Path(recipe).suffix in {".yaml", ".yml"} else str(recipe),
-        overrides=overrides,
-        out=run,
-        nodes=nodes,
-        gpus_per_node=gpus_per_node,
-        go_on=go_on,
-    )
+    plan = make_launch_plan(loaded, slurm, out=run, nodes=nodes, gpus_per_node=gpus_per_node, go_on=go_on)
     for line in plan.lines(slurm):
         say(console, line)
     planned = [row for row in rows if row.action in {"run", "resume"}]
@@ -189,8 +186,7 @@ def _require_time(plan: LaunchPlan, options: SlurmOptions, times: Mapping[str, f
 
 def _show_scripts(plan: LaunchPlan, options: SlurmOptions, console: Console) -> None:
     folder = Path(plan.out) / LOG_FOLDER / "DATE-TIME"
-    if plan.shipped is None:
-        say(console, f"would write {folder / RECIPE_FILE}: the resolved recipe")
+    say(console, f"would write {folder / RECIPE_FILE}: the resolved recipe")
     ids = {group.name: f"ID-OF-{group.name}" for group in plan.groups}
     for script in slurm_scripts(plan, options, folder, Path.cwd()):
         console.print(f"\n{script.path}:\n{script.text}", soft_wrap=True, markup=False)
@@ -213,8 +209,7 @@ def submit_run(plan: LaunchPlan, options: SlurmOptions, console: Console) -> lis
     # A folder of its own for every submission.
     folder = Path(plan.out) / LOG_FOLDER / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
     folder.mkdir(parents=True)
-    if plan.shipped is None:
-        write_text(folder / RECIPE_FILE, plan.recipe.to_yaml())
+    write_text(folder / RECIPE_FILE, plan.recipe.to_yaml())
     scripts = slurm_scripts(plan, options, folder, Path.cwd())
     for script in scripts:
         write_text(script.path, script.text)
@@ -262,7 +257,7 @@ def _options(
         ("chdir", str(cwd)),
         ("output", log),
         ("open-mode", "append"),
-        ("signal", f"B:USR1@{options.warn_seconds}"),
+        ("signal", f"B:USR1@{WARN_SECONDS}"),
         ("kill-on-invalid-dep", "yes"),
         *options.extra.items(),
     ]

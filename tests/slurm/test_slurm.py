@@ -52,13 +52,7 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], 
 
 def plan(nodes: int = 2) -> LaunchPlan:
     return make_launch_plan(
-        load_recipe("humantomato-tiny"),
-        OPTIONS,
-        shipped="humantomato-tiny",
-        overrides=(),
-        out=Path("run").absolute(),
-        nodes=nodes,
-        gpus_per_node=0,
+        load_recipe("humantomato-tiny"), OPTIONS, out=Path("run").absolute(), nodes=nodes, gpus_per_node=0
     )
 
 

@@ -17,9 +17,12 @@ from motionloom.pipeline.runs.resolve import shipped_recipes
 
 def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1, parts: int = 1) -> LaunchPlan:
     return make_launch_plan(
-        load_recipe(name, overrides), SlurmOptions(parts=parts), shipped=str(name), overrides=overrides,
-        out=Path("/runs/x"), nodes=nodes, gpus_per_node=gpus,
-    )  # fmt: skip
+        load_recipe(name, overrides),
+        SlurmOptions(parts=parts),
+        out=Path("/runs/x"),
+        nodes=nodes,
+        gpus_per_node=gpus,
+    )
 
 
 def stages(plan: LaunchPlan) -> list[tuple[str, ...]]:
@@ -61,8 +64,8 @@ def test_a_job_per_branch_of_the_paper() -> None:
     first, second, last = plan.groups[0], plan.groups[1], plan.groups[-1]
     assert second.settings == ("hardware.nodes=1", "hardware.devices=8", "hardware.accelerator=gpu")
     assert "hardware.accelerator=cpu" in first.settings and "hardware.accelerator=cpu" not in last.settings
-    words = plan.command(plan.groups[5], "unused.yaml", ["motionloom"])
-    assert words[:7] == ["motionloom", "run", "humantomato-paper", "-o", "/runs/x", "--until", "gpt"]
+    words = plan.command(plan.groups[5], "r.yaml", ["motionloom"])
+    assert words[:7] == ["motionloom", "run", "r.yaml", "-o", "/runs/x", "--until", "gpt"]
 
 
 @pytest.mark.parametrize(
@@ -114,17 +117,6 @@ def test_names_suit_slurm(tmp_path: Path) -> None:
     assert max(len(plan.job(group)) for group in plan.groups) <= 56
 
 
-def test_a_resolved_recipe_takes_no_overrides_twice() -> None:
-    overrides = ("tma.train.steps=5",)
-    recipe = load_recipe("humantomato-tiny", overrides)
-    shipped = plan_of("humantomato-tiny", *overrides)
-    own = LaunchPlan(shipped.name, recipe, None, overrides, shipped.out, shipped.groups)
-    group = shipped.groups[0]
-    assert "tma.train.steps=5" in shipped.command(group, "r.yaml", ["motionloom"])
-    words = own.command(group, "r.yaml", ["motionloom"])
-    assert words[2] == "r.yaml" and "tma.train.steps=5" not in words
-
-
 @pytest.mark.parametrize(
     ("call", "message"), [({"nodes": 0}, "take 1 node or more"), ({"gpus": -1}, "take 1 node or more")]
 )
@@ -140,7 +132,7 @@ def test_what_cannot_run_is_refused_before_it_waits(call: dict[str, Any], messag
         (["partitoin=gpu"], "did you mean 'partition'"),
         (["partition=a\n#SBATCH --wrap=x"], "one line"),
         (["extra.comment=a\nrm -rf x"], "one line"),
-        (["time_minutes=3"], "warn_seconds 120 is more than half"),
+        (["time_minutes=3"], "time_minutes"),
     ],
 )
 def test_wrong_options_are_explained(words: list[str], message: str) -> None:

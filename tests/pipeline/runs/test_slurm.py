@@ -21,15 +21,12 @@ from motionloom.pipeline.runs.launch_plan import SlurmOptions, make_launch_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.slurm import launch_recipe
 
-NASTY = """data.path=it's a "$(HOME)" `x`; touch y"""
+NASTY = """it's a "$(HOME)" `x`; touch y"""
 
 
 def scripts(folder: Path, recipe: str, *words: str, nodes: int = 1, gpus: int = 0) -> list[slurm.Script]:
-    options, overrides = SlurmOptions.from_words(words), (NASTY,) if "paper" in recipe else ()
-    plan = make_launch_plan(
-        load_recipe(recipe, overrides), options, shipped=recipe, overrides=overrides,
-        out=folder / "run", nodes=nodes, gpus_per_node=gpus,
-    )  # fmt: skip
+    options, out = SlurmOptions.from_words(words), folder / (NASTY if "paper" in recipe else "run")
+    plan = make_launch_plan(load_recipe(recipe), options, out=out, nodes=nodes, gpus_per_node=gpus)
     return slurm.slurm_scripts(plan, options, folder, folder)
 
 
@@ -65,7 +62,7 @@ def test_scripts_ask_for_a_task_a_gpu(tmp_path: Path) -> None:
     assert "gpus-per-node" not in asked(first) and asked(last)["gpus-per-node"] == "1"
     line = next(line for line in train.text.splitlines() if line.startswith("srun"))
     words = shlex.split(line)
-    assert words[-1] == "&" and after(words, "--set")[0] == NASTY
+    assert words[-1] == "&" and after(words, "-o") == [str(tmp_path / NASTY)]
     assert {"--nodes=2", "--ntasks-per-node=8", "--gpus-per-node=8"} <= set(words)
     assert not any(line.startswith("srun") for line in first.text.splitlines())
     assert train.submit({"1-data": "17"}) == [
@@ -102,9 +99,7 @@ def fake_sbatch(folder: Path, monkeypatch: pytest.MonkeyPatch, refuse: str = "")
 def test_jobs_are_submitted_behind_what_they_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     record = fake_sbatch(tmp_path / "bin", monkeypatch)
     out, to = tmp_path / "run", console()
-    recipe = tmp_path / "own.yaml"
-    recipe.write_text("extends: humantomato-tiny\nname: own\n")
-    launch_recipe(recipe, gpus_per_node=1, out=out, console=to)
+    launch_recipe("humantomato-tiny", gpus_per_node=1, out=out, overrides=["tma.train.steps=5"], console=to)
     calls = [line.split() for line in record.read_text().splitlines()]
     # Data; tokenizer, face, TMA; GPT; evaluation; motions and report.
     behind = [words[2].removeprefix("--dependency=afterok:") for words in calls[1:]]
@@ -112,7 +107,8 @@ def test_jobs_are_submitted_behind_what_they_read(tmp_path: Path, monkeypatch: p
     written = sorted(Path(words[-1]) for words in calls)
     assert all(path.is_file() and path.parent.parent == out / ".slurm" for path in written)
     resolved = load_recipe(written[0].parent / "recipe.yaml")
-    assert resolved.name == "own" and all("recipe.yaml -o" in path.read_text() for path in written)
+    assert resolved == load_recipe("humantomato-tiny", ["tma.train.steps=5"])
+    assert all("recipe.yaml -o" in path.read_text() for path in written)
     assert "scancel 1 2 3 4 5 6 7" in said(to)
 
 
