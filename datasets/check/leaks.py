@@ -8,15 +8,12 @@ equal, so that of most clips nothing is read.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 
 import numpy as np
 
-from motionloom.datasets.motion.layout import MotionLayout, require_layout
 from motionloom.datasets.schema import SPLITS, Split
 from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.reader import ShardDataset, load_manifest, manifest_layout
 
 _SAME = 1e-2
 """Metres, or radians, between two conversions of one recording at most."""
@@ -35,19 +32,6 @@ def find_leaks(sets: Mapping[str, Splits]) -> list[str]:
                     if split != other_split and split in sets[name] and other_split in sets[other]:
                         _compare(name, sets[name][split], other, sets[other][other_split], found)
     return list(found.values())
-
-
-def leaks_across(folders: Sequence[Path]) -> list[str]:
-    """The same for data set folders; sets of other layouts than the first cannot be compared: `UserError`."""
-    sets: dict[str, Splits] = {}
-    layout: MotionLayout | None = None
-    for folder in folders:
-        manifest = load_manifest(folder)
-        layout = layout or manifest_layout(manifest)
-        require_layout(manifest_layout(manifest), layout, str(folder))
-        here = {shard.split for shard in manifest.shards}
-        sets[str(folder)] = {split: ShardDataset.open(folder, split) for split in SPLITS if split in here}
-    return find_leaks(sets)
 
 
 def _compare(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import typer
-from rich.console import Console
 
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import grouped
@@ -122,37 +121,37 @@ def remove(
 
 @data_app.command()
 def check(
-    paths: Annotated[list[Path], typer.Argument(help="Folders with manifest.json.")],
+    root: Root,
     strict: Annotated[bool, typer.Option("--strict", help="Warnings count as problems.")] = False,
     as_json: AsJson = False,
 ) -> None:
     """Checksums, schema, finite values, ranges, people on a floor, duplicates, leaks. Exit code 1 and a list.
 
-    Several data sets are also compared with each other: no clip of one may be in another split of the next.
-
     Example: `motionloom data check shards`
     """
+    from motionloom.datasets.check.dataset import examine
+
     console = make_console(aside=as_json)
-    records = [_check_dataset(path, strict, console) for path in paths]
-    record, count = records[0], sum(cast(int, one["problems"]) for one in records)
-    if len(paths) > 1:
-        leaks = _leaks(paths, console)
-        count += len(leaks)
-        record = {"paths": records, "problems": count, "leaks": leaks}
+    if not root.exists():
+        raise UserError(f"{root}: no such folder")
+    report = examine(root, progress=console.is_terminal)
+    for title, problems in (("warning: ", report.warnings), ("", report.errors)):
+        findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
+        for group in grouped(findings):
+            if group.count > _ALIKE:
+                first, others = group.members[0], f"(and {group.count - 1:,} more like it; each: --json)"
+                say(console, f"{title}{first.source}: {first.reason} {others}")
+                continue
+            for finding in group.members:
+                say(console, f"{title}{finding.source}: {finding.reason}")
+    if report.warning_kinds:
+        counts = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
+        say(console, f"{root}: warnings: {counts}")
+    count = sum(report.error_kinds.values()) + strict * sum(report.warning_kinds.values())
+    console.print(f"{root}: {count} problems" if count else f"{root}: no problems", markup=False)
     if as_json:
-        print_json(record)
+        print_json({"path": root, "problems": count, **plain(report)})
     raise typer.Exit(1 if count else 0)
-
-
-def _leaks(folders: list[Path], console: Console) -> list[str]:
-    """Print and return the clips that data sets have in different splits."""
-    from motionloom.datasets.check.leaks import leaks_across
-
-    found = leaks_across(folders)
-    for leak in found:
-        say(console, f"leak: {leak}")
-    console.print(f"{len(found) or 'no'} clips of one data set are in another split of the next")
-    return found
 
 
 @data_app.command()
@@ -223,27 +222,3 @@ def clean(
     write_clean_page(root, page, found, _SUSPECTS)
     kinds = ", ".join(f"{count} {kind}" for kind, count in kinds_of(found).items())
     say(console, f"{page}: {len(found)} suspects{f' ({kinds})' if kinds else ''}")
-
-
-def _check_dataset(root: Path, strict: bool, console: Console) -> dict[str, object]:
-    """The record of a data set: `problems`, their number, and what was found."""
-    from motionloom.datasets.check.dataset import examine
-
-    if not root.exists():
-        raise UserError(f"{root}: no such folder")
-    report = examine(root, progress=console.is_terminal)
-    for title, problems in (("warning: ", report.warnings), ("", report.errors)):
-        findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
-        for group in grouped(findings):
-            if group.count > _ALIKE:
-                first, others = group.members[0], f"(and {group.count - 1:,} more like it; each: --json)"
-                say(console, f"{title}{first.source}: {first.reason} {others}")
-                continue
-            for finding in group.members:
-                say(console, f"{title}{finding.source}: {finding.reason}")
-    if report.warning_kinds:
-        counts = ", ".join(f"{count} {kind}" for kind, count in sorted(report.warning_kinds.items()))
-        say(console, f"{root}: warnings: {counts}")
-    count = sum(report.error_kinds.values()) + strict * sum(report.warning_kinds.values())
-    console.print(f"{root}: {count} problems" if count else f"{root}: no problems", markup=False)
-    return {"path": root, "problems": count, **plain(report)}

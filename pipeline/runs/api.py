@@ -23,13 +23,7 @@ from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.doubts import doubts
-from motionloom.pipeline.runs.dry_run import (
-    explain_replacements,
-    plan_table,
-    replaced_stages,
-    say_estimate,
-    started_trainings,
-)
+from motionloom.pipeline.runs.dry_run import explain_replacements, plan_table, replaced_stages, say_estimate
 from motionloom.pipeline.runs.execute import context_of, execute, perform
 from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
@@ -81,9 +75,6 @@ def run_recipe(
         console.print(f"[yellow]without --replace this is refused. {escape(refusal)}[/]", soft_wrap=True)
     elif replace and replaced:
         console.print(f"[yellow]replaces stages: {', '.join(stage.stage for stage in replaced)}[/]")
-    named = {stage.stage for stage in replaced}
-    if started := [name for name in started_trainings(run, plan) if name not in named]:
-        console.print(f"[yellow]replaces unfinished trainings: {', '.join(started)}[/]")
     if dry_run:
         say(console, f"{len(todo)} of {len(plan)} stages would run in {run}")
         return run

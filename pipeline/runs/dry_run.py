@@ -232,19 +232,6 @@ def replaced_stages(run: Path, plan: Sequence[PlannedStage]) -> list[Replaced]:
     return out
 
 
-def started_trainings(run: Path, plan: Sequence[PlannedStage]) -> list[str]:
-    """Trainings with checkpoints that the plan starts over although the user did not name them."""
-    return [
-        row.stage.name
-        for row in plan
-        if row.action == "run"
-        and row.stage.kind.trains
-        and row.request is None
-        and Artifact.find(stage_folder(run, row.stage.name)) is None
-        and newest_step(stage_folder(run, row.stage.name)) is not None
-    ]
-
-
 def explain_replacements(run: Path, recipe: str, stages: Sequence[Replaced]) -> str | None:
     """Why a run is refused without `--replace`; None where it replaces nothing that is guarded."""
     other = _recipe_in(run, recipe)

@@ -19,7 +19,7 @@ from rich.console import Console
 from motionloom.datasets.check.clip import ABSURD, beyond, human_limits
 from motionloom.datasets.check.dataset import CheckReport, examine
 from motionloom.datasets.check.findings import LISTED, Findings
-from motionloom.datasets.check.leaks import find_leaks, leaks_across
+from motionloom.datasets.check.leaks import find_leaks
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
@@ -318,8 +318,6 @@ def test_a_leaking_mix_is_refused_unless_it_is_allowed(tmp_path: Path) -> None:
     for name, val in (("one", 0.0), ("two", 0.9)):
         given = SynthConfig(layout="body133", clips=6, seed=3, val_fraction=val, test_fraction=0.0)
         synthesize(given, tmp_path / name)
-    leaks = leaks_across([tmp_path / "one", tmp_path / "two"])
-    assert leaks and all(f"of {tmp_path / 'two'} (val)" in leak for leak in leaks)
     recipe = tmp_path / "recipe.yaml"
     for allowed in (False, True):
         recipe.write_text(RECIPE.format(folder=tmp_path, allowed=str(allowed).lower()))

@@ -55,7 +55,7 @@ def test_models_are_what_has_a_folder(place: Path) -> None:
     assert list(found) == ["calm", "lively"]
     assert found["calm"].description == "moves slowly" and found["lively"].description == ""
     assert found["lively"].bytes == 1002 and found["lively"].folder == place / "lively"
-    assert info().models["calm"] == {"bytes": found["calm"].bytes, "description": "moves slowly"}
+    assert info()["models"]["calm"] == {"bytes": found["calm"].bytes, "description": "moves slowly"}
 
 
 def test_a_folder_here_goes_first(place: Path) -> None:

@@ -179,7 +179,7 @@ def test_what_is_asked_for_by_name_is_made_anew_and_what_was_begun_is_named(go: 
         go("tokenizer.add=2", "gpt.add=-1", replace=True)
     row = json.dumps({"step": 3, "elapsed_seconds": 599.0})
     write_text(tmp_path / "run/stages/gpt/flight/rank_0.jsonl", row + "\n")
-    assert "replaces unfinished trainings: gpt\n" in go("tokenizer.add=2", "gpt.add=5")
+    assert "[7/9] gpt" in go("tokenizer.add=2", "gpt.add=5")
 
 
 def test_ten_minutes_of_a_training_that_is_not_finished_are_guarded(go: Go, tmp_path: Path) -> None:
