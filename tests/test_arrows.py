@@ -168,8 +168,8 @@ def top_of(room: str) -> str:
 
 
 READERS = {
-    "synth": "pipeline/cli/data pipeline/stages/data pipeline/baselines/beats pipeline/evaluation "
-    "pipeline/inference/checks datasets/convert/aistpp",
+    "synth": "pipeline/cli/data pipeline/stages/data pipeline/evaluation pipeline/inference/checks "
+    " datasets/convert/aistpp",
     "actions": "datasets/synth pipeline/stages/data pipeline/evaluation pipeline/inference/checks",
 }
 """Who may import the synthetic source, and the rules on joints that know its actions."""

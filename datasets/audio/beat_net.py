@@ -1,8 +1,8 @@
 """Beat network: levels of 64 mel bands in, for each row the probability of a beat and of a downbeat out.
 
 Row t is centred at t / 60 s. Dilated convolutions see some eight seconds to both sides of a row. The weights
-in this package (`beats.safetensors`) were trained by the recipe `beats` on songs that a band of General MIDI
-instruments plays, whose beats are known; `pipeline/baselines/beats` says how they are made.
+in this package (`beats.safetensors`) were trained on songs with known beats, played by a band of General MIDI
+instruments, and on excerpts of freedoom's MIDI files; that training is no longer part of the package.
 
 Gain and equaliser of a recording are taken out before the network: power becomes decibels, of which each
 band's mean over the piece is subtracted. Spectra need no librosa, whose import takes seconds.
@@ -19,11 +19,9 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.schema import Config, UserError
 
 BANDS = 64
@@ -153,7 +151,7 @@ def load_beat_net() -> BeatNet:
 
 
 def read_beat_net(path: Path) -> BeatNet:
-    """A network as `write_beat_net` wrote it, frozen; `UserError` for a file that is none."""
+    """A network with the sizes that its file states, frozen; `UserError` for a file that is none."""
     try:
         with safe_open(path, "pt") as file:
             about = json.loads((file.metadata() or {}).get("config", "null"))
@@ -164,10 +162,3 @@ def read_beat_net(path: Path) -> BeatNet:
         why = " ".join(str(error).split())[:200]
         raise UserError(f"{path}: no weights of a beat network ({why}); install motionloom again") from None
     return net.eval().requires_grad_(False)
-
-
-def write_beat_net(net: BeatNet, path: Path) -> None:
-    """Weights in half precision, with the sizes of the network."""
-    state = {name: value.detach().half().contiguous() for name, value in net.state_dict().items()}
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(save(state, {"config": json.dumps(net.config.dump())}))

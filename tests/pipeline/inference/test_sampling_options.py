@@ -231,7 +231,7 @@ def test_the_commands_settings_reach_the_sampling(
         assert made.code == 2 and wrong.partition("=")[0] in made.err
 
 
-@pytest.mark.parametrize("name", [name for name in shipped_recipes() if name != "ude-beats"])
+@pytest.mark.parametrize("name", shipped_recipes())
 def test_what_a_run_writes_down_draws_as_its_recipe_does(name: str, tmp_path: Path) -> None:
     """With some sampling settings or none; of UDE the stage's sampler runs unless another is set."""
     again, drawn = tmp_path / "recipe.yaml", list[dict[str, object]]()
