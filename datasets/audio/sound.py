@@ -52,6 +52,8 @@ _OTHER = "wav, flac, ogg and mp3 are read; convert others, as by: ffmpeg -i song
 _PART = re.compile(r"(?P<file>.+)@(?P<start>[\d:.]*)(?P<dash>[-\u2013]?)(?P<end>[\d:.]*)", re.DOTALL)
 _TIME = re.compile(r"(?:(?:(\d+):)?(\d+):)?(\d+(?:\.\d*)?)")
 
+_LEAST = 0.5
+"""Seconds of the shortest part; `0.10-0.20` is meant as minutes."""
 _BEYOND = 0.5
 """Seconds that the end may lie after that of the sound."""
 
@@ -81,6 +83,9 @@ class Excerpt:
         first, last = _seconds(start or "0", name), None if not end else _seconds(end, name)
         if last is not None and last <= first:
             raise UserError(f"{name}: its end, {end}, is not after its start, {start}; swap them")
+        if last is not None and last - first < _LEAST and "." in f"{start}{end}":
+            meant = Path(file).name + f"@{start}-{end}".replace(".", ":")
+            raise UserError(f"{name}: {last - first:g} s are no music; did you mean {meant}?")
         return cls(Path(file), first, last)
 
     @property

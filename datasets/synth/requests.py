@@ -59,6 +59,8 @@ class CaptionRequest:
 
     candidates: tuple[Record, ...] = ()
     refused: bool = False
+    without: tuple[str, ...] = ()
+    """Actions that it takes back."""
 
 
 def parse_requests(caption: str) -> CaptionRequest:
@@ -71,7 +73,9 @@ def parse_requests(caption: str) -> CaptionRequest:
     actions = tuple(action for own in named for action in own)
     if not actions or (len(parts) > 1 and any(len(own) != 1 for own in named)):
         return CaptionRequest()
-    if len(actions) > 2 or _has(text, _NEGATIONS):
+    if _has(text, _NEGATIONS):
+        return CaptionRequest(refused=True, without=actions)
+    if len(actions) > 2:
         return CaptionRequest(refused=True)
     if len(actions) == 2:
         return CaptionRequest(({"action": "then", "parts": [{"action": action} for action in actions]},))

@@ -119,7 +119,8 @@ def generate(
                 if begun is None and (seed_frames := bundle.generator.capabilities.seed_frames):
                     start = f"the first {seed_frames / bundle.layout.fps:.2g} s are of a training dance"
                     print_note(aside, f"{start}; --set seed_motion=FILE takes yours")
-            notes = bundle.notes([one.prompt for one in (segments or motions)], motions, sampling.face_model)
+            prompts = [one.prompt for one in (segments or motions)]
+            notes = bundle.notes(prompts, motions, sampling.face_model, seconds)
             for note in notes:
                 print_note(aside, note)
             title = page_title([motion.caption for motion in motions], [path.name for path in songs], file)

@@ -27,7 +27,7 @@ from motionloom.pipeline.contract.generation import GenerationRequest, MotionGen
 from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CAPTIONER, CPU, CompletedStage, StageCache
-from motionloom.pipeline.inference.checks import find_mismatches, unknown_captions
+from motionloom.pipeline.inference.checks import find_mismatches, rounded_lengths, unknown_captions
 from motionloom.pipeline.inference.generators.idle_pose import blend_to_idle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
@@ -262,17 +262,16 @@ class Bundle:
 
     def notes(
         self,
-        prompts: Iterable[Prompt],
-        motions: Iterable[GeneratedMotion] = (),
+        prompts: Sequence[Prompt],
+        motions: Sequence[GeneratedMotion] = (),
         face_model: str | None = None,
+        seconds: float | Sequence[float] | None = None,
     ) -> list[Unknown | str]:
-        """Return what a person should know of prompts and of their motions: captions unlike all that were
-        trained on, sounds without a beat, and motions that show something else than was asked for.
-        """
-        prompts = list(prompts)
+        """What a person should know of prompts, and of motions that are not as was asked for (`seconds`)."""
         texts, faces = [prompt.text for prompt in prompts], [prompt.face_text for prompt in prompts]
         remarks = dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark)
-        return [*self.unknown_captions(texts, faces, face_model), *remarks, *self.find_mismatches(motions)]
+        found: list[Unknown | str] = [*self.unknown_captions(texts, faces, face_model), *remarks]
+        return [*found, *rounded_lengths(self.generator, seconds, motions), *self.find_mismatches(motions)]
 
     def find_mismatches(self, motions: Iterable[GeneratedMotion]) -> list[str]:
         """Return a sentence for each caption, scripts apart, of which its motions show something else."""

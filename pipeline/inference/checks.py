@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.actions.measure import actions_of, find_mismatch
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.synth.requests import CaptionRequest, parse_requests
+from motionloom.datasets.synth.requests import CaptionRequest, parse_actions, parse_requests
+from motionloom.pipeline.contract.generation import MotionGenerator
+from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.text import TextSource
 
@@ -29,8 +31,23 @@ def unknown_captions(source: object, captions: Sequence[str], *, face: bool = Fa
     if not isinstance(source, TextSource):
         return []
     wanted = [caption for caption in captions if caption.strip()]
-    judge = partial(_is_known, source) if source.actions and not face else None
-    return source.unknown(wanted, face=face, judge=judge)
+    if face or not source.actions:
+        return source.unknown(wanted, face=face)
+    return source.unknown(wanted, judge=partial(_is_known, source), suits=_suits)
+
+
+def rounded_lengths(
+    generator: MotionGenerator, seconds: float | Sequence[float] | None, motions: Sequence[GeneratedMotion]
+) -> list[str]:
+    """Return a sentence for each of `seconds` that a motion's length, in whole units, is not."""
+    asked = [seconds] * len(motions) if isinstance(seconds, int | float) else seconds or ()
+    fps, unit = generator.layout.fps, generator.unit_frames
+    lengths = dict.fromkeys((wanted, one.seconds) for wanted, one in zip(asked, motions, strict=False))
+    return [
+        f"{wanted:g} s were asked for and {made:g} s are made: this model makes whole {unit / fps:.2g} s"
+        for wanted, made in lengths
+        if abs(wanted - made) > 0.5 / fps
+    ]
 
 
 def find_mismatches(
@@ -59,6 +76,11 @@ def _is_known(source: TextSource, caption: str) -> bool | None:
     """Whether a caption is known by the actions that it names; None where it names none of the training's."""
     request = _request(source, caption)
     return None if request is None else not request.refused
+
+
+def _suits(caption: str, other: str) -> bool:
+    """Whether a caption may be named beside another: not for an action that this one takes back."""
+    return not set(parse_requests(caption).without) & set(parse_actions(other.lower()))
 
 
 def _request(source: TextSource, caption: str) -> CaptionRequest | None:

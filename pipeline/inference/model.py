@@ -105,7 +105,7 @@ class MotionModel(
                 sampling=SamplingConfig.of(sampling), strict=True,
                 seed_motions=None if seed_motion is None else [seed_motion],
             )  # fmt: skip
-        for note in self.bundle.notes((motion.prompt for motion in motions), motions):
+        for note in self.bundle.notes([motion.prompt for motion in motions], motions, seconds=seconds):
             warnings.warn(str(note), stacklevel=2)
         return motions
 
@@ -134,7 +134,7 @@ class MotionModel(
         segments = script.open() if isinstance(script, Script) else Script.read(Path(script))
         drawn = SamplingConfig.of(sampling)
         motions = self.bundle.perform(segments, samples=samples, seed=seed, sampling=drawn)
-        for note in self.bundle.notes(segment.prompt for segment in segments):
+        for note in self.bundle.notes([segment.prompt for segment in segments]):
             warnings.warn(str(note), stacklevel=2)
         return motions
 

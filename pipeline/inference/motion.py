@@ -67,6 +67,12 @@ class GeneratedMotion:
     def joint_names(self) -> tuple[str, ...]:
         return tuple(self.layout.skeleton.joints)
 
+    def __repr__(self) -> str:
+        """The words and sizes, without the numbers."""
+        frames, joints = self.joints.shape[:2]
+        sizes = f"{self.seconds:g} s, {frames} frames, {joints} joints"
+        return f"{type(self).__name__}({self.words!r}, {sizes}{'' if self.face is None else ', face'})"
+
     def save(self, path: Path | str) -> Path:
         """Write one file, of the format that its ending names (`writers.WRITERS`); returns its path."""
         path = Path(path)
@@ -78,7 +84,7 @@ class GeneratedMotion:
         return str(import_module(_OUTPUTS).frame_of(self))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class EditedMotion(GeneratedMotion):
     """A clip of which a part was made anew, in the clip's world, the floor at height 0."""
 

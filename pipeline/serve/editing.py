@@ -37,6 +37,10 @@ _KINDS = {b"PK": ".npz", b"glTF": ".glb"}
 """First bytes and the file's ending; what begins otherwise is tried as BVH."""
 
 
+_HEAD = 4096
+"""Bytes at the beginning of a BVH within which its first word stands."""
+
+
 class ChangeRequest(Config):
     """A clip, and what is to change of it."""
 
@@ -80,6 +84,8 @@ class Clips:
         if not data:
             raise UserError(f"{CLIP}: empty (0 bytes)")
         kind = next((ending for first, ending in _KINDS.items() if data.startswith(first)), ".bvh")
+        if kind == ".bvh" and b"HIERARCHY" not in data[:_HEAD].replace(b"\0", b"").upper():
+            raise UserError(f"{CLIP}: no motion; send a BVH, or a GLB or npz that was made here")
         with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
             path = Path(folder) / f"clip{kind}"
             path.write_bytes(data)

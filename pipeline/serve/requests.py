@@ -142,7 +142,7 @@ def notes_of(
     be said of the body instead, that a sound has no beat, and that the motion does something else.
     """
     prompt = Prompt(asked.caption, asked.face, sound)
-    found = model.bundle.notes([prompt], [motion])
+    found = model.bundle.notes([prompt], [motion], seconds=asked.seconds)
     unknown = [one for one in found if isinstance(one, Unknown)]
     nearest = [text for one in unknown if one.caption == asked.caption for text in one.nearest]
     return {"notes": [one.what if isinstance(one, Unknown) else one for one in found], "nearest": nearest}

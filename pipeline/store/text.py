@@ -25,6 +25,7 @@ from motionloom.pipeline.store.known_captions import (
     KnownCaptions,
     KnownTexts,
     Unknown,
+    is_english,
     load_known,
 )
 
@@ -37,6 +38,8 @@ _SUFFIXES = (".safetensors", ".json", ".txt", ".model", ".md")
 _EXPORTED = "text.json"
 _COPY = "encoder"
 _KNOWN_WIDTHS = {BUILT_IN: 384, "openai/clip-vit-base-patch32": 512}
+_MARKS = 2
+"""Tokens that MiniLM puts around a caption."""
 _USUAL_WIDTH = 768
 """Width of DistilBERT and CLIP ViT-L/14, assumed for encoders that are not loaded to look."""
 
@@ -131,23 +134,30 @@ class TextSource:
         captions: Sequence[str],
         *,
         face: bool = False,
-        judge: Callable[[str], bool | None] | None = None,
+        judge: Callable[[str], bool | None] = lambda _: None,
+        suits: Callable[[str, str], bool] = lambda *_: True,
     ) -> list[Unknown]:
         """Return those of `captions` that are unlike all that were trained on, each once.
 
-        `judge` says of some captions whether they are known; where it returns None, distance decides.
+        `judge` says of some captions whether they are known; where it returns None, distance decides. `suits`
+        says of a caption and one of the training's whether that may be named beside it.
         """
         known = self.known.get("face" if face else "body")
         different = list(dict.fromkeys(captions))
         if known is None or not different:
             return []
-        out = []
-        for caption, vector in zip(different, self._sentences.encode(different).sentence, strict=True):
-            is_known = judge(caption) if judge is not None else None
+        out, encoded = [], self._sentences.encode(different)
+        pieces = (encoded.mask.sum(1) - _MARKS).tolist()
+        for caption, vector, count in zip(different, encoded.sentence, pieces, strict=True):
+            is_known = judge(caption)
             if is_known is None:
                 is_known = not known.is_far(vector)
-            if not is_known:
-                out.append(Unknown(caption, known.nearest(vector)))
+            if is_known:
+                continue
+            if known.english and not is_english(caption, count):
+                out.append(Unknown(caption, english=False))
+            else:
+                out.append(Unknown(caption, known.nearest(vector, partial(suits, caption))))
         return out
 
     @cached_property

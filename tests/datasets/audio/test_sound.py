@@ -268,6 +268,7 @@ def test_start_and_end(song: Path, part: str, start: float, end: float) -> None:
     ("part", "fix"),
     [
         ("60-30", "swap them"),
+        ("0.10-0.20", "did you mean song.flac@0:10-0:20"),
         ("1:75-", "m:ss"),
         ("1.2.3-", "m:ss"),
         ("30", "0:30-1:00"),

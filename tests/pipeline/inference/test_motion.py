@@ -53,6 +53,7 @@ def test_endings_that_are_none(motion: GeneratedMotion, tmp_path: Path) -> None:
 
 
 def test_a_notebook_shows_it_apart(motion: GeneratedMotion) -> None:
+    assert repr(motion) == f"GeneratedMotion({NASTY!r}, 1.5 s, 30 frames, 52 joints)"
     tags: list[tuple[str, dict[str, str | None]]] = []
     reader = HTMLParser()
     reader.handle_starttag = lambda tag, attrs: tags.append((tag, dict(attrs)))  # type: ignore[method-assign]

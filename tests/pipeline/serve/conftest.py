@@ -89,7 +89,7 @@ class QuickModel:
     def examples(self) -> list[str]:
         return ["a person stretches"]
 
-    def notes(self, prompts: Sequence[Prompt], motions: Sequence[GeneratedMotion] = ()) -> list[Any]:
+    def notes(self, prompts: Sequence[Prompt], *_: object, **__: object) -> list[Any]:
         """All that is said of a violin, and remarks on sounds."""
         known = ("a person <b>claps</b>", "a person stretches")
         words = [text for prompt in prompts for text in (prompt.text, prompt.face_text)]

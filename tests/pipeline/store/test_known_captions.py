@@ -125,6 +125,11 @@ def test_a_run_of_clips_with_a_truth_knows_their_actions(small_run: Any) -> None
     for caption in ("nobody kicks", "kick, jump and wave", "he plays the violin"):
         (found,) = bundle.unknown_captions([caption, caption])
         assert found.caption == caption and len(found.nearest) == 3
+    (found,) = bundle.unknown_captions(["a person does not wave the left hand"])
+    assert len(found.nearest) == 3 and not any("wav" in one for one in found.nearest)
+    for caption in ("ein Mann läuft vorwärts", "una persona saluda a su amigo", "人が歩く", "iemand zwaait"):
+        (found,) = bundle.unknown_captions([caption])
+        assert not found.english and not found.nearest and "reads English" in str(found)
     assert bundle.find_mismatches([]) == []
 
 
