@@ -183,7 +183,6 @@ def generate(
     gpt: InterleavedGPT,
     text: Tensor,
     *,
-    max_groups: int | None = None,
     groups: Tensor | None = None,
     how: Drawing = Drawing(),
     cfg_scale: float = 1.0,
@@ -194,7 +193,6 @@ def generate(
     Args:
         gpt: The model; runs in evaluation mode and is left as it was.
         text: float [B, E].
-        max_groups: Longest result in groups (default: what the block size allows).
         groups: int64 [B], requested lengths: End is forbidden before and forced there. None: the model
             decides.
         how: How each token is drawn.
@@ -207,9 +205,7 @@ def generate(
         length.
     """
     batch, device = len(text), text.device
-    most_groups = gpt.max_groups if max_groups is None else max_groups
-    allowed = min(most_groups, gpt.max_groups)
-    limit = requested_groups(groups, batch, most=most_groups, limit=allowed, device=device)
+    limit = requested_groups(groups, batch, most=gpt.max_groups, limit=gpt.max_groups, device=device)
     gpt.require_guidance(cfg_scale)
     size, most = len(gpt.pattern), int(limit.max()) if batch else 0
     # All numbers are drawn before the loop, so that a row does not depend on the others' lengths.

@@ -77,8 +77,8 @@ class TokenTimeline:
             new = torch.minimum(wanted[rows] - done[rows], self.window_groups - seen)
             first = (done[rows] - seen) * GROUP_FRAMES
             frames = (seen + new) * GROUP_FRAMES
-            own_rows = {name: _rows_of(condition, rows) for name, condition in conditions.items()}
-            part = self.within(own_rows, first, frames)
+            part = {name: _rows_of(condition, rows) for name, condition in conditions.items()}
+            part |= {name: cut(part[name], first, frames) for name in part.keys() & set(self.net.mate.timed)}
             own = [seeds[row] for row in rows.tolist()]
             noise = None if z is None else z[rows]
             more = self.window(part, here, noise, new, window_seeds(own, number, turn), sampling)
@@ -86,11 +86,6 @@ class TokenTimeline:
             done[rows] += more.groups
             turn += 1
         return made
-
-    def within(self, conditions: Conditions, first: Tensor, frames: Tensor) -> dict[str, Condition]:
-        """Conditions of a window of `frames` [B] from the frame `first` [B] of the stretch on."""
-        timed = self.net.mate.timed
-        return {name: cut(one, first, frames) if name in timed else one for name, one in conditions.items()}
 
     def window(
         self,

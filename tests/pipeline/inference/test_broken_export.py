@@ -158,18 +158,6 @@ def test_what_cannot_be_is_refused_in_a_sentence(name: str, model: Path) -> None
         MotionModel.from_pretrained(model)
 
 
-def test_an_export_that_fails_leaves_nothing(
-    small_run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise UserError("the encoder is gone")
-
-    monkeypatch.setattr("motionloom.pipeline.store.text.TextSource.export", fail)
-    with pytest.raises(UserError, match="the encoder is gone"):
-        write_bundle(small_run.folder, tmp_path / "out")
-    assert list((tmp_path / "out").iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("stage", "key"),
     [

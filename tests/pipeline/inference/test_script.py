@@ -38,10 +38,6 @@ def write(tmp_path: Path) -> Write:
     return go
 
 
-def opened(path: Path) -> list[DrivenSegment]:
-    return Script.read(path)
-
-
 def test_all_forms_of_a_segment(write: Write) -> None:
     path = write("""
 segments:
@@ -55,7 +51,7 @@ segments:
   - {music: "song.wav@0:02-"}
   - {music: "song.wav@-3.5", text: a person spins}
 """)
-    found = opened(path)
+    found = Script.read(path)
     assert [s.seconds for s in found] == pytest.approx([4, 1.5, 6, 4.25, 2, 4, 3.5])
     spins = "a person spins + song"
     labels = ["a person walks", "a person bows", "song", spins, "song", "song", spins]
@@ -101,7 +97,7 @@ MISTAKES = {
 def test_mistakes_are_one_sentence_that_names_file_and_key(text: str, write: Write) -> None:
     path = write(text)
     with pytest.raises(UserError, match=MISTAKES[text]) as caught:
-        opened(path)
+        Script.read(path)
     assert re.search(r"show\.yaml|\.wav|tmp", str(caught.value)), caught.value
     assert "\n" not in str(caught.value)
 

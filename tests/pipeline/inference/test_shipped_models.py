@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.places import hub_is_away, means_folder, no_such_folder, require_hub_name
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import load_text_encoder
@@ -22,7 +21,6 @@ from motionloom.pipeline.inference import shipped_models as module
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import model_folder, shipped_models
-from motionloom.pipeline.store.artifact import Artifact
 
 CAPTION = "a person waves with the left hand"
 """Of the README's first line."""
@@ -86,10 +84,6 @@ def synthetic() -> Path:
 
 def test_the_model_that_ships_is_small_and_whole(synthetic: Path) -> None:
     assert shipped_models()["synthetic"].bytes <= 20e6
-    for path in synthetic.glob("*/artifact.json"):
-        noted = {name: one.sha256 for name, one in Artifact.load_json(path).outputs.items()}
-        assert {file.name for file in path.parent.glob("*.safetensors")} <= set(noted)
-        assert noted == {name: sha256_of(path.parent / name) for name in noted}
     model = MotionModel.from_pretrained("synthetic", device="cpu")
     assert model.modalities == {"text"} and model.bundle.faces and model.bundle.layout.has("face")
 
@@ -114,12 +108,6 @@ def test_the_readmes_first_line_waves_with_the_left_hand(
         return joints[:, number[f"{side}_wrist"], 1] - joints[:, number[f"{side}_elbow"], 1]
 
     assert (lifted("left") > 0.1).mean() > 0.3 and (lifted("right") < 0.1).mean() > 0.9
-
-
-def test_the_model_that_ships_says_what_it_does_not_know(synthetic: Path) -> None:
-    model = MotionModel.from_pretrained("synthetic", device="cpu")
-    (found,) = model.unknown([CAPTION, "the stock market fell sharply"])
-    assert found.caption == "the stock market fell sharply" and len(found.nearest) == 3
 
 
 @pytest.fixture
