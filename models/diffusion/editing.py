@@ -78,7 +78,6 @@ class Filling:
         window: Frames denoised at once: those that the network was trained on.
         overlap: Frames that neighbouring windows share.
         guidance: Classifier-free guidance of the captions; 1 is off.
-        strength: Gradient steps towards places and pins in each denoising step; a fraction is a shorter one.
     """
 
     def __init__(
@@ -91,10 +90,9 @@ class Filling:
         window: int,
         overlap: int,
         guidance: float = 1.0,
-        strength: float = 1.0,
     ) -> None:
         self.net, self.known, self.recovery = net, known, recovery
-        self.guidance, self.strength = guidance, strength
+        self.guidance = guidance
         frames = len(known.motion)
         self.size = min(window, frames)
         overlap = min(overlap, self.size // 2)
@@ -135,7 +133,7 @@ class Filling:
     @torch.no_grad()
     def _predict(self, x: Tensor, step: Tensor) -> Tensor:
         """Return the predicted clean motions of x [n, T, D], corrected by what is known."""
-        return self._gradient_steps(self._smoothed(self._blended(x, step)))
+        return self._gradient_step(self._smoothed(self._blended(x, step)))
 
     def _blended(self, x: Tensor, step: Tensor) -> Tensor:
         """Return the means of all rows' predictions [n, T, D]."""
@@ -179,22 +177,18 @@ class Filling:
             errors.append((joints - pins.positions).flatten(1))
         return torch.cat(errors, dim=1)
 
-    def _gradient_steps(self, motion: Tensor) -> Tensor:
+    def _gradient_step(self, motion: Tensor) -> Tensor:
         """Return motions moved in their free values against the gradient of the squared errors."""
         if self.recovery is None or self.known.places is None:
             return motion
-        left = self.strength
-        while left > 0:
-            with torch.enable_grad():
-                at = motion.detach().requires_grad_()
-                [slope] = torch.autograd.grad(self._errors(at).square().sum() / 2, at)
-            slope = slope.masked_fill(self.known.mask, 0.0)
-            # The length of a step minimises the errors as they change linearly along the gradient.
-            change: Tensor = jvp(self._errors, (motion,), (slope,))[1]
-            size = slope.square().sum((1, 2)) / change.square().sum(1).clamp(min=1e-12)
-            motion = motion - min(left, 1.0) * size[:, None, None] * slope
-            left -= 1
-        return motion
+        with torch.enable_grad():
+            at = motion.detach().requires_grad_()
+            [slope] = torch.autograd.grad(self._errors(at).square().sum() / 2, at)
+        slope = slope.masked_fill(self.known.mask, 0.0)
+        # The length of the step minimises the errors as they change linearly along the gradient.
+        change: Tensor = jvp(self._errors, (motion,), (slope,))[1]
+        size = slope.square().sum((1, 2)) / change.square().sum(1).clamp(min=1e-12)
+        return motion - size[:, None, None] * slope
 
     def _smoothed(self, motion: Tensor) -> Tensor:
         """Return motions [n, T, D] with known values in place and free values corrected towards them.

@@ -21,7 +21,7 @@ from motionloom.models.metrics.distributions import fid
 
 Array = NDArray[np.float64]
 
-_ANKLES_TOES = ((7, 10), (8, 11))
+ANKLES_TOES = ((7, 10), (8, 11))
 """(ankle, toes) of the left and the right foot."""
 
 
@@ -78,7 +78,7 @@ def foot_contact_score(joints: NDArray[np.floating], fps: float) -> float:
     if top == 0:
         return 0.0
     flat = np.linalg.norm(np.diff(x[1:, :, [0, 2]], axis=0), axis=-1)
-    left, right = (flat[:, list(foot)].min(1) for foot in _ANKLES_TOES)
+    left, right = (flat[:, list(foot)].min(1) for foot in ANKLES_TOES)
     return float((left * right * strength / top).mean() * 10_000)
 
 
@@ -89,7 +89,7 @@ def foot_skating(joints: NDArray[np.floating], fps: float) -> float:
     from frame t to t + 1 counts as low when both its frames are; each foot counts on its own.
     """
     x = np.asarray(joints, dtype=np.float64)
-    toes = x[:, [toe for _, toe in _ANKLES_TOES]]
+    toes = x[:, [toe for _, toe in ANKLES_TOES]]
     low = toes[..., 1] - x[..., 1].min() < 0.05
     fast = np.linalg.norm(np.diff(toes[..., [0, 2]], axis=0), axis=-1) * fps > 0.5
     return float((low[1:] & low[:-1] & fast).mean())

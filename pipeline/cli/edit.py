@@ -44,7 +44,7 @@ def edit(
     """A clip of which a part is kept and the rest made anew, on a page beside the clip.
 
     Says how far each thing that was asked for is from what came, and how smooth the seams are. `--set` also
-    takes plant_feet and the task's keys, such as seconds (length of the result), lead and strength.
+    takes the task's keys, such as seconds (length of the result) and lead.
 
     Example: `motionloom edit inbetween walk.bvh --keep 0:1.5 --keep 2.5:`  (fill a gap)
 

@@ -123,18 +123,12 @@ class EditTask(Config):
     """Seconds to make before the clip."""
     seconds: Seconds | None = Field(None, gt=0)
     """Length of the result from the clip's first frame on; None: the clip's. Longer: made after its end."""
-    keep: tuple[Kept, ...] = ()
-    """None: with `words`, all outside of them, and all of the clip where the result is longer than it;
-    else nothing."""
+    keep: tuple[Kept, ...] | None = None
+    """Without it: all outside of `words`, and all of the clip where the result is longer; else nothing."""
     path: tuple[PathPoint, ...] = ()
     """Between its points the root takes a smooth way that does not overshoot."""
     pins: tuple[Pin, ...] = ()
     words: tuple[Words, ...] = ()
-    strength: float = Field(1.0, ge=0, le=100, allow_inf_nan=False)
-    """How hard each denoising step is pulled towards path and pins. More is nearer and less natural; 0 leaves
-    them to `exact` alone."""
-    exact: bool = True
-    """Meet path and pins at the end by moving the motion around them as little as needed."""
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -167,23 +161,27 @@ class EditReport:
     """Furthest that the root is from its path; NaN without one."""
     pins_cm: dict[str, float]
     """How far each pinned joint is from its place, by joint and seconds."""
+    aside_degrees: float
+    """Mean angle between where the figure faces and where it walks on its path; NaN without one."""
     seams: float
-    """Mean acceleration where kept and made meet; NaN where they do not."""
+    """Largest acceleration, of the joints on average, where kept and made meet; NaN where they do not."""
     inside: float
-    """Mean acceleration of the clip itself."""
-    skating: float
-    """Share of the result's steps in which a foot slides, and that of the clip."""
-    clip_skating: float
+    """The largest of the clip itself."""
+    sliding: float
+    """Mean speed of the slower foot where the legs are made, cm/s; NaN where they are kept."""
+    clip_sliding: float
+    """That of the clip."""
 
     def lines(self) -> list[str]:
-        """The report for people, one line a figure."""
-        out = []
-        if not math.isnan(self.kept_cm):
-            out.append(f"kept joints: {self.kept_cm:.2f} cm at most from the clip")
-        if not math.isnan(self.path_cm):
-            out.append(f"path: {self.path_cm:.1f} cm at most off it")
-        out += [f"pin {name}: {miss:.1f} cm off" for name, miss in self.pins_cm.items()]
-        if not math.isnan(self.seams):
-            out.append(f"seams: {self.seams:.1f} m/s², the clip itself {self.inside:.1f} m/s²")
-        out.append(f"feet slide in {self.skating:.0%} of the steps, in the clip in {self.clip_skating:.0%}")
-        return out
+        """The report for people, one line a figure; what was not asked for has none."""
+        facing = f"faces {self.aside_degrees:.0f} degrees away from where it walks"
+        seams = f"largest acceleration at a seam: {self.seams:.1f} m/s², in the clip {self.inside:.1f} m/s²"
+        sliding = f"slower foot: {self.sliding:.1f} cm/s, in the clip {self.clip_sliding:.1f} cm/s"
+        lines = {
+            f"kept joints: {self.kept_cm:.2f} cm at most from the clip": self.kept_cm,
+            f"path: {self.path_cm:.1f} cm at most off it, {facing}": self.path_cm,
+            **{f"pin {name}: {miss:.1f} cm off": miss for name, miss in self.pins_cm.items()},
+            seams: self.seams,
+            sliding: self.sliding,
+        }
+        return [line for line, value in lines.items() if not math.isnan(value)]

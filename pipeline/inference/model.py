@@ -210,13 +210,13 @@ def edit_clip(
     whole[..., columns] = np.stack(editor(frames, words, seeds[:samples], sampling))
     faces = _faces(bundle, frames, whole, seeds[samples:], sampling)
     original, texts = original_of(frames, clip.caption), [text for text, _ in shares if text.strip()]
-    prompt, kept = Prompt("; ".join(dict.fromkeys(texts)), task.face), np.all(frames.kept_joints, axis=1)
+    prompt = Prompt("; ".join(dict.fromkeys(texts)), task.face)
     out = []
     for body, face in zip(whole[..., layout.part("bodyhand")], faces, strict=True):
-        features, joints, report = finish(frames, body)
+        features, figure, report = finish(frames, body)
         out.append(
             EditedMotion(
-                prompt, features, joints, face, layout, seed=seed, kept=kept, original=original,
+                prompt, features, figure.joints, face, layout, seed=seed, figure=figure, original=original,
                 report=report, remarks=frames.remarks,
             )
         )  # fmt: skip
@@ -226,10 +226,15 @@ def edit_clip(
 def original_of(frames: EditFrames, caption: str) -> GeneratedMotion:
     """The clip of a task as the model reads it: at its frame rate, on the floor."""
     features, layout = frames.features[frames.inside], frames.layout
+    figure = frames.to_world(frames.figure)
     return GeneratedMotion(
-        Prompt(caption), features[:, layout.part("bodyhand")], frames.to_world(frames.joints), frames.face,
-        kept=np.ones(len(features), dtype=np.bool_), layout=layout,
-    )  # fmt: skip
+        Prompt(caption),
+        features[:, layout.part("bodyhand")],
+        figure.joints,
+        frames.face,
+        layout,
+        figure=figure,
+    )
 
 
 def _encoded(bundle: Bundle, stage: CompletedStage, text: str) -> Conditions:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Prompt
@@ -36,8 +37,8 @@ class GeneratedMotion:
     """Seconds of the beats of its music, as the model heard them; None: not looked for."""
     seed: int | None = None
     """The seed that it was asked for with."""
-    kept: NDArray[np.bool_] | None = None
-    """Frames that are a clip's own [T], whose feet are left as they are; None: all were made."""
+    figure: RigidMotion | None = None
+    """The figure whose joints these are, which is shown as it is; None: one is fitted to them."""
 
     @property
     def caption(self) -> str:

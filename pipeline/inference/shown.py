@@ -77,6 +77,8 @@ def shown(motion: GeneratedMotion | ShownMotion, options: FigureOptions | None =
     """The figure of one motion; one that was made already stays what it is."""
     if isinstance(motion, ShownMotion):
         return motion
+    if motion.figure is not None:
+        return ShownMotion(motion, motion.figure)
     options, layout = options or FigureOptions(), motion.layout
     figure = fit_rigid(motion.joints, layout.skeleton, rotations=rotations_of(motion.features, layout))
     if not options.plant_feet:
@@ -84,6 +86,4 @@ def shown(motion: GeneratedMotion | ShownMotion, options: FigureOptions | None =
     # Only the h3d family has contact columns; others are judged by height and speed.
     columns = motion.features if layout.family == "h3d" else None
     contacts = foot_contacts(figure.joints, layout.skeleton, layout.fps, columns, layout)
-    if motion.kept is not None:
-        contacts &= ~motion.kept[:, None]
     return ShownMotion(motion, *plant_feet(figure, motion.joints, contacts, layout.fps))

@@ -124,8 +124,9 @@ class Clips:
         report = {key: None if value != value else value for key, value in asdict(made.report).items()}
         facts = {"clip": name, "seed": asked.seed, "notes": list(made.remarks)}
         cells = {"before": made.original, "after": made}
-        note = "\n".join(made.report.lines())
-        return answer(made, asked.format, {**facts, "report": report}, note, cells)
+        lines = made.report.lines()
+        facts |= {"report": report, "lines": lines}
+        return answer(made, asked.format, facts, "\n".join(lines), cells)
 
 
 def _name_of(facts: dict[str, object]) -> str:

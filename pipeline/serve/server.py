@@ -7,11 +7,9 @@ import socket
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import uvicorn
 from rich.console import Console
 
-from motionloom.datasets.audio.features import beats
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import find_model
@@ -29,7 +27,6 @@ def serve(folder: Path | str, config: ServeConfig, *, device: str = "auto", cons
     # The address is taken before the model is loaded, so that a taken port is reported at once.
     with closing(listen(config)) as listener:
         model = MotionModel.from_pretrained(place, device=device)
-        warm(model)
         worker, name = Worker(config.waiting), Path(folder).resolve().name
         server = server_of(Site(model, config, worker, name))
         host, port = listener.getsockname()[:2]
@@ -83,15 +80,3 @@ def server_of(site: Site) -> uvicorn.Server:
         timeout_graceful_shutdown=_GRACE,
     )
     return uvicorn.Server(config)
-
-
-def warm(model: MotionModel) -> None:
-    """Load what is loaded at the first use, so that the first request does not wait for it."""
-    generator = model.bundle.generator
-    if "text" in generator.modalities:
-        caption = (model.examples(1) or ["a person stands"])[0]  # a known one: a note here would be nobody's
-        model.generate([caption], seconds=1.0)
-    if "audio" in generator.modalities:
-        rate = 22_050
-        clicks = (np.arange(4 * rate) % (rate // 2) < 100).astype(np.float32)
-        beats(clicks, rate)

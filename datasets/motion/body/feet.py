@@ -81,11 +81,16 @@ def foot_contacts(
 
 
 def plant_feet(
-    motion: RigidMotion, unfitted: NDArray[np.floating], contacts: NDArray[np.bool_], fps: float
+    motion: RigidMotion,
+    unfitted: NDArray[np.floating],
+    contacts: NDArray[np.bool_],
+    fps: float,
+    fixed: NDArray[np.bool_] | None = None,
 ) -> tuple[RigidMotion, FeetReport]:
     """Return the motion with its feet pinned while `contacts` [T, 2] say that they stand.
 
-    `unfitted` [T, N, 3] are the joints before any fit, which the result's error is measured against.
+    `unfitted` [T, N, 3] are the joints before any fit, which the result's error is measured against. Frames
+    that are `fixed` [T] have no contacts; a foot that stands beside one is pinned where it stands there.
     """
     skeleton, balls = motion.skeleton, _balls(motion.skeleton)
     before = _slide(motion.joints[:, balls], contacts, fps)
@@ -96,7 +101,7 @@ def plant_feet(
     blend = max(1, round(_BLEND * fps))
     for foot, side in enumerate(SIDES):
         ankle = skeleton.index(f"{side}_ankle")
-        change = _correction(motion.joints[:, balls[foot]], contacts[:, foot], blend)
+        change = _correction(motion.joints[:, balls[foot]], contacts[:, foot], blend, fixed)
         targets[:, [ankle, balls[foot]]] += change[:, None]
         weights[[ankle, balls[foot]]] = _PINNED
         weights[skeleton.index(f"{side}_knee")] = _KNEES
@@ -121,12 +126,17 @@ def _slide(balls: NDArray[np.float64], contacts: NDArray[np.bool_], fps: float) 
     return float(step[both].mean() * fps * 100)
 
 
-def _correction(ball: NDArray[np.float64], standing: NDArray[np.bool_], blend: int) -> NDArray[np.float64]:
+def _correction(
+    ball: NDArray[np.float64], standing: NDArray[np.bool_], blend: int, fixed: NDArray[np.bool_] | None
+) -> NDArray[np.float64]:
     """Displacement [T, 3] along the floor that keeps a ball of the foot [T, 3] still while it stands."""
     out = np.zeros_like(ball)
     stands = runs(standing)
+    fixed = np.zeros(len(ball), dtype=np.bool_) if fixed is None else fixed
     for start, end in stands:
-        anchor = np.median(ball[start:end], axis=0)
+        # Between two fixed frames the foot gives way evenly.
+        ends = [ball[k] for k in (start - 1, end) if 0 <= k < len(ball) and fixed[k]]
+        anchor = np.linspace(ends[0], ends[-1], end - start) if ends else np.median(ball[start:end], axis=0)
         out[start:end, [0, 2]] = (anchor - ball[start:end])[:, [0, 2]]
     frames = np.arange(len(ball))
     ends = [0, *(edge for run in stands for edge in run), len(ball)]
@@ -140,6 +150,7 @@ def _correction(ball: NDArray[np.float64], standing: NDArray[np.bool_], blend: i
             out[free] += out[free_start - 1] * _fade((free - free_start + 1) / span)[:, None]
         if free_end < len(ball):
             out[free] += out[free_end] * _fade((free_end - free) / span)[:, None]
+    out[fixed] = 0
     return out
 
 

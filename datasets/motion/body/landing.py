@@ -6,16 +6,15 @@ its limb along, and what the limb does not reach the rest of the body gives.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.chain_solver import solve_poses
-from motionloom.datasets.motion.body.rigid import fit_rigid
+from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.canonical import ground
-from motionloom.datasets.motion.skeleton import Skeleton
 
 Number = TypeVar("Number", np.float64, np.complex128)
 
@@ -67,31 +66,34 @@ def landed(
 
 
 def reached(
-    joints: NDArray[np.float64], skeleton: Skeleton, pinned: Pinned, fixed: NDArray[np.bool_], blend: int
-) -> NDArray[np.float64]:
-    """Joints [T, N, 3] of which the pinned ones are where they must be, as far as the bones reach.
+    figure: RigidMotion,
+    pinned: Pinned,
+    fixed: NDArray[np.bool_],
+    blend: int,
+    hold: Callable[[RigidMotion], RigidMotion],
+) -> RigidMotion:
+    """The figure with the pinned joints where they must be, as far as its bones reach; feet stay.
 
     Args:
         fixed: Joints that may not move, bool [T, N].
         blend: Frames before and after a pin in which the figure goes there and comes back; fewer where a
             fixed frame is nearer.
+        hold: Puts back what is kept of a figure, bit for bit.
     """
-    if not pinned:
-        return joints
-    figure = fit_rigid(joints, skeleton)
-    missing = {key: np.asarray(place) - joints[key] for key, place in pinned.items()}
-    out = joints
-    # The solver trades pins against bones, so it falls short of them by a little. Each round aims past a pin
-    # by what was missed.
+    skeleton, out = figure.skeleton, figure
+    missing = {key: np.asarray(place) - figure.joints[key] for key, place in pinned.items()}
+    pinned_joints = sorted({joint for _, joint in pinned})
+    firm = np.where(fixed, _PINNED, _FREE)
+    firm[
+        :, [skeleton.index(f"{side}_{joint}") for side in ("left", "right") for joint in ("ankle", "foot")]
+    ] = _PINNED
+    # The solver trades pins against the rest, so it falls short of them by a little. Each round aims past a
+    # pin by what was missed.
     for _ in range(_ROUNDS):
-        targets = figure.joints.copy()
-        weights = np.where(fixed, _PINNED, _FREE)
-        moved = np.zeros(len(joints), dtype=np.bool_)
-        pinned_joints = sorted({joint for _, joint in pinned})
+        targets, weights = figure.joints.copy(), firm.copy()
         still: NDArray[np.bool_] = np.all(fixed, axis=1)
         changes = {joint: _track(joint, missing, still, blend) for joint in pinned_joints}
         for joint in pinned_joints:
-            moved |= changes[joint].any(axis=1)
             # Elbows and knees give way, so that a hand or foot is reached by bending, not by moving the body.
             weights[:, skeleton.parents[joint]] = np.minimum(weights[:, skeleton.parents[joint]], _BENDS)
         # Fingers follow their wrist, and toes their ankle.
@@ -101,25 +103,16 @@ def reached(
             nearest.append(above)
             if above is not None:
                 targets[:, joint] += np.where(fixed[:, joint, None], 0.0, changes[above])
-        for joint in pinned_joints:
-            weights[:, joint] = _PINNED
+        weights[:, pinned_joints] = _PINNED
         weights[fixed] = _PINNED
-        rows = np.flatnonzero(moved)
-        turned, root = solve_poses(
-            targets[rows],
-            figure.skeleton.offsets,
-            skeleton.parents,
-            figure.rotations[rows],
-            figure.root[rows],
-            weights[rows],
+        rows = np.flatnonzero(np.any([change.any(axis=1) for change in changes.values()], axis=0))
+        turned, root = figure.rotations.copy(), figure.root.copy()
+        turned[rows], root[rows] = solve_poses(
+            targets[rows], skeleton.offsets, skeleton.parents, turned[rows], root[rows], weights[rows]
         )
-        posed = type(figure).posed(figure.skeleton, turned, root, targets[rows])
-        # The fitted figure's change is added to the joints that came in, whose bones may stretch: so what
-        # no pin moves stays to the bit.
-        out = joints.copy()
-        out[rows] += np.where(fixed[rows][..., None], 0.0, posed.joints - figure.joints[rows])
+        out = hold(RigidMotion.posed(skeleton, turned, root, figure.joints))
         for key, place in pinned.items():
-            missing[key] = missing[key] + np.asarray(place) - out[key]
+            missing[key] = missing[key] + np.asarray(place) - out.joints[key]
     return out
 
 

@@ -1,21 +1,26 @@
-"""Motions that a model made of a task, moved onto what it asks exactly, and measured."""
+"""Motions that a model made of a task: posed on the clip's figure, moved onto what is asked, and measured."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.motion.body.chain_solver import solve_poses
+from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
 from motionloom.datasets.motion.body.landing import eased, landed, reached
-from motionloom.datasets.motion.canonical import ground, retarget
-from motionloom.datasets.motion.features.codec import encode, encode_exact, place
+from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
+from motionloom.datasets.motion.canonical import facing, ground, retarget
+from motionloom.datasets.motion.features.codec import encode, place
 from motionloom.datasets.motion.features.torch_joints import torch_way
+from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.layout import PIECES, piece_columns, piece_joints
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.observed import known_columns
-from motionloom.models.metrics.dance import foot_skating
+from motionloom.models.metrics.dance import ANKLES_TOES
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Motion, MotionGenerator
 from motionloom.pipeline.inference.edits.frames import EditFrames, RootPath
@@ -24,8 +29,14 @@ WORDS_EASE = 0.3
 """Seconds in which one stretch of words takes over from another [ours]."""
 _REACH_SECONDS = 0.5
 """In which a figure goes to a pin and comes back [ours]."""
+_REACHED = 0.01
+"""Metres from its pin at which a joint is there."""
 _SEAM_FRAMES = 2
 """Frames on either side of a seam that belong to it."""
+_WALKS = 0.3
+"""Metres a second of the root above which the figure should face where it goes [ours]."""
+_TRUNK_AND_ARMS = (1, 2, 3)
+"""Numbers of the `PIECES` that keep their direction where what carries them is made; fingers follow hands."""
 
 
 def why_no_edits(generator: MotionGenerator) -> str | None:
@@ -76,39 +87,76 @@ def word_shares(frames: EditFrames) -> list[tuple[str, NDArray[np.float64]]]:
 
 def finish(
     frames: EditFrames, made: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float64], EditReport]:
-    """Move features of body and hands [T, D], as a model made them, onto what the task asks exactly.
+) -> tuple[NDArray[np.float32], RigidMotion, EditReport]:
+    """Pose the clip's figure by features of body and hands [T, D], as a model made them.
 
-    Returns the features, the joints [T, N, 3] in the clip's world, and how near they are to the task.
+    Returns the features of what came, the figure in the clip's world, and how near it is to the task.
+    `UserError` for a pin that it does not reach.
     """
-    layout, task = frames.layout.without_face(), frames.task
-    root = _made_root(frames, made)
-    joints = place(made, layout, np.exp(1j * root.heading), root.place * frames.scale)
-    if frames.scale != 1.0:
-        # The model's figure is not the clip's: pose the clip's bones, and put its root where the model's is.
-        own = layout.skeleton.with_lengths_of(frames.joints).offsets
-        joints = retarget(joints, layout.skeleton, own)
-        joints = landed(joints, root.heading, root.place - ground(joints[:, 0]), np.zeros(len(joints)))[0]
-        joints[..., 1] += frames.lift
-    # The root is led to where it is kept or asked for, and eased between, so that nothing jumps.
-    rooted, inside, exact = frames.rooted, frames.inside, task.exact
-    target, targeted, heading = root.place.copy(), rooted.copy(), root.heading.copy()
+    layout, rooted = frames.layout.without_face(), frames.rooted
+    posed, heading = _posed(frames, made)
+    hold = partial(_with_kept, frames, heading)
+    figure = hold(posed)
+    contacts = foot_contacts(figure.joints, figure.skeleton, layout.fps) & ~rooted[:, None]
+    figure = hold(plant_feet(figure, posed.joints, contacts, layout.fps, rooted)[0])
+    if frames.pins:
+        blend = max(2, round(_REACH_SECONDS * layout.fps))
+        figure = reached(figure, frames.pins, frames.kept_joints, blend, hold)
+    report, joints = _report(frames, figure, heading), figure.joints
+    far = max(report.pins_cm, key=report.pins_cm.__getitem__, default="")
+    if far and report.pins_cm[far] > 100 * _REACHED:
+        raise UserError(
+            f"pins: {far} is out of reach: the figure gets within {report.pins_cm[far]:.1f} cm of it; pin it "
+            f"nearer, keep less around it, or draw a path that leads there"
+        )
+    if layout.family != "exact":
+        # These are made of steps between joints, so there is one frame more of joints.
+        joints = np.concatenate([joints, 2 * joints[-1:] - joints[-2:-1]])
+    return encode(joints, layout), frames.to_world(figure), report
+
+
+def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, NDArray[np.float64]]:
+    """The clip's figure in the poses that a model made, its root led to where it is kept or asked for; and
+    its headings [T].
+    """
+    layout, own = frames.layout.without_face(), frames.figure.skeleton
+    root, rooted, inside = _made_root(frames, made), frames.rooted, frames.inside
+    joints = place(made, layout, np.exp(1j * root.heading), root.place)
+    # Between where it is kept or asked for the root is eased, so that nothing jumps.
+    target, heading = root.place.copy(), root.heading.copy()
     target[inside] = np.where(rooted[inside], frames.clip_root.place, target[inside])
     heading[inside] = np.where(rooted[inside], frames.clip_root.heading, heading[inside])
-    if exact:
-        on_path = ~np.isnan(frames.path)
-        target[on_path] = frames.path[on_path]
-        targeted |= on_path
-    shift, turn = eased(target - root.place, targeted), eased(heading - root.heading, rooted)
-    joints, heading = landed(joints, root.heading, shift, turn)
-    # Kept joints are the clip's own bits, before pins bend the limbs around them.
-    kept = frames.kept_joints
-    joints[inside][kept[inside]] = frames.joints[kept[inside]]
-    if exact:
-        blend = max(2, round(_REACH_SECONDS * layout.fps))
-        joints = reached(joints, layout.skeleton, frames.pins, kept, blend)
-    features, report = _features(frames, joints, heading), _report(frames, joints, heading)
-    return features, frames.to_world(joints), report
+    on_path = ~np.isnan(frames.path)
+    target[on_path] = frames.path[on_path]
+    shift, turn = eased(target - root.place, rooted | on_path), eased(heading - root.heading, rooted)
+    # The bones' directions are the model's, their lengths the clip's.
+    targets = retarget(joints, layout.skeleton, own.offsets)
+    targets[..., 1] += (joints[:, 0, 1] / frames.scale + frames.lift - targets[:, 0, 1])[:, None]
+    shift += root.place - ground(targets[:, 0])
+    targets, heading = landed(targets, root.heading, shift, turn)
+    start = joints_to_rotations(targets, own)
+    turned, there = solve_poses(targets, own.offsets, own.parents, start, targets[:, 0])
+    return RigidMotion.posed(own, share_twist(turned, own), there, targets), heading
+
+
+def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMotion) -> RigidMotion:
+    """The figure with the clip's own poses where they are kept."""
+    clip, inside, pieces = frames.figure, frames.inside, piece_joints(frames.layout)
+    rotations, root, rooted = figure.rotations.copy(), figure.root.copy(), frames.rooted[inside]
+    kept, own = frames.pieces[inside][:, pieces], rotations[inside]
+    own[kept] = clip.rotations[kept]
+    root[inside][rooted] = clip.root[rooted]
+    turn = Rotation.from_euler("y", (heading[inside] - frames.clip_root.heading)[:, None]).as_matrix()
+    for joint, parent in enumerate(clip.skeleton.parents):
+        loose = kept[:, joint] & ~kept[:, parent]
+        if pieces[joint] in _TRUNK_AND_ARMS and loose.any():
+            _, was = forward_kinematics(
+                clip.rotations, clip.root, clip.skeleton.offsets, clip.skeleton.parents
+            )
+            _, now = forward_kinematics(own, root[inside], clip.skeleton.offsets, clip.skeleton.parents)
+            aligned = now[:, parent].swapaxes(-1, -2) @ turn @ was[:, joint]
+            own[loose, joint] = aligned[loose]
+    return RigidMotion.posed(clip.skeleton, rotations, root, figure.joints)
 
 
 def _made_root(frames: EditFrames, made: NDArray[np.float32]) -> RootPath:
@@ -120,71 +168,58 @@ def _made_root(frames: EditFrames, made: NDArray[np.float32]) -> RootPath:
     return RootPath(heading - heading[first] + anchor.heading[0], anchor.place[0] + away)
 
 
-def _features(
-    frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[np.float64]
-) -> NDArray[np.float32]:
-    """Columns of body and hands [T, D] that decode to the joints; what is kept has the clip's own bits."""
-    layout = frames.layout.without_face()
-    if layout.family != "exact":
-        # These are made of steps between joints, so there is one frame more of joints.
-        return encode(np.concatenate([joints, 2 * joints[-1:] - joints[-2:-1]]), layout)
-    features = encode_exact(joints, layout, heading)
-    if frames.scale != 1.0:
-        return features
-    columns = frames.layout.part("bodyhand")
-    known = known_columns(torch.from_numpy(frames.pieces)[None], frames.layout, columns)
-    return np.where(known[0].numpy(), frames.features[:, columns], features)
-
-
-def _report(frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[np.float64]) -> EditReport:
-    """How near joints [T, N, 3] are to the task."""
+def _report(frames: EditFrames, figure: RigidMotion, heading: NDArray[np.float64]) -> EditReport:
+    """How near a figure with its headings [T], seen from the clip's first frame, is to the task."""
     fps, inside, pieces = frames.layout.fps, frames.inside, piece_joints(frames.layout)
-    # Without the legs the figure goes elsewhere, so what is kept of it is compared within the figure.
-    away = np.linalg.norm(joints[inside] - frames.joints, axis=-1)
-    local = _local(joints[inside], heading[inside]) - _local(frames.joints, frames.clip_root.heading)
-    away = np.where(frames.rooted[inside][:, None], away, np.linalg.norm(local, axis=-1))
-    kept = frames.pieces[inside][:, pieces]
-    on_path = ~np.isnan(frames.path)
-    off_path = np.abs(ground(joints[on_path, 0]) - frames.path[on_path])
-    names = frames.layout.skeleton.joints
-    pins = {
-        f"{names[joint]} at {(frame - frames.lead) / fps:.2f} s": 100
-        * float(np.linalg.norm(joints[frame, joint] - np.asarray(wanted)))
-        for (frame, joint), wanted in frames.pins.items()
-    }
-    kept_body = frames.pieces[:, np.isin(np.arange(len(PIECES)), pieces)]
-    # Frames after which it changes what is kept.
-    seams = np.flatnonzero((kept_body[1:] != kept_body[:-1]).any(axis=1))
+    joints, clip, rooted = figure.joints, frames.figure.joints, frames.rooted[frames.inside][:, None]
+    names, parents = figure.skeleton.joints, np.maximum(figure.skeleton.parents, 0)
+    # Without the legs the figure goes elsewhere, so what is kept of it is compared bone by bone, as the
+    # figure sees it; fingers are kept within a hand, which goes with its arm.
+    kept = frames.pieces[inside].copy()
+    kept[:, 4:6] &= kept[:, 2:4]
+    kept = kept[:, pieces] & (rooted | kept[:, pieces][:, parents])
+    back = Rotation.from_euler("y", (frames.clip_root.heading - heading[inside])[:, None]).as_matrix()
+    bones = np.einsum("tij,tnj->tni", back, joints[inside] - joints[inside][:, parents])
+    away = np.where(rooted[..., None], joints[inside] - clip, bones - (clip - clip[:, parents]))
+    # The way is looked at where the root walks; a figure that stands may face anywhere.
+    on_path, root = ~np.isnan(frames.path), ground(joints[:, 0])
+    way = np.gradient(root) * fps
+    walks = on_path & (np.abs(way) > _WALKS)
+    aside = np.abs(np.angle(way * np.exp(-1j * facing(joints))))[walks]
+    body = frames.pieces[:, np.isin(np.arange(len(PIECES)), pieces)]
+    # Frames after which it changes what is kept, and the inner frames around them.
+    seams = np.flatnonzero((body[1:] != body[:-1]).any(axis=1))
+    near = (np.abs(np.arange(1, len(joints) - 1)[:, None] - seams - 0.5) < _SEAM_FRAMES).any(axis=1)
+    free = ~frames.rooted
     return EditReport(
-        kept_cm=100 * float(away[kept].max()) if kept.any() else float("nan"),
-        path_cm=100 * float(off_path.max()) if on_path.any() else float("nan"),
-        pins_cm=pins,
-        seams=seam_acceleration(joints, fps, seams),
-        inside=float(accelerations(frames.joints, fps).mean()),
-        skating=foot_skating(joints, fps),
-        clip_skating=foot_skating(frames.joints, fps),
+        kept_cm=_largest(100 * np.linalg.norm(away, axis=-1)[kept]),
+        path_cm=_largest(100 * np.abs(root - frames.path)[on_path]),
+        pins_cm={
+            f"{names[joint]} at {(frame - frames.lead) / fps:.2f} s": 100
+            * float(np.linalg.norm(joints[frame, joint] - np.asarray(wanted)))
+            for (frame, joint), wanted in frames.pins.items()
+        },
+        aside_degrees=float(np.degrees(aside.mean())) if walks.any() else float("nan"),
+        seams=_largest(accelerations(joints, fps)[near]),
+        inside=_largest(accelerations(clip, fps)),
+        sliding=_sliding(joints, fps, free[1:] | free[:-1]),
+        clip_sliding=_sliding(clip, fps, np.ones(len(clip) - 1, dtype=np.bool_)),
     )
+
+
+def _largest(values: NDArray[np.float64]) -> float:
+    """NaN where there are none."""
+    return float(values.max(initial=-np.inf)) if values.size else float("nan")
+
+
+def _sliding(joints: NDArray[np.float64], fps: float, steps: NDArray[np.bool_]) -> float:
+    """Speed along the floor of the slowest of ankles and balls, cm/s, on average over some of the steps."""
+    feet = ground(joints[:, [joint for foot in ANKLES_TOES for joint in foot]])
+    slowest = 100 * fps * np.abs(np.diff(feet, axis=0)).min(axis=1)
+    return float(slowest[steps].mean()) if steps.any() else float("nan")
 
 
 def accelerations(joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
     """Mean size of the joints' accelerations in every inner frame [T - 2], m/s², of joints [T, N, 3]."""
     second = np.diff(np.asarray(joints, dtype=np.float64), n=2, axis=0) * fps**2
     return np.asarray(np.linalg.norm(second, axis=-1).mean(axis=-1))
-
-
-def seam_acceleration(joints: NDArray[np.floating], fps: float, seams: NDArray[np.int64]) -> float:
-    """Mean acceleration of joints [T, N, 3] in the frames around seams; NaN where there are none [ours].
-
-    A jump between two frames is an acceleration of twice its size in each of them.
-    """
-    size = accelerations(joints, fps)
-    inner = np.arange(1, len(joints) - 1)
-    near = (np.abs(inner[:, None] - seams - 0.5) < _SEAM_FRAMES).any(axis=1)
-    return float(size[near].mean()) if near.any() else float("nan")
-
-
-def _local(joints: NDArray[np.float64], heading: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Joints [T, N, 3] from the root's place on the floor, in the heading."""
-    plane = ground(joints)
-    plane = (plane - plane[:, :1]) * np.exp(-1j * heading)[:, None]
-    return np.stack([plane.imag, joints[..., 1], plane.real], axis=-1)

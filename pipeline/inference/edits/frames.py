@@ -11,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.torch_joints import torch_way
@@ -56,8 +58,8 @@ class EditFrames:
     layout: MotionLayout
     lead: int
     """Frames before the clip's first."""
-    joints: NDArray[np.float64]
-    """The clip's [n, N, 3] on its own bones."""
+    figure: RigidMotion
+    """The clip's, n frames on its own bones."""
     face: NDArray[np.float32] | None
     """The clip's [n, 50]."""
     clip_root: RootPath
@@ -91,7 +93,7 @@ class EditFrames:
     @property
     def inside(self) -> slice:
         """The clip's frames among those of the result."""
-        return slice(self.lead, self.lead + len(self.joints))
+        return slice(self.lead, self.lead + len(self.figure.root))
 
     @property
     def rooted(self) -> NDArray[np.bool_]:
@@ -104,10 +106,16 @@ class EditFrames:
         kept: NDArray[np.bool_] = self.pieces[:, piece_joints(self.layout)] & self.rooted[:, None]
         return kept
 
-    def to_world(self, joints: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Joints [T, N, 3] in the clip's world, the floor at height 0."""
-        plane = ground(joints) * np.exp(1j * self.turn) + self.origin
-        return np.stack([plane.imag, joints[..., 1], plane.real], axis=-1)
+    def to_world(self, figure: RigidMotion) -> RigidMotion:
+        """A figure in the clip's world, the floor at height 0."""
+
+        def put(points: NDArray[np.float64]) -> NDArray[np.float64]:
+            plane = ground(points) * np.exp(1j * self.turn) + self.origin
+            return np.stack([plane.imag, points[..., 1], plane.real], axis=-1)
+
+        rotations = figure.rotations.copy()
+        rotations[:, 0] = Rotation.from_euler("y", self.turn).as_matrix() @ rotations[:, 0]
+        return RigidMotion(figure.skeleton, rotations, put(figure.root), put(figure.joints), figure.error)
 
     @property
     def model_pins(self) -> list[tuple[float, float, float]]:
@@ -133,7 +141,8 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         joints = with_resting_hands(joints)
         remarks.append("the clip has no hands, so the model makes them")
     origin, turn = complex(ground(joints[0, 0])), float(facing(joints[:1])[0])
-    own = canonicalize(joints)
+    figure = fit_rigid(canonicalize(joints), layout.skeleton)
+    own = figure.joints
     difference = _bone_difference(own, layout.skeleton)
     posed, scale, lift = own, 1.0, 0.0
     if difference > SAME_BONES:
@@ -148,21 +157,21 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         )
     features = encode(posed, layout, face if layout.has("face") else None)
     # Features of steps have one frame less than the joints.
-    own = own[: len(features)]
     face = None if face is None else face[: len(features)]
     if layout.has("face") and face is None:
         remarks.append("the clip has no face, so the model makes it")
-    lead, clip_frames = round(task.lead * layout.fps), len(own)
+    lead, clip_frames = round(task.lead * layout.fps), len(features)
     total = lead + (clip_frames if task.seconds is None else max(2, round(task.seconds * layout.fps)))
     # A result that is shorter than the clip takes no notice of what the clip does later.
-    own = own[: total - lead]
-    features = features[: len(own)]
+    features = features[: total - lead]
+    rows = slice(len(features))
+    figure = RigidMotion(figure.skeleton, figure.rotations[rows], figure.root[rows], own[rows], figure.error)
     heading, x, z = (one.numpy() for one in torch_way(torch.from_numpy(features).double(), layout))
     clip_root = RootPath(heading, (z + 1j * x) / scale)
     timed = _TimedTask(task, layout, lead, total)
     # What the clip does not have cannot be kept: fingers and face are made where it has none.
     has = np.array([True] * 4 + [clip.has_hands or not hands] * 2 + [face is not None])
-    pieces = timed.pieces(len(own)) & has
+    pieces = timed.pieces(len(features)) & has
     path = timed.path(origin, turn)
     timed.require_free(path, pieces[:, LOWER], clip_root)
     pins = timed.pins(pieces, origin, turn)
@@ -171,8 +180,8 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         task=task,
         layout=layout,
         lead=lead,
-        joints=own,
-        face=None if face is None else np.asarray(face[: len(own)], np.float32),
+        figure=figure,
+        face=None if face is None else np.asarray(face[rows], np.float32),
         clip_root=clip_root,
         features=_held(features, layout, lead, total),
         pieces=pieces,
@@ -210,7 +219,7 @@ class _TimedTask:
         task, fps = self.task, self.layout.fps
         out = np.zeros((self.frames, len(PIECES)), dtype=np.bool_)
         clip_end = self.lead + clip_frames
-        for number, kept in enumerate(task.keep):
+        for number, kept in enumerate(task.keep or ()):
             start = self.lead + round(kept.start * fps)
             if start >= clip_end:
                 raise UserError(
@@ -219,7 +228,7 @@ class _TimedTask:
                 )
             end = clip_end if kept.end is None else min(clip_end, self.lead + round(kept.end * fps))
             out[start:end] |= pieces_of(kept.parts, kept.but)
-        if not task.keep and (task.words or self.frames > clip_frames):
+        if task.keep is None and (task.words or self.frames > clip_frames):
             out[self.lead : clip_end] = True
             for words in task.words:
                 start, end = (max(0, round(time * fps) + self.lead) for time in (words.start, words.end))

@@ -111,7 +111,6 @@ class DiffusionMotion(DenoisedMotion):
             window=self.window,
             overlap=self.window // 4,
             guidance=guidance,
-            strength=frames.task.strength,
         )
         made = filling(seeds, *self.denoising(sampling)).cpu()
         # What is kept is taken from where it came from: normalising there and back rounds.

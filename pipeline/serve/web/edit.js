@@ -9,12 +9,12 @@ const panel = one("edit"), go = one("edit-go"), why = one("edit-why"), marks = o
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }, PIXELS = 6;
 
 /* The editor of a page. `page` gives `info`, `post(path, body, signal)` and `mount(viewerData, over)`; it is told what can be saved,
-   `savable(asked)`, and when the panel is shut, `closed(viewerData, ref)`. */
+   `savable(asked)`, and when the panel is shut, `closed(clip)`. */
 export function makeEditor(page) {
   const { info } = page, fps = info.fps, rows = info.edit.possible ? rowsOf(info) : [];
-  let clips = [], history = null, draft = null, chosen = null, viewer = null, mounted = null, busy = null, turn = 0, seen = -1;
+  let clip = null, history = null, draft = null, chosen = null, viewer = null, mounted = null, busy = null, turn = 0, seen = -1;
   let results = new Map(); // by the state that they are of
-  const state = () => draft || history.now, clipOf = (one) => clips[one.source];
+  const state = () => draft || history.now;
 
   joints.append(...Object.entries(HANDLES).map(([name, { label }]) => new Option(label, name)));
   const style = () => {
@@ -56,16 +56,14 @@ export function makeEditor(page) {
 
   function update() {
     const now = state(), lack = missing(now, rows, fps, info.edit.max_speed), said = now.words.find(({ from }) => from === chosen), result = results.get(history.now);
-    mount(result ? result.answer.viewer : clipOf(now).viewer);
+    mount(result ? result.answer.viewer : clip.viewer);
     lanes.show(now, chosen, viewer.frame);
     viewer.refresh();
-    one("edit-name").textContent = clipOf(now).name;
     go.disabled = !busy && Boolean(lack);
     go.textContent = busy ? "Stop" : result ? "Try another" : "Make the change";
     if (!busy) tell(lack || (result ? result.words : ready(now)));
     one("edit-undo").disabled = Boolean(busy) || !history.canUndo;
     one("edit-redo").disabled = Boolean(busy) || !history.canRedo;
-    one("edit-on").hidden = !result;
     page.savable(result ? result.asked : null);
     draw.setAttribute("aria-pressed", String(tools.drawing));
     draw.textContent = tools.drawing ? "Do not draw" : now.path ? "Draw another path" : "Draw a path";
@@ -127,9 +125,10 @@ export function makeEditor(page) {
   }
 
   /* Begins with a clip: `{ ref, viewer, frames, caption, face, name }`; `ref` is what the server knows it by. */
-  function open(clip) {
-    clips = [clip];
-    history = new History(freshState(rows, clip, 0));
+  function open(opened) {
+    clip = opened;
+    one("edit-name").textContent = clip.name;
+    history = new History(freshState(rows, clip));
     results = new Map();
     draft = chosen = mounted = viewer = null;
     stop();
@@ -139,34 +138,18 @@ export function makeEditor(page) {
     update();
   }
   function close() {
-    const { ref } = clipOf(state());
+    const now = history.now, result = results.get(now);
     tools.draw(false);
     panel.hidden = true;
     document.body.classList.remove("serve-editing");
     history = viewer = null;
     stop();
-    page.closed({ ...mounted, motions: mounted.motions.slice(-1) }, ref);
+    page.closed(result ? changed(result.answer, now.caption) : clip);
   }
-  /* Goes on from what was made: a state of its own, so that it can be undone. */
-  function goOn() {
-    const now = history.now, { answer } = results.get(now), [, after] = answer.viewer.motions, clip = clipOf(now);
-    const name = clip.name.endsWith(", changed") ? clip.name : `${clip.name}, changed`;
-    clips.push({ ...clip, ref: answer.clip, viewer: { ...answer.viewer, motions: [{ ...after, label: "changed" }] }, frames: after.frames, caption: now.caption, name });
-    draft = chosen = null;
-    history.push(freshState(rows, clips.at(-1), clips.length - 1));
-    update();
-  }
-
-  /* How near a result is to what was asked; joints as they are shown, since the figure that is shown keeps its bones' lengths. */
-  function metBy(report, { pins }) {
-    const far = (what, cm) => `${what} ${cm < 0.05 ? "exactly" : `within ${cm.toFixed(1)} cm`}`, found = [];
-    if (report.kept_cm !== null) found.push(far("what stays is as it was", report.kept_cm));
-    if (report.path_cm !== null) found.push(far("the path is met", report.path_cm));
-    for (const { joint, frame, position } of pins) {
-      const at = 3 * info.joint_names.indexOf(joint), place = viewer.joints(1, frame).subarray(at, at + 3);
-      found.push(far(`the ${HANDLES[joint].label} is there`, 100 * Math.hypot(...position.map((v, i) => v - place[i]))));
-    }
-    return found.length ? sentence(found.join(", ")) : "";
+  /* What was made, as a clip of its own. */
+  function changed(answer, caption) {
+    const [, after] = answer.viewer.motions, name = clip.name.endsWith(", changed") ? clip.name : `${clip.name}, changed`;
+    return { ...clip, ref: answer.clip, viewer: { ...answer.viewer, motions: [{ ...after, label: "changed" }] }, frames: after.frames, caption, name };
   }
   const sentence = (words) => `${words[0].toUpperCase()}${words.slice(1)}.`;
 
@@ -178,7 +161,7 @@ export function makeEditor(page) {
   }
 
   async function make() {
-    const mine = ++turn, now = history.now, before = results.get(now), seed = before ? before.asked.seed + 1 : 0, clip = clipOf(now);
+    const mine = ++turn, now = history.now, before = results.get(now), seed = before ? before.asked.seed + 1 : 0;
     const asked = { clip: clip.ref, task: taskOf(now, rows, fps, clip.face), seed, format: "viewer" }, began = performance.now();
     busy = new AbortController();
     update();
@@ -192,7 +175,7 @@ export function makeEditor(page) {
       results.set(now, result);
       busy = null;
       update();
-      result.words = [`Made in ${took} s.`, history.now === now ? metBy(answer.report, now) : "", ...answer.notes.map(sentence)].filter(Boolean).join(" ");
+      result.words = [`Made in ${took} s.`, ...answer.lines.map(sentence), ...answer.notes.map(sentence)].filter(Boolean).join(" ");
       update();
     } catch (error) {
       if (mine !== turn) return;
@@ -215,8 +198,7 @@ export function makeEditor(page) {
   one("edit-undo").addEventListener("click", () => { history.undo(); update(); });
   one("edit-redo").addEventListener("click", () => { history.redo(); update(); });
   one("edit-none").addEventListener("click", () => change((next) => mark(next, rows.map(({ name }) => name), 0, next.frames, false), true));
-  one("edit-all").addEventListener("click", () => change((next) => Object.assign(next, freshState(rows, clipOf(next), next.source)), true));
-  one("edit-on").addEventListener("click", goOn);
+  one("edit-all").addEventListener("click", () => change((next) => Object.assign(next, freshState(rows, clip)), true));
   draw.addEventListener("click", () => {
     if (!tools.drawing) { viewer.play(false); viewer.setFrame(Math.min(viewer.frame, Math.max(state().frames - 10, 0))); }
     tools.draw(!tools.drawing);

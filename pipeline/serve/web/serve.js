@@ -193,9 +193,10 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   editor = makeEditor({
     info, post, mount,
     savable: (body) => savable(body && { path: "/api/edit", body }),
-    closed: (viewer, ref) => {
-      mount(viewer);
-      if (!asked && typeof ref === "object") savable({ path: "/api/generate", body: ref });
+    closed: (clip) => {
+      current = clip;
+      mount(clip.viewer);
+      if (!asked && typeof clip.ref === "object") savable({ path: "/api/generate", body: clip.ref });
       save.hidden = false;
     },
   });

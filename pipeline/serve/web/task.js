@@ -25,10 +25,10 @@ const STEP = 0.12; // metres between two points of a path
 /* The rows of a model: fingers and a face only where it makes them. */
 export const rowsOf = (info) => ROWS.filter(({ name }) => (name === "hands" ? info.joint_names.length > 22 : name !== "face" || info.face));
 
-/* All of a clip kept; `source` is its number among the page's clips. */
-export function freshState(rows, { frames, caption }, source) {
+/* All of a clip kept. */
+export function freshState(rows, { frames, caption }) {
   const kept = Object.fromEntries(rows.map(({ name }) => [name, new Uint8Array(frames).fill(1)]));
-  return { source, clip: frames, frames, kept, path: null, pins: [], words: [], caption };
+  return { clip: frames, frames, kept, path: null, pins: [], words: [], caption };
 }
 
 /* States that were, and those that were taken back. */
@@ -144,7 +144,7 @@ export function taskOf(state, rows, fps, face) {
     if (!marks.includes("0")) keep.push({ ...span, parts: ["all"] });
     else rows.forEach(({ parts, but }, k) => { if (marks[k] === "1") keep.push({ ...span, parts, but }); });
   }
-  const task = { caption: state.caption.trim(), face, keep, words: spoken(state).map(({ from, to, text }) => ({ start: at(from), end: at(to), text: text.trim() })) };
+  const task = { caption: state.caption.trim(), face, keep, words: state.words.map(({ from, to, text }) => ({ start: at(from), end: at(to), text: text.trim() })) };
   if (state.frames !== state.clip) task.seconds = at(state.frames);
   task.pins = state.pins.map(({ joint, frame, position }) => ({ joint, at: at(frame), position }));
   if (state.path) {
@@ -155,17 +155,4 @@ export function taskOf(state, rows, fps, face) {
     });
   }
   return task;
-}
-
-/* What is said when. Where nothing is kept, the caption is said between: words alone would keep the rest. */
-function spoken(state) {
-  if (!state.words.length || together(state).some(Boolean) || !state.caption.trim()) return state.words;
-  const all = [];
-  let end = 0;
-  for (const said of [...state.words, { from: state.frames, to: state.frames }]) {
-    if (said.from > end) all.push({ from: end, to: said.from, text: state.caption });
-    if (said.text) all.push(said);
-    end = said.to;
-  }
-  return all;
 }

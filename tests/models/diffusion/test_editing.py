@@ -136,20 +136,24 @@ def task(pinned: bool = True) -> KnownMotion:
 
 
 @pytest.mark.parametrize("kind", [InBetweener, Mdm])
-def test_known_values_are_kept_and_errors_fall_with_strength(kind: type[TextDenoiser]) -> None:
+def test_known_values_are_kept_and_errors_fall(
+    kind: type[TextDenoiser], monkeypatch: pytest.MonkeyPatch
+) -> None:
     torch.manual_seed(0)
     net, given = kind(TINY, len(COLUMNS), 4), task()
     assert given.places is not None and given.pins is not None
-    misses = []
-    for strength in (0.0, 1.0, 6.0):
-        made = filled(net, given, strength=strength)
+
+    def missed() -> float:
+        made = filled(net, given)
         assert torch.equal(made[:, given.mask], given.motion[given.mask].expand(2, -1))
         anchor = given.places.anchor.expand(2)
         landing = recovery().way(made, anchor)[1][:, -1] - given.places.place[:, -1]
         joint = recovery().world(made, anchor)[:, 12, given.pins.joints] - given.pins.positions
-        misses.append(float(landing.norm(dim=-1).mean() + joint.norm(dim=-1).mean()))
-    assert misses[0] > misses[1] > misses[2]
-    assert misses[2] < 0.7 * misses[0]
+        return float(landing.norm(dim=-1).mean() + joint.norm(dim=-1).mean())
+
+    pulled = missed()
+    monkeypatch.setattr(Filling, "_gradient_step", lambda self, motion: motion)
+    assert pulled < 0.9 * missed()
 
 
 class Aside(InBetweener):

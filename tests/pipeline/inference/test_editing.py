@@ -1,4 +1,4 @@
-"""Edits of clips: what is kept to the bit, what is asked for met, and what cannot be done refused."""
+"""Edits of clips: one figure, what is kept of it, what is asked for met, and what cannot be done refused."""
 
 from __future__ import annotations
 
@@ -74,25 +74,24 @@ def edit(model: Bundle, one: RecordedClip, **task: object) -> EditedMotion:
 
 
 @pytest.mark.parametrize("name", ["wholebody363", "body133", "tomato623"])
-def test_kept_frames_are_the_clips_to_the_bit(walk: Walk, name: str) -> None:
+def test_kept_frames_are_the_clips_own(walk: Walk, name: str) -> None:
     model, one = editor(name), clip(walk)
     made = edit(model, one, keep=ENDS)
-    kept, original = made.kept, made.original
-    assert kept is not None and kept.sum() == len(kept) - 20 and not kept[20:40].any()
-    np.testing.assert_array_equal(made.joints[kept], original.joints[kept])
-    assert made.report.kept_cm == 0
+    original, kept = made.original, np.ones(len(made.joints), dtype=bool)
+    kept[20:40] = False
+    np.testing.assert_allclose(made.joints[kept], original.joints[kept], atol=1e-9)
+    assert made.report.kept_cm < 1e-6
     assert np.abs(made.joints - original.joints)[~kept].max() > 0.01
     # In the clip's own world, whose floor is at 0.
     floor = one.joints[..., 1].min()
     np.testing.assert_allclose(
-        original.joints[:, :22], one.joints[: len(kept), :22] - [0, floor, 0], atol=0.02
+        original.joints[:, :22], one.joints[: len(kept), :22] - [0, floor, 0], atol=0.03
     )
     # The features decode to these joints, from the first frame on.
     local = joints_of(made.features, made.layout)
     decoded, shown = (np.abs(ground(one)[:, :1] - ground(one)[:1, :1]) for one in (local, made.joints))
     assert np.abs(decoded - shown).max() < 0.05
     if name == "wholebody363":
-        np.testing.assert_array_equal(made.features[kept][:, 4:157], original.features[kept][:, 4:157])
         assert made.face is not None and original.face is not None
         np.testing.assert_array_equal(made.face[kept], original.face[kept])
 
@@ -100,23 +99,20 @@ def test_kept_frames_are_the_clips_to_the_bit(walk: Walk, name: str) -> None:
 @pytest.mark.parametrize(
     ("keep", "free"),
     [
-        ({"parts": ["lower"]}, {"spine1", "head", "left_wrist", "right_thumb3"}),
-        ({"parts": ["all"], "but": ["right_hand"]}, {"right_index1", "right_thumb3"}),
-        (
-            {"parts": ["all"], "but": ["left_arm", "left_hand"]},
-            {"left_shoulder", "left_wrist", "left_pinky2"},
-        ),
+        ({"parts": ["lower"]}, {"spine2", "head", "left_wrist", "right_thumb3"}),
+        ({"parts": ["all"], "but": ["right_hand"]}, {"right_index2", "right_thumb3"}),
+        ({"parts": ["all"], "but": ["left_arm", "left_hand"]}, {"left_elbow", "left_wrist", "left_pinky2"}),
         ({"parts": ["all"], "but": ["face"]}, set()),
     ],
 )
 def test_parts_are_kept_alone(walk: Walk, keep: dict[str, object], free: set[str]) -> None:
     made = edit(editor(), clip(walk), keep=[keep])
     names = made.layout.skeleton.joints
-    moved = np.abs(made.joints - made.original.joints).max(axis=(0, 2)) > 0
+    moved = np.abs(made.joints - made.original.joints).max(axis=(0, 2)) > 1e-6
     found = {name for name, one in zip(names, moved, strict=True) if one}
     assert free <= found
     assert not found & {"pelvis", "left_knee", "right_foot"}
-    assert made.report.kept_cm == 0
+    assert made.report.kept_cm < 1e-6
     assert made.face is not None and made.original.face is not None
     face_kept = keep["parts"] == ["all"] and keep.get("but") != ["face"]
     assert np.array_equal(made.face, made.original.face) == face_kept
@@ -125,36 +121,40 @@ def test_parts_are_kept_alone(walk: Walk, keep: dict[str, object], free: set[str
 def test_before_after_and_between(walk: Walk) -> None:
     made = edit(editor(), clip(walk), lead=0.5, seconds=4.0)
     assert len(made.joints) == 10 + 80
-    assert made.kept is not None and made.kept.tolist() == [False] * 10 + [True] * 60 + [False] * 20
-    np.testing.assert_array_equal(made.joints[10:70], made.original.joints)
+    np.testing.assert_allclose(made.joints[10:70], made.original.joints, atol=1e-9)
     longer = edit(editor(), clip(walk, 6.0), keep=[{"end": 2.5}, {"start": 3.0}])  # windows of 2 s
-    assert longer.report.kept_cm == 0
+    assert longer.report.kept_cm < 1e-6
+    legs = edit(editor(), clip(walk), keep=[{"parts": ["upper"]}])
+    assert legs.report.kept_cm < 1e-6 and np.abs(legs.joints - legs.original.joints)[:, 7].max() > 0.01
 
 
 def test_path_and_pins_are_met(walk: Walk) -> None:
     model, one = editor(), clip(walk)
     path = [{"at": 0, "x": 1, "z": -2}, {"at": 1.5, "x": 1.5, "z": -1}, {"at": 2.5, "x": 2.5, "z": -0.5}]
     made = edit(model, one, path=path)
-    assert made.report.path_cm < 0.01
-    np.testing.assert_allclose(made.joints[30, 0, [0, 2]], [1.5, -1], atol=1e-4)
-    loose = edit(model, one, path=path, exact=False)
-    assert loose.report.path_cm > 1
+    assert made.report.path_cm < 1
+    np.testing.assert_allclose(made.joints[30, 0, [0, 2]], [1.5, -1], atol=0.01)
+    assert made.report.aside_degrees > 0
     start = one.joints[0]
-    assert abs(ground(made.joints[0, 0]) - ground(start[0])) < 1e-3
+    assert abs(ground(made.joints[0, 0]) - ground(start[0])) < 0.01
 
     hand = one.joints[30, 20] + [0.05, -0.2, 0.1]  # the floor of the clip is 0.2 m up
     pin = {"at": 1.5, "joint": "left_wrist", "position": hand.tolist()}
     made = edit(model, one, keep=ENDS, pins=[pin])
     [miss] = made.report.pins_cm.values()
-    assert miss < 0.5
-    assert made.report.kept_cm == 0
+    assert miss < 0.1
+    assert made.report.kept_cm < 1e-6
+    forearm = np.linalg.norm(made.joints[:, 20] - made.joints[:, 18], axis=-1)
+    assert np.ptp(forearm) < 1e-9, "the figure is rigid"
+    with pytest.raises(UserError, match=r"left_wrist at 1.50 s is out of reach: .* \d+\.\d cm"):
+        edit(model, one, keep=ENDS, pins=[{**pin, "position": [50.0, 1.0, 0.0]}])
 
 
 def test_a_model_of_the_face_keeps_and_makes_the_face(walk: Walk) -> None:
     made = edit(editor(face=True), clip(walk), keep=[{"parts": ["all"], "but": ["face"]}], face="a smile")
     assert made.face is not None and made.original.face is not None
     assert not np.isclose(made.face, made.original.face).any(axis=1).all()
-    assert made.report.kept_cm == 0
+    assert made.report.kept_cm < 1e-6
 
 
 def test_other_rates_bones_and_missing_hands_are_said(walk: Walk) -> None:
@@ -164,11 +164,10 @@ def test_other_rates_bones_and_missing_hands_are_said(walk: Walk) -> None:
     assert len(made.joints) == 60
     for word in ("40 frames/s", "no hands", "no face", "bones differ"):
         assert any(word in remark for remark in made.remarks)
-    body = made.joints[:, :22]
     kept = np.r_[0:20, 40:60]
-    np.testing.assert_array_equal(body[kept], made.original.joints[kept, :22])
-    bones = np.linalg.norm(body[:, 4] - body[:, 1], axis=-1)  # a thigh
-    np.testing.assert_allclose(bones[20:40], bones[0], rtol=0.02)
+    np.testing.assert_allclose(made.joints[kept, :22], made.original.joints[kept, :22], atol=1e-9)
+    bones = np.linalg.norm(made.joints[:, 4] - made.joints[:, 1], axis=-1)  # a thigh
+    np.testing.assert_allclose(bones, bones[0], rtol=1e-9)
 
 
 def test_a_figure_on_other_bones_stands_where_the_clip_does(walk: Walk) -> None:
@@ -182,9 +181,9 @@ def test_a_figure_on_other_bones_stands_where_the_clip_does(walk: Walk) -> None:
     layout = MotionLayout.named("wholebody363", fps=20.0)
     frames = edit_frames(EditTask.parse({"keep": ENDS}, "task"), RecordedClip("long", long, 20.0), layout)
     assert frames.scale != 1.0
-    joints = finish(frames, frames.features[:, layout.part("bodyhand")])[1]
+    joints = finish(frames, frames.features[:, layout.part("bodyhand")])[1].joints
     off = np.linalg.norm(joints[20:40] - original_of(frames, "").joints[20:40], axis=-1)
-    assert off.max() < 0.01
+    assert off.max() < 0.02
 
 
 def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:
@@ -192,10 +191,8 @@ def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:
     again = [read_clip(made.save(tmp_path / f"clip.{ending}")) for ending in ("npz", "bvh", "glb")]
     for one in again:
         assert one.fps == 20 and one.joints.shape == (60, 52, 3)
-        np.testing.assert_allclose(one.joints, again[0].joints, atol=1e-3)
+        np.testing.assert_allclose(one.joints, made.joints, atol=1e-3)
     assert again[0].caption == "a person walks"
-    # What a file shows is one rigid figure: kept frames are its own to a few millimetres.
-    assert np.abs(again[0].joints - made.joints)[made.kept].mean() < 0.005
 
 
 REFUSED: list[tuple[dict[str, object], str]] = [

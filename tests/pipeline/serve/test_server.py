@@ -315,7 +315,6 @@ def test_the_command_says_where_and_who_can_reach_it(
             raise KeyboardInterrupt
 
     monkeypatch.setattr(server.MotionModel, "from_pretrained", lambda *_, **options: quick)
-    monkeypatch.setattr(server, "warm", lambda model: None)
     monkeypatch.setattr(server, "server_of", lambda site: Interrupted())
     said = Console(file=io.StringIO(), width=200)
     server.serve(tmp_path, ServeConfig(host=host, port=0), console=said)
