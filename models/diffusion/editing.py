@@ -5,26 +5,23 @@ editing). The prediction is corrected near the boundary of known frames and smoo
 step reduces its distance to the root's known places and headings and to pinned joints, recovered in metres
 (`observed.py`) [ours]. The in-betweener also observes all that is known but the pins.
 
-Motions longer than the training's are made in overlapping windows that agree at every step, and spans of
-other captions are windows of their own: a frame is the mean of the predictions for it, weighed by how much it
-belongs to window and caption.
+Motions longer than the training's are made in overlapping windows that agree at every step: a frame is the
+mean of the predictions for it, weighed by how much it belongs to each window.
 
-Legend: n motions of one task, T frames, D features, K rows (a window and its caption), W frames of a window,
-M pins.
+Legend: n motions of one task, T frames, D features, K windows of W frames, M pins.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.func import jvp
 
-from motionloom.models.diffusion.network import InBetweener, TextDenoiser
+from motionloom.models.diffusion.network import InBetweener
 from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, turned_back
 from motionloom.models.diffusion.sampling import blend_weights, window_starts
 from motionloom.models.diffusion.schedule import Sampler
@@ -54,38 +51,27 @@ class KnownMotion:
     """[T, D], normalised; any values where nothing is known."""
     mask: Tensor
     """bool [T, D]."""
-    places: Places | None = None
-    """One row; None where the columns hold no root."""
+    places: Places
+    """One row."""
     pins: Pins | None = None
-
-
-@dataclass(frozen=True)
-class CaptionSpan:
-    """A caption and the frames that it is about."""
-
-    text: Tensor
-    """[E]; zeros without a caption."""
-    conditioned: bool
-    share: Tensor
-    """[T]; the shares of all spans sum to 1 in each frame."""
 
 
 class Filling:
     """Fills in the free values of a motion.
 
     Args:
-        recovery: None where the columns hold no root; then there is no gradient step.
+        text: Sentence embedding [E] of the caption; None without one.
         window: Frames denoised at once: those that the network was trained on.
         overlap: Frames that neighbouring windows share.
-        guidance: Classifier-free guidance of the captions; 1 is off.
+        guidance: Classifier-free guidance of the caption; 1 is off.
     """
 
     def __init__(
         self,
-        net: TextDenoiser,
+        net: InBetweener,
         known: KnownMotion,
-        captions: Sequence[CaptionSpan],
-        recovery: Recovery | None,
+        text: Tensor | None,
+        recovery: Recovery,
         *,
         window: int,
         overlap: int,
@@ -99,20 +85,13 @@ class Filling:
         starts = window_starts(frames, self.size, overlap)
         blend = blend_weights(starts, self.size, overlap, frames).to(known.motion)
         free = ~known.mask.all(1)
-        rows = [
-            (start, span, blend[number] * span.share)
-            for (number, start), span in product(enumerate(starts), captions)
-        ]
-        # Windows without free values, or without a frame of the span's caption, need no network.
-        rows = [row for row in rows if (row[2] * free).any()]
-        self.starts = [start for start, _, _ in rows]
-        shares = torch.stack([share for _, _, share in rows])
-        self.shares = shares / shares.sum(0).clamp(min=1e-9)
-        self.text = torch.stack([span.text for _, span, _ in rows])
-        self.conditioned = torch.tensor([span.conditioned for _, span, _ in rows], device=self.text.device)
-        # MDM has no observed columns: it sees the known part only as it is put into its predictions.
-        observing = isinstance(net, InBetweener)
-        self.observed = [torch.stack([self._observed(one) for one in self.starts])] if observing else []
+        # Windows without free values need no network.
+        rows = [number for number in range(len(starts)) if (blend[number] * free).any()]
+        self.starts = [starts[number] for number in rows]
+        self.shares = blend[rows] / blend[rows].sum(0).clamp(min=1e-9)
+        self.text = known.motion.new_zeros(net.text_dim) if text is None else text
+        self.conditioned = text is not None
+        self.observed = torch.stack([self._observed(start) for start in self.starts])
         self._boundaries = self._boundary_filters()
 
     def __call__(self, seeds: Sequence[int], sampler: Sampler, steps: int) -> Tensor:
@@ -127,7 +106,7 @@ class Filling:
     def _observed(self, start: int) -> Tensor:
         """Return the observed columns of a window [W, 2 D + 6]."""
         inside = slice(start, start + self.size)
-        places = None if self.known.places is None else _places_of_window(self.known.places, inside)
+        places = _places_of_window(self.known.places, inside)
         return observed_columns(self.known.motion[None, inside], self.known.mask[None, inside], places)[0]
 
     @torch.no_grad()
@@ -136,21 +115,17 @@ class Filling:
         return self._gradient_step(self._smoothed(self._blended(x, step)))
 
     def _blended(self, x: Tensor, step: Tensor) -> Tensor:
-        """Return the means of all rows' predictions [n, T, D]."""
-        count, guided = len(x), self.guidance != 1.0 and bool(self.conditioned.any())
+        """Return the means of all windows' predictions [n, T, D]."""
+        count = len(x)
         windows = torch.stack([x[:, start : start + self.size] for start in self.starts], dim=1)
         rows = windows.flatten(0, 1)
-
-        def repeated(values: Tensor) -> Tensor:
-            return values.repeat(count, *(1,) * (values.ndim - 1))
-
         mask = torch.ones(rows.shape[:2], dtype=torch.bool, device=x.device)
         at = step.to(x.device).expand(len(rows))
-        text, conditioned = repeated(self.text), repeated(self.conditioned)
-        observed = [repeated(columns) for columns in self.observed]
-        found = self.net(rows, at, text, mask, conditioned, *observed)
-        if guided:
-            without = self.net(rows, at, text, mask, torch.zeros_like(conditioned), *observed)
+        text, observed = self.text.expand(len(rows), -1), self.observed.repeat(count, 1, 1)
+        conditioned = mask.new_full((len(rows),), self.conditioned)
+        found = self.net(rows, at, text, mask, conditioned, observed)
+        if self.guidance != 1.0 and self.conditioned:
+            without = self.net(rows, at, text, mask, torch.zeros_like(conditioned), observed)
             found = without + self.guidance * (found - without)
         found = found.view(count, len(self.starts), *found.shape[1:])
         out = torch.zeros_like(x)
@@ -164,7 +139,6 @@ class Filling:
 
     def _errors(self, motion: Tensor) -> Tensor:
         """Return the errors of motions [n, T, D] in places, headings and pins, in metres [n, ...]."""
-        assert self.recovery is not None and self.known.places is not None
         places, pins = self.known.places, self.known.pins
         anchor = places.anchor.expand(len(motion))
         heading, place = self.recovery.way(motion, anchor)
@@ -179,8 +153,6 @@ class Filling:
 
     def _gradient_step(self, motion: Tensor) -> Tensor:
         """Return motions moved in their free values against the gradient of the squared errors."""
-        if self.recovery is None or self.known.places is None:
-            return motion
         with torch.enable_grad():
             at = motion.detach().requires_grad_()
             [slope] = torch.autograd.grad(self._errors(at).square().sum() / 2, at)

@@ -20,9 +20,7 @@ def edit(
     clip: Annotated[Path, typer.Argument(help="A .bvh of any human skeleton, or a .npz or .glb of ours.")],
     task: Annotated[
         Path | None,
-        typer.Option(
-            "--task", help="YAML: keep, caption, path, pins, words, seconds and more; see the docs."
-        ),
+        typer.Option("--task", help="YAML: keep, caption, path, pins, seconds and more; see the docs."),
     ] = None,
     keep: Annotated[
         list[str] | None,
@@ -52,7 +50,7 @@ def edit(
 
     Example: `motionloom edit inbetween walk.bvh --keep :=lower --caption "a person waves"`
 
-    Example: `motionloom edit inbetween walk.bvh --task task.yaml`  (paths, pinned joints, words in time)
+    Example: `motionloom edit inbetween walk.bvh --task task.yaml`  (paths, pinned joints)
     """
     from motionloom.pipeline.contract.editing import EditTask
     from motionloom.pipeline.contract.sampling import SamplingConfig

@@ -96,39 +96,20 @@ class Pin(Config):
         return self
 
 
-class Words(Config):
-    """A description of the person from `start` to `end`, in place of the caption."""
-
-    start: Seconds
-    end: Seconds
-    text: str
-
-    @model_validator(mode="after")
-    def _says_something(self) -> Self:
-        if self.end <= self.start:
-            raise ValueError(f"they end at {self.end:g} s, before they start ({self.start:g} s)")
-        if not self.text.strip():
-            raise ValueError("text is empty; say what the person does")
-        return self
-
-
 class EditTask(Config):
     """An edit: the parts of a clip to keep, and the constraints on the rest."""
 
     caption: str = ""
-    """Describes the motion where no `words` do; empty: whatever fits."""
-    face: str = ""
-    """Describes the face; empty takes the caption."""
+    """Describes what is made; empty: whatever fits."""
     lead: Seconds = Field(0.0, ge=0)
     """Seconds to make before the clip."""
     seconds: Seconds | None = Field(None, gt=0)
     """Length of the result from the clip's first frame on; None: the clip's. Longer: made after its end."""
     keep: tuple[Kept, ...] | None = None
-    """Without it: all outside of `words`, and all of the clip where the result is longer; else nothing."""
+    """Without it: all of the clip where the result is longer than it, else nothing."""
     path: tuple[PathPoint, ...] = ()
     """Between its points the root takes a smooth way that does not overshoot."""
     pins: tuple[Pin, ...] = ()
-    words: tuple[Words, ...] = ()
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -140,12 +121,6 @@ class EditTask(Config):
                 raise ValueError(
                     f"path: {speed:.0f} m/s between {one.at:g} s and {two.at:g} s; nobody runs faster than "
                     f"{MAX_SPEED:g} m/s, give the points more time"
-                )
-        for first, second in pairwise(self.words):
-            if second.start < first.end:
-                raise ValueError(
-                    f"words: a stretch from {second.start:g} s follows one to {first.end:g} s; give them in "
-                    f"order of time, without overlap"
                 )
         return self
 

@@ -21,15 +21,13 @@ import torch
 from huggingface_hub import ModelHubMixin
 from numpy.typing import NDArray
 
-from motionloom.datasets.conditions import Conditions
 from motionloom.models.layers.seeds import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.edits.clip_file import read_clip, read_seed_motion, require_clip
-from motionloom.pipeline.inference.edits.edit import finish, require_editor, require_work, word_shares
+from motionloom.pipeline.inference.edits.edit import finish, require_editor, require_work
 from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
@@ -201,19 +199,17 @@ def edit_clip(
     frames = edit_frames(task, clip, layout)
     require_work(frames)
     editor, generator = require_editor(bundle.generator), bundle.generator
-    # Body and face draw from seeds of their own, so that one does not depend on whether the other is made.
-    seeds = sample_seeds(seed, 2 * samples)
-    shares = word_shares(frames)
-    words = [(_encoded(bundle, bundle.main, text), share) for text, share in shares]
+    prompt, original = Prompt(task.caption), original_of(frames, clip.caption)
+    words = bundle.encode(bundle.main, [prompt], [prompt.text]) if prompt.text.strip() else {}
     columns = layout.part(generator.part)
-    whole = np.zeros((samples, frames.frames, layout.dim), dtype=np.float32)
-    whole[..., columns] = np.stack(editor(frames, words, seeds[:samples], sampling))
-    faces = _faces(bundle, frames, whole, seeds[samples:], sampling)
-    original, texts = original_of(frames, clip.caption), [text for text, _ in shares if text.strip()]
-    prompt = Prompt("; ".join(dict.fromkeys(texts)), task.face)
+    whole = np.repeat(frames.features[None], samples, axis=0)
+    whole[..., columns] = np.stack(editor(frames, words, sample_seeds(seed, samples), sampling))
+    # A face that the model does not make is the clip's, if that has one.
+    has_face = layout.has("face") and (generator.part == "all" or frames.face is not None)
     out = []
-    for body, face in zip(whole[..., layout.part("bodyhand")], faces, strict=True):
-        features, figure, report = finish(frames, body)
+    for made in whole:
+        features, figure, report = finish(frames, made[:, layout.part("bodyhand")])
+        face = made[:, layout.part("face")] if has_face else None
         out.append(
             EditedMotion(
                 prompt, features, figure.joints, face, layout, seed=seed, figure=figure, original=original,
@@ -235,29 +231,3 @@ def original_of(frames: EditFrames, caption: str) -> GeneratedMotion:
         layout,
         figure=figure,
     )
-
-
-def _encoded(bundle: Bundle, stage: CompletedStage, text: str) -> Conditions:
-    """A text as one row of a stage's conditions; none for an empty one."""
-    return bundle.encode(stage, [Prompt(text)], [text]) if text.strip() else {}
-
-
-def _faces(
-    bundle: Bundle,
-    frames: EditFrames,
-    whole: NDArray[np.float32],
-    seeds: Sequence[int],
-    sampling: SamplingConfig,
-) -> Sequence[NDArray[np.float32] | None]:
-    """The expressions [T, 50] beside motions [n, T, D]; None where the layout or the clip has none."""
-    layout, task, stage = frames.layout, frames.task, bundle.choose_face(sampling.face_model)
-    if not layout.has("face"):
-        return [None] * len(whole)
-    columns = layout.part("face")
-    if bundle.generator.part == "all":
-        return list(whole[..., columns])
-    editor = None if stage is None else bundle.of(stage).capabilities.edit
-    if stage is not None and editor is not None:
-        words = [(_encoded(bundle, stage, task.face or task.caption), np.ones(frames.frames))]
-        return editor(frames, words, seeds, sampling)
-    return [None if frames.face is None else frames.features[:, columns]] * len(whole)

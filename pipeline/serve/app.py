@@ -19,7 +19,6 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import MAX_HEIGHT, MAX_SPEED
 from motionloom.pipeline.inference.edits.edit import require_editor, why_no_edits
@@ -27,7 +26,7 @@ from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips
 from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
-from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds, make
+from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds
 
 T = TypeVar("T")
 RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
@@ -162,13 +161,14 @@ class Site:
         )
 
     async def generate(self, http: Request) -> Response:
-        request, sound = await self._read_request(http, MotionRequest)
-        return await self._respond(http, lambda: make(self.model, request, sound, self.config))
+        request = await self._read_request(http, MotionRequest)
+        sound = None if request.sound is None else self.sounds.kept.get(request.sound)
+        return await self._respond(http, lambda: self.clips.generate(request, sound))
 
     async def edit(self, http: Request) -> Response:
         """A clip of which a part is made anew."""
-        request, sound = await self._read_request(http, ChangeRequest)
-        return await self._respond(http, lambda: self.clips.change(request, sound))
+        request = await self._read_request(http, ChangeRequest)
+        return await self._respond(http, lambda: self.clips.change(request))
 
     async def _respond(self, http: Request, call: Callable[[], Answer]) -> Response:
         """Return the answer of the model's thread; nothing is begun for a client that has left by then."""
@@ -201,7 +201,7 @@ class Site:
         async with self._uploads:
             return await read_body(http, what, _bytes(most), self.config.patience)
 
-    async def _read_request(self, http: Request, kind: type[RequestT]) -> tuple[RequestT, Sound | None]:
+    async def _read_request(self, http: Request, kind: type[RequestT]) -> RequestT:
         media = http.headers.get("content-type", "").split(";")[0].strip().lower()
         if media != "application/json":
             raise HTTPException(415, "send JSON with Content-Type: application/json")
@@ -218,10 +218,7 @@ class Site:
             raise HTTPException(400, 'the request is not a JSON object like {"caption": "a person waves"}')
         request = kind.parse(fields, "request")
         request.require_within(self.config, self.model)
-        sound = None if request.sound is None else self.sounds.kept.get(request.sound)
-        if isinstance(request, ChangeRequest) and isinstance(request.clip, str):
-            self.clips.kept.get(request.clip)
-        return request, sound
+        return request
 
 
 _REFUSALS = (HTTPException, UserError, ClientDisconnect, Busy)

@@ -148,14 +148,6 @@ def notes_of(
     return {"notes": [one.what if isinstance(one, Unknown) else one for one in found], "nearest": nearest}
 
 
-def make(model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig) -> Answer:
-    """The motion that is asked for, in its format."""
-    motion = motion_of(model, asked, sound, limits)
-    notes = notes_of(model, asked, sound, motion)
-    facts = {"seed": asked.seed, "face": asked.face, **notes}
-    return answer(motion, asked.format, facts, "\n".join(notes["notes"]), {"generated": motion})
-
-
 def motion_of(
     model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
 ) -> GeneratedMotion:

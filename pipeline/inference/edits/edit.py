@@ -25,8 +25,6 @@ from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Motion, MotionGenerator
 from motionloom.pipeline.inference.edits.frames import EditFrames, RootPath
 
-WORDS_EASE = 0.3
-"""Seconds in which one stretch of words takes over from another [ours]."""
 _REACH_SECONDS = 0.5
 """In which a figure goes to a pin and comes back [ours]."""
 _REACHED = 0.01
@@ -69,20 +67,6 @@ def require_work(frames: EditFrames) -> None:
             "nothing of the clip is kept and nothing else is asked: say what to keep, draw a path, or pin a "
             "joint"
         )
-
-
-def word_shares(frames: EditFrames) -> list[tuple[str, NDArray[np.float64]]]:
-    """Each text of the task, the caption last, and its share of every frame [T]; a frame's sum to 1."""
-    task, fps, at = frames.task, frames.layout.fps, np.arange(frames.frames)
-    ease = max(1.0, WORDS_EASE * fps)
-    out = []
-    for words in task.words:
-        start, end = ((seconds * fps) + frames.lead for seconds in (words.start, words.end))
-        out.append((words.text, np.clip(np.minimum(at - start, end - at) / ease + 0.5, 0.0, 1.0)))
-    rest = 1 - sum((share for _, share in out), np.zeros(frames.frames))
-    out.append((task.caption, np.clip(rest, 0.0, 1.0)))
-    total = np.sum([share for _, share in out], axis=0)
-    return [(text, share / total) for text, share in out if share.any()]
 
 
 def finish(

@@ -228,11 +228,8 @@ class _TimedTask:
                 )
             end = clip_end if kept.end is None else min(clip_end, self.lead + round(kept.end * fps))
             out[start:end] |= pieces_of(kept.parts, kept.but)
-        if task.keep is None and (task.words or self.frames > clip_frames):
+        if task.keep is None and self.frames > clip_frames:
             out[self.lead : clip_end] = True
-            for words in task.words:
-                start, end = (max(0, round(time * fps) + self.lead) for time in (words.start, words.end))
-                out[start:end] = False
         return out
 
     def path(self, origin: complex, turn: float) -> NDArray[np.complex128]:

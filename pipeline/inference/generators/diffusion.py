@@ -14,8 +14,8 @@ from torch import Tensor
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.editing import CaptionSpan, Filling, KnownMotion, Pins
-from motionloom.models.diffusion.network import TextDenoiser
+from motionloom.models.diffusion.editing import Filling, KnownMotion, Pins
+from motionloom.models.diffusion.network import InBetweener, TextDenoiser
 from motionloom.models.diffusion.observed import Places, Recovery, known_columns
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler
@@ -70,20 +70,19 @@ class DiffusionMotion(DenoisedMotion):
 
     @property
     def capabilities(self) -> Capabilities:  # type: ignore[override]
-        return Capabilities(denoising=self.denoising, edit=self.edit)
+        # Editing needs a network that observes what is known, and columns that hold the root.
+        able = isinstance(self.net, InBetweener) and Recovery.possible(
+            self.layout, self.layout.part(self.part)
+        )
+        return Capabilities(denoising=self.denoising, edit=self.edit if able else None)
 
     def edit(
-        self,
-        frames: EditFrames,
-        words: Sequence[tuple[Conditions, NDArray[np.float64]]],
-        seeds: Sequence[int],
-        sampling: SamplingConfig,
+        self, frames: EditFrames, words: Conditions, seeds: Sequence[int], sampling: SamplingConfig
     ) -> list[NDArray[np.float32]]:
         """Fill in what an edit leaves free (`Capabilities.edit`): motions [T, C] of the part in their own
         units, one a seed; what is kept in them is so to the bit, and the rest near what is asked for.
 
-        `words` are encoded, one row each and empty for no words, each with its share of every frame [T];
-        those of all sum to 1 in each frame.
+        `words` are an encoded caption, one row; empty for none.
         """
         stats: FeatureStats = self.given["stats"]
         layout, columns, device = self.layout, self.layout.part(self.part), device_of(self.net)
@@ -96,18 +95,17 @@ class DiffusionMotion(DenoisedMotion):
         known = known_columns(torch.from_numpy(frames.pieces)[None], layout, columns)[0]
         if known.all():
             return [features.numpy().copy() for _ in seeds]
-        recovery = places = pins = None
-        if Recovery.possible(layout, columns):
-            recovery = Recovery(layout, columns, stats.mean, stats.std)
-            places = Places(*(values.to(device) for values in frames.places))
-            if frames.pins:
-                at, joints = torch.tensor(list(frames.pins), device=device).T
-                pins = Pins(at, joints, torch.tensor(frames.model_pins, device=device))
+        places, pins = Places(*(values.to(device) for values in frames.places)), None
+        if frames.pins:
+            at, joints = torch.tensor(list(frames.pins), device=device).T
+            pins = Pins(at, joints, torch.tensor(frames.model_pins, device=device))
+        text = words.get("text")
+        pooled = None if text is None or text.pooled is None else text.pooled[0].float().to(device)
         filling = Filling(
             self.net,
             KnownMotion(stats.normalize(features, columns).to(device), known.to(device), places, pins),
-            [self._caption_span(*pair) for pair in words],
-            recovery,
+            pooled,
+            Recovery(layout, columns, stats.mean, stats.std),
             window=self.window,
             overlap=self.window // 4,
             guidance=guidance,
@@ -116,11 +114,3 @@ class DiffusionMotion(DenoisedMotion):
         # What is kept is taken from where it came from: normalising there and back rounds.
         own = torch.where(known, features, stats.denormalize(made, columns))
         return [np.asarray(one, dtype=np.float32) for one in own.numpy()]
-
-    def _caption_span(self, conditions: Conditions, share: NDArray[np.float64]) -> CaptionSpan:
-        """The sentence embedding of encoded words, zeros without any, and its share of every frame [T]."""
-        text, device = conditions.get("text"), device_of(self.net)
-        shares = torch.from_numpy(share).float().to(device)
-        if text is None or text.pooled is None:
-            return CaptionSpan(torch.zeros(self.net.text_dim, device=device), False, shares)
-        return CaptionSpan(text.pooled[0].float().to(device), True, shares)

@@ -2,17 +2,17 @@
 
 import { buildLanes, element } from "./lanes.js";
 import { figureTools } from "./figure.js";
-import { HANDLES, History, freshState, mark, missing, paceOf, pin, resize, rowsOf, say, taskOf, walk } from "./task.js";
+import { HANDLES, History, freshState, mark, missing, paceOf, pin, resize, rowsOf, taskOf, walk } from "./task.js";
 
 const one = (id) => document.getElementById(id);
 const panel = one("edit"), go = one("edit-go"), why = one("edit-why"), marks = one("edit-marks"), draw = one("edit-draw"), joints = one("edit-joint");
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }, PIXELS = 6;
 
 /* The editor of a page. `page` gives `info`, `post(path, body, signal)` and `mount(viewerData, over)`; it is told what can be saved,
-   `savable(asked)`, and when the panel is shut, `closed(clip)`. */
+   `savable({ path, body })`, and when the panel is shut, `closed(clip)`. */
 export function makeEditor(page) {
   const { info } = page, fps = info.fps, rows = info.edit.possible ? rowsOf(info) : [];
-  let clip = null, history = null, draft = null, chosen = null, viewer = null, mounted = null, busy = null, turn = 0, seen = -1;
+  let clip = null, history = null, draft = null, viewer = null, mounted = null, busy = null, turn = 0, seen = -1;
   let results = new Map(); // by the state that they are of
   const state = () => draft || history.now;
 
@@ -35,8 +35,6 @@ export function makeEditor(page) {
   const lanes = info.edit.possible ? buildLanes(one("edit-time"), rows, fps, {
     seek: (frame) => { viewer.play(false); viewer.setFrame(frame); lanes.seek(frame); },
     mark: (names, from, to, keep, done) => change((next) => mark(next, names, from, to, keep), done),
-    words: (from, to, done) => { chosen = from; change((next) => say(next, from, to, ""), done); if (done) one("edit-say").focus(); },
-    choose: (said) => { chosen = said.from; viewer.setFrame(said.from); update(); one("edit-say").focus(); },
     cancel: () => { draft = null; update(); },
   }) : null;
 
@@ -55,25 +53,20 @@ export function makeEditor(page) {
   }
 
   function update() {
-    const now = state(), lack = missing(now, rows, fps, info.edit.max_speed), said = now.words.find(({ from }) => from === chosen), result = results.get(history.now);
+    const now = state(), lack = missing(now, rows, fps, info.edit.max_speed), result = results.get(history.now);
     mount(result ? result.answer.viewer : clip.viewer);
-    lanes.show(now, chosen, viewer.frame);
+    lanes.show(now, viewer.frame);
     viewer.refresh();
     go.disabled = !busy && Boolean(lack);
     go.textContent = busy ? "Stop" : result ? "Try another" : "Make the change";
     if (!busy) tell(lack || (result ? result.words : ready(now)));
     one("edit-undo").disabled = Boolean(busy) || !history.canUndo;
     one("edit-redo").disabled = Boolean(busy) || !history.canRedo;
-    page.savable(result ? result.asked : null);
+    page.savable(result && result.saved);
     draw.setAttribute("aria-pressed", String(tools.drawing));
     draw.textContent = tools.drawing ? "Do not draw" : now.path ? "Draw another path" : "Draw a path";
     if (document.activeElement !== one("edit-caption")) one("edit-caption").value = now.caption;
     if (document.activeElement !== one("edit-seconds")) one("edit-seconds").value = (now.frames / fps).toFixed(1);
-    one("edit-said").hidden = !said;
-    if (said) {
-      one("edit-said-when").textContent = `What happens from ${(said.from / fps).toFixed(1)} to ${(said.to / fps).toFixed(1)} s`;
-      if (document.activeElement !== one("edit-say")) one("edit-say").value = said.text;
-    }
     marks.replaceChildren(...[...now.pins.map((one) => ({
       words: `${HANDLES[one.joint].label} at ${(one.frame / fps).toFixed(2)} s`, frame: one.frame, joint: one.joint,
       drop: (next) => { next.pins = next.pins.filter(({ joint, frame }) => joint !== one.joint || frame !== one.frame); },
@@ -124,13 +117,13 @@ export function makeEditor(page) {
     viewer.setFrame(data.motions.length > 1 ? 0 : frame || Math.floor(data.motions[0].frames / 2));
   }
 
-  /* Begins with a clip: `{ ref, viewer, frames, caption, face, name }`; `ref` is what the server knows it by. */
+  /* Begins with a clip: `{ ref, viewer, frames, caption, name }`; `ref` is what the server knows it by. */
   function open(opened) {
     clip = opened;
     one("edit-name").textContent = clip.name;
     history = new History(freshState(rows, clip));
     results = new Map();
-    draft = chosen = mounted = viewer = null;
+    draft = mounted = viewer = null;
     stop();
     panel.hidden = false;
     document.body.classList.add("serve-editing");
@@ -144,12 +137,12 @@ export function makeEditor(page) {
     document.body.classList.remove("serve-editing");
     history = viewer = null;
     stop();
-    page.closed(result ? changed(result.answer, now.caption) : clip);
+    page.closed(result ? changed(result, now.caption) : clip);
   }
   /* What was made, as a clip of its own. */
-  function changed(answer, caption) {
+  function changed({ answer, saved }, caption) {
     const [, after] = answer.viewer.motions, name = clip.name.endsWith(", changed") ? clip.name : `${clip.name}, changed`;
-    return { ...clip, ref: answer.clip, viewer: { ...answer.viewer, motions: [{ ...after, label: "changed" }] }, frames: after.frames, caption, name };
+    return { ref: answer.clip, saved, viewer: { ...answer.viewer, motions: [{ ...after, label: "changed" }] }, frames: after.frames, caption, name };
   }
   const sentence = (words) => `${words[0].toUpperCase()}${words.slice(1)}.`;
 
@@ -161,8 +154,8 @@ export function makeEditor(page) {
   }
 
   async function make() {
-    const mine = ++turn, now = history.now, before = results.get(now), seed = before ? before.asked.seed + 1 : 0;
-    const asked = { clip: clip.ref, task: taskOf(now, rows, fps, clip.face), seed, format: "viewer" }, began = performance.now();
+    const mine = ++turn, now = history.now, before = results.get(now), seed = before ? before.answer.seed + 1 : 0;
+    const asked = { clip: clip.ref, task: taskOf(now, rows, fps), seed, format: "viewer" }, began = performance.now();
     busy = new AbortController();
     update();
     const clock = setInterval(() => tell(`Working… ${Math.round((performance.now() - began) / 1000)} s`), 1000);
@@ -171,7 +164,7 @@ export function makeEditor(page) {
       const answer = await (await page.post("/api/edit", asked, busy.signal)).json();
       if (mine !== turn) return;
       const took = ((performance.now() - began) / 1000).toFixed(1);
-      const result = { asked, answer, words: "" };
+      const result = { saved: { path: "/api/edit", body: asked }, answer, words: "" };
       results.set(now, result);
       busy = null;
       update();
@@ -206,13 +199,6 @@ export function makeEditor(page) {
     update();
   });
   one("edit-caption").addEventListener("change", () => change((next) => { next.caption = one("edit-caption").value; }, true));
-  one("edit-say").addEventListener("input", () => {
-    draft = structuredClone(state());
-    draft.words.find(({ from }) => from === chosen).text = one("edit-say").value;
-    update();
-  });
-  one("edit-say").addEventListener("change", () => { if (draft) { history.push(draft); draft = null; update(); } });
-  one("edit-unsay").addEventListener("click", () => { draft = null; change((next) => { next.words = next.words.filter(({ from }) => from !== chosen); }, true); });
   one("edit-seconds").addEventListener("change", () => {
     const frames = Math.round(Number(one("edit-seconds").value) * fps), most = Math.floor(info.limits.seconds * fps);
     if (frames >= fps / 2) change((next) => resize(next, Math.min(frames, most)), true); else update();

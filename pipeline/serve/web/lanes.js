@@ -1,10 +1,9 @@
-/* The time line: a row a part of the body, marked by dragging, tapping or the keyboard; and a row of words. */
+/* The time line: a row a part of the body, marked by dragging, tapping or the keyboard. */
 
 import { runsOf, together } from "./task.js";
 
 const STAYS = "stays as it is", NEW = "made anew", PARTLY = "stays in part";
 const TAP = 4; // pixels that a finger may slip in a tap
-const SAID = 1.0; // seconds of words that a tap begins
 
 /* A node with properties and children. */
 export function element(tag, properties, ...children) {
@@ -13,17 +12,17 @@ export function element(tag, properties, ...children) {
   return node;
 }
 
-/* `act` takes `seek(frame)`, `mark(names, from, to, keep, done)`, `words(from, to, done)`, `choose(stretch)` and `cancel()`. */
+/* `act` takes `seek(frame)`, `mark(names, from, to, keep, done)` and `cancel()`. */
 export function buildLanes(root, rows, fps, act) {
   const ruler = element("input", { type: "range", className: "edit-ruler", min: 0, step: 1 });
   ruler.setAttribute("aria-label", "Time");
   ruler.addEventListener("input", () => act.seek(Number(ruler.value)));
   const head = element("div", { className: "edit-head" }), pins = element("div", { className: "edit-pins" });
   const all = { name: "all", label: "Everything", names: rows.map(({ name }) => name) };
-  const lanes = [all, ...rows.map((row) => ({ ...row, names: [row.name] }))].map(makeLane), words = makeWords();
-  const box = element("div", { className: "edit-lanes" }, ruler, pins, ...lanes.map(({ node }) => node), words.node, head);
+  const lanes = [all, ...rows.map((row) => ({ ...row, names: [row.name] }))].map(makeLane);
+  const box = element("div", { className: "edit-lanes" }, ruler, pins, ...lanes.map(({ node }) => node), head);
   const names = element("div", { className: "edit-names" }, element("span", { textContent: "Time" }),
-    ...lanes.map(({ label }) => element("span", { textContent: label })), element("span", { textContent: "Words" }));
+    ...lanes.map(({ label }) => element("span", { textContent: label })));
   root.replaceChildren(names, box);
   let state = null, frame = 0;
 
@@ -91,18 +90,7 @@ export function buildLanes(root, rows, fps, act) {
     return lane;
   }
 
-  function makeWords() {
-    const node = element("div", { className: "edit-lane edit-words" });
-    node.setAttribute("role", "group");
-    node.setAttribute("aria-label", "Words of a part of the time");
-    watch(node, (from, event) => (event.target === node ? {
-      drag: (a, b, done) => { if (b - a > 3 || !done) act.words(a, b, done); else act.cancel(); },
-      tap: (k) => act.words(k, Math.min(k + Math.round(SAID * fps), state.frames), true),
-    } : null));
-    return { node };
-  }
-
-  function show(next, chosen, now) {
+  function show(next, now) {
     state = next;
     ruler.max = state.frames - 1;
     for (const lane of lanes) {
@@ -114,14 +102,6 @@ export function buildLanes(root, rows, fps, act) {
         return run;
       }));
     }
-    words.node.replaceChildren(...(state.words.length ? [] : [element("span", { className: "edit-empty", textContent: "drag here to say what happens then" })]),
-      ...state.words.map((said) => {
-        const run = element("button", { type: "button", className: "edit-said", textContent: said.text || "…", title: said.text });
-        run.setAttribute("aria-pressed", String(said.from === chosen));
-        run.addEventListener("click", () => act.choose(said));
-        place(run, said.from, said.to);
-        return run;
-      }));
     pins.replaceChildren(...[...new Set(state.pins.map((pin) => pin.frame))].map((when) => {
       const mark = element("i");
       mark.style.left = `${(100 * (when + 0.5)) / state.frames}%`;

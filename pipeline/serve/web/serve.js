@@ -77,9 +77,9 @@ function mount(data, over) {
 
 function show(answer, body) {
   mount(answer.viewer);
-  savable({ path: "/api/generate", body });
-  const { format, ...ref } = body;
-  current = { ref, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, face: answer.face, name: answer.caption || "a dance" };
+  const saved = { path: "/api/generate", body };
+  savable(saved);
+  current = { ref: answer.clip, saved, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, name: answer.caption || "a dance" };
   note(answer.notes, answer.nearest);
 }
 
@@ -135,7 +135,7 @@ async function send(path, file, most, words) {
 async function takeClip(file) {
   const mine = ++turn, answer = await send("/api/clips", file, info.limits.clip_bytes, `Reading ${file.name}…`);
   if (!answer || mine !== turn) return;
-  current = { ref: answer.clip, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, face: "", name: file.name };
+  current = { ref: answer.clip, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, name: file.name };
   note(answer.notes, []);
   say(`${file.name}: ${answer.seconds.toFixed(1)} s of motion`);
   editor.open(current);
@@ -192,12 +192,11 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   say(`${info.model}: ${drivers} to motion, at most ${info.limits.seconds} s`);
   editor = makeEditor({
     info, post, mount,
-    savable: (body) => savable(body && { path: "/api/edit", body }),
+    savable,
     closed: (clip) => {
       current = clip;
       mount(clip.viewer);
-      if (!asked && typeof clip.ref === "object") savable({ path: "/api/generate", body: clip.ref });
-      save.hidden = false;
+      savable(clip.saved);
     },
   });
   for (const node of document.querySelectorAll(".edit-can")) node.hidden = !info.edit.possible;

@@ -28,7 +28,7 @@ export const rowsOf = (info) => ROWS.filter(({ name }) => (name === "hands" ? in
 /* All of a clip kept. */
 export function freshState(rows, { frames, caption }) {
   const kept = Object.fromEntries(rows.map(({ name }) => [name, new Uint8Array(frames).fill(1)]));
-  return { clip: frames, frames, kept, path: null, pins: [], words: [], caption };
+  return { clip: frames, frames, kept, path: null, pins: [], caption };
 }
 
 /* States that were, and those that were taken back. */
@@ -45,7 +45,7 @@ export class History {
 /* Keeps or frees frames `from` up to `to` of some rows; what the clip does not have cannot be kept. Fingers go with the arms:
    they cannot stay where they are while these move. */
 export function mark(state, names, from, to, keep) {
-  const linked = { [keep ? "hands" : "upper"]: keep ? "upper" : "hands" };
+  const linked = keep ? { hands: "upper", upper: "hands" } : { upper: "hands" };
   const all = new Set(names.flatMap((name) => [name, linked[name]]).filter((name) => name in state.kept));
   for (const name of all) state.kept[name].fill(keep ? 1 : 0, Math.max(from, 0), Math.min(Math.max(to, 0), state.clip));
 }
@@ -75,7 +75,6 @@ export function resize(state, frames) {
     state.kept[name] = row;
   }
   state.pins = state.pins.filter((pin) => pin.frame < frames);
-  state.words = state.words.filter((said) => said.from < frames - 2).map((said) => ({ ...said, to: Math.min(said.to, frames) }));
   if (state.path && state.path.from >= frames - 1) state.path = null;
   state.frames = frames;
 }
@@ -86,14 +85,6 @@ export function pin(state, joint, frame, position, fps) {
   const reach = Math.round(AROUND * fps);
   mark(state, HANDLES[joint].rows, frame - reach, frame + reach + 1, false);
 }
-
-/* Says what happens from one frame to another; what was said there before makes room. */
-export function say(state, from, to, text) {
-  state.words = [...state.words.flatMap((old) => cut(old, from, to)), { from, to, text }].sort((a, b) => a.from - b.from);
-  mark(state, Object.keys(state.kept), from, to, false);
-}
-
-const cut = (old, from, to) => [{ ...old, to: Math.min(old.to, from) }, { ...old, from: Math.max(old.from, to) }].filter((part) => part.to - part.from > 3);
 
 /* A path over the floor, [x, z] each, walked from a frame on to the end. */
 export function walk(state, from, points) {
@@ -126,17 +117,13 @@ export function paceOf(state, fps) {
 
 /* Why nothing can be made of it yet, in one sentence; empty where it can. */
 export function missing(state, rows, fps, maxSpeed) {
-  const silent = state.words.find(({ text }) => !text.trim());
-  if (silent) return `Say what happens from ${time(silent.from, fps)} to ${time(silent.to, fps)} s, or remove these words.`;
   if (state.path && paceOf(state, fps).speed > maxSpeed) return "The path is too long for the time: draw a shorter one, or make the motion longer.";
   const changed = state.frames !== state.clip || rows.some(({ name }) => state.kept[name].some((kept) => !kept));
-  return changed ? "" : "Nothing would change yet: do one of the four things above.";
+  return changed ? "" : "Nothing would change yet: do one of the three things above.";
 }
 
-const time = (frame, fps) => (frame / fps).toFixed(1);
-
 /* The task as the server reads it (`EditTask`). */
-export function taskOf(state, rows, fps, face) {
+export function taskOf(state, rows, fps) {
   const at = (frame) => Math.round((1000 * frame) / fps) / 1000, keep = [];
   const kept = Array.from({ length: Math.min(state.frames, state.clip) }, (_, k) => rows.map(({ name }) => state.kept[name][k]).join(""));
   for (const [from, to, marks] of runsOf(kept)) {
@@ -144,7 +131,7 @@ export function taskOf(state, rows, fps, face) {
     if (!marks.includes("0")) keep.push({ ...span, parts: ["all"] });
     else rows.forEach(({ parts, but }, k) => { if (marks[k] === "1") keep.push({ ...span, parts, but }); });
   }
-  const task = { caption: state.caption.trim(), face, keep, words: state.words.map(({ from, to, text }) => ({ start: at(from), end: at(to), text: text.trim() })) };
+  const task = { caption: state.caption.trim(), keep };
   if (state.frames !== state.clip) task.seconds = at(state.frames);
   task.pins = state.pins.map(({ joint, frame, position }) => ({ joint, at: at(frame), position }));
   if (state.path) {

@@ -1,4 +1,4 @@
-"""Changing a motion in a real headless Chromium: mark, pull, draw, say, undo, make, save."""
+"""Changing a motion in a real headless Chromium: mark, pull, draw, undo, make, save."""
 
 from __future__ import annotations
 
@@ -65,21 +65,11 @@ def test_a_motion_is_changed(page: Any, until: Any, quick: Any) -> None:
     drag(page, place, (place[0] + 20, place[1] - 40))
     assert page.get_by_role("button", name="left hand at 1.00 s").first.is_visible()
 
-    words = page.get_by_role("group", name="Words of a part of the time")
-    words.scroll_into_view_if_needed()
-    box = words.bounding_box()
-    y = box["y"] + box["height"] / 2
-    drag(page, (box["x"] + 0.8 * box["width"] + 1, y), (box["x"] + box["width"] - 1, y))
-    assert go.is_disabled() and "Say what happens from 1.6 to 2.0 s" in why(page)
-    page.get_by_label("What happens from 1.6 to 2.0 s").fill("a person bows")
-    page.get_by_label("What happens from 1.6 to 2.0 s").press("Tab")
-
     go.click()
     until(page, "document.querySelectorAll('.mlv-cell').length === 2")
     [task] = quick.edited
-    [pin], [said] = task.pins, task.words
+    [pin] = task.pins
     assert (pin.joint, pin.at) == ("left_wrist", 1.0)
-    assert (said.text, said.start, said.end) == ("a person bows", 1.6, 2.0)
     assert task.keep[0].model_dump() == {"start": 0.0, "end": 0.5, "parts": ("all",), "but": ()}
     assert why(page).startswith("Made in") and "Pin left_wrist at 1.00 s: 0.0 cm off" in why(page)
     assert page.locator(".mlv-label").all_text_contents() == ["before", "after"]

@@ -33,18 +33,19 @@ def npz(joints: Any, fps: float = 20.0) -> bytes:
 
 
 def test_a_motion_that_was_generated_is_changed(served: Any, quick: Any) -> None:
-    said = served.post("/api/edit", {"clip": WALK, "task": ARM}).json
+    clip = served.post("/api/generate", WALK).json["clip"]
+    said = served.post("/api/edit", {"clip": clip, "task": ARM}).json
     joints, wrist = np.array(said["joints"]), said["joint_names"].index("left_wrist")
     assert said["frames"] == len(joints) == 40
     assert np.linalg.norm(joints[20, wrist] - [0.75, 1.2, 1.1]) < 0.001
     assert "pin left_wrist at 1.00 s: 0.0 cm off" in said["lines"]
     assert said["report"]["pins_cm"] == {"left_wrist at 1.00 s": pytest.approx(0.0, abs=0.01)}
     assert said["report"]["path_cm"] is None, "nothing was asked of it"
-    cells = served.post("/api/edit", {"clip": WALK, "task": ARM, "format": "viewer"}).json["viewer"][
+    cells = served.post("/api/edit", {"clip": clip, "task": ARM, "format": "viewer"}).json["viewer"][
         "motions"
     ]
     assert [cell["label"] for cell in cells] == ["before", "after"]
-    bvh = served.post("/api/edit", {"clip": WALK, "task": ARM, "format": "bvh"})
+    bvh = served.post("/api/edit", {"clip": clip, "task": ARM, "format": "bvh"})
     assert bvh.body.startswith(b"HIERARCHY") and ".bvh" in bvh.headers["content-disposition"]
     assert len(quick.edited) == 1 and quick.asked == ["a person walks"], "made once, and answered three times"
     on = served.post("/api/edit", {"clip": said["clip"], "task": {"seconds": 3.0}}).json
@@ -68,16 +69,16 @@ def test_a_file_is_read_and_changed(served: Any, walk: Callable[..., Any]) -> No
         (WALK, {"kept": []}, "unknown key 'task.kept'; did you mean 'keep'?"),
         (WALK, {}, "nothing of the clip is kept"),
         (WALK, {"seconds": 5.5}, "5.5 s were asked for; this server makes at most 5 s"),
-        (WALK, {"words": [{"start": 0, "end": 1, "text": "w" * 41}]}, "a caption has 41 letters"),
+        (WALK, {"caption": "w" * 41}, "a caption has 41 letters"),
         (WALK, {"pins": [{"at": 1, "joint": "tail", "position": [0, 1, 0]}]}, "no joint 'tail'"),
         (WALK, {"pins": [{"at": 1, "joint": "head", "position": [0, 9, 0]}]}, "9 m above the floor"),
         (WALK, {"path": [{"at": 0, "x": 0, "z": 0}, {"at": 1, "x": 60, "z": 0}]}, "nobody runs faster"),
-        ({"caption": " "}, ARM, "caption is empty"),
-        ({**WALK, "seconds": 9}, ARM, "9 s were asked for"),
         (3, ARM, "clip"),
     ],
 )
 def test_what_cannot_be_done_is_one_sentence(served: Any, clip: Any, task: Any, words: str) -> None:
+    if clip == WALK:
+        clip = served.post("/api/generate", WALK).json["clip"]
     got = served.post("/api/edit", {"clip": clip, "task": task})
     assert got.status == 400 and words in got.json["error"]
 
@@ -114,7 +115,7 @@ def test_a_model_that_makes_whole_motions_says_so(run_server: Callable[..., Any]
         edit = served.ask("GET", "/api/info").json["edit"]
         assert edit["possible"] is False and "edits none" in edit["why"]
         for got in (
-            served.post("/api/edit", {"clip": WALK, "task": ARM}),
+            served.post("/api/edit", {"clip": "any", "task": ARM}),
             served.ask("POST", "/api/clips", b"HIERARCHY"),
         ):
             assert got.status == 400 and got.json["error"] == edit["why"]
