@@ -22,9 +22,6 @@ from motionloom.datasets.schema import Config
 
 MAX_SPEED = 12.0
 """Metres a second of a root; the fastest sprint that was measured (Bolt, Berlin 2009) reached 12.4."""
-MAX_HEIGHT = 3.0
-"""Metres of a joint above the floor; a tall person's raised hand in a jump comes to about as much."""
-
 Seconds = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1000, le=1000)]
 
@@ -85,16 +82,6 @@ class Pin(Config):
     """A name of the layout's skeleton, such as left_wrist."""
     position: tuple[Metres, Metres, Metres]
 
-    @model_validator(mode="after")
-    def _within_reach(self) -> Self:
-        height = self.position[1]
-        if not -0.5 <= height <= MAX_HEIGHT:
-            raise ValueError(
-                f"{self.joint} is pinned {height:g} m above the floor; nobody reaches that, "
-                f"take -0.5 to {MAX_HEIGHT:g} m"
-            )
-        return self
-
 
 class EditTask(Config):
     """An edit: the parts of a clip to keep, and the constraints on the rest."""
@@ -116,12 +103,6 @@ class EditTask(Config):
         for one, two in pairwise(self.path):
             if two.at <= one.at:
                 raise ValueError(f"path: {two.at:g} s comes after {one.at:g} s; give them in order of time")
-            speed = math.hypot(two.x - one.x, two.z - one.z) / (two.at - one.at)
-            if speed > MAX_SPEED:
-                raise ValueError(
-                    f"path: {speed:.0f} m/s between {one.at:g} s and {two.at:g} s; nobody runs faster than "
-                    f"{MAX_SPEED:g} m/s, give the points more time"
-                )
         return self
 
 

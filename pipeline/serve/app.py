@@ -20,7 +20,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.editing import MAX_HEIGHT, MAX_SPEED
+from motionloom.pipeline.contract.editing import MAX_SPEED
 from motionloom.pipeline.inference.edits.edit import require_editor, why_no_edits
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
@@ -38,9 +38,6 @@ _SCRIPTS = ("serve.js", "edit.js", "lanes.js", "figure.js", "task.js")
 
 _UPLOADS = 4
 """Sounds and clips that are received at a time; others wait unread."""
-
-_LOOK = 0.25
-"""Seconds after which a waiting request looks whether its client is still there."""
 
 
 class Busy(Exception):  # noqa: N818 - an answer, not a fault
@@ -141,12 +138,7 @@ class Site:
                 "joint_names": list(skeleton.joints),
                 "parents": [int(parent) for parent in skeleton.parents],
                 "settings": sorted(bundle.generator.settings),
-                "edit": {
-                    "possible": why is None,
-                    "why": why or "",
-                    "max_speed": MAX_SPEED,
-                    "max_height": MAX_HEIGHT,
-                },
+                "edit": {"possible": why is None, "why": why or "", "max_speed": MAX_SPEED},
                 "sampling": bundle.recommended.model_dump(mode="json", exclude_unset=True),
                 "limits": {
                     "seconds": longest,
@@ -163,21 +155,16 @@ class Site:
     async def generate(self, http: Request) -> Response:
         request = await self._read_request(http, MotionRequest)
         sound = None if request.sound is None else self.sounds.kept.get(request.sound)
-        return await self._respond(http, lambda: self.clips.generate(request, sound))
+        return await self._respond(lambda: self.clips.generate(request, sound))
 
     async def edit(self, http: Request) -> Response:
         """A clip of which a part is made anew."""
         request = await self._read_request(http, ChangeRequest)
-        return await self._respond(http, lambda: self.clips.change(request))
+        return await self._respond(lambda: self.clips.change(request))
 
-    async def _respond(self, http: Request, call: Callable[[], Answer]) -> Response:
-        """Return the answer of the model's thread; nothing is begun for a client that has left by then."""
-        result = asyncio.wrap_future(self.worker.submit(call))
-        while not (await asyncio.wait({result}, timeout=_LOOK))[0]:
-            if await http.is_disconnected():
-                result.cancel()
-                raise ClientDisconnect
-        answer, headers = result.result(), dict[str, str]()
+    async def _respond(self, call: Callable[[], Answer]) -> Response:
+        """Return the answer of the model's thread."""
+        answer, headers = await asyncio.wrap_future(self.worker.submit(call)), dict[str, str]()
         if answer.file:
             headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
         return Response(answer.body, media_type=answer.kind, headers=headers)

@@ -105,6 +105,8 @@ def plant_feet(
         targets[:, [ankle, balls[foot]]] += change[:, None]
         weights[[ankle, balls[foot]]] = _PINNED
         weights[skeleton.index(f"{side}_knee")] = _KNEES
+    if fixed is not None:
+        weights[0] = 10 * _PINNED  # the root stays on its way, which leads from one fixed frame to the next
     turned, root = solve_poses(
         targets, skeleton.offsets, skeleton.parents, motion.rotations, motion.root, weights
     )

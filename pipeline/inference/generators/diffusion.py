@@ -84,6 +84,7 @@ class DiffusionMotion(DenoisedMotion):
 
         `words` are an encoded caption, one row; empty for none.
         """
+        assert isinstance(self.net, InBetweener)
         stats: FeatureStats = self.given["stats"]
         layout, columns, device = self.layout, self.layout.part(self.part), device_of(self.net)
         guidance = sampling.guidance_of(self.part)

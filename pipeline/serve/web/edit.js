@@ -22,7 +22,7 @@ export function makeEditor(page) {
     return { accent: of("color"), card: of("background-color"), ink: of("border-left-color") };
   };
   const tools = figureTools({
-    names: info.joint_names, maxHeight: info.edit.max_height, state, style,
+    names: info.joint_names, state, style,
     active: () => history !== null,
     hold: () => { viewer.play(false); viewer.setFrame(viewer.frame); },
     drag: (joint, frame, position, done) => change((next) => pin(next, joint, frame, position, fps), done),

@@ -6,7 +6,7 @@ const DOT = 7, GRASP = { mouse: 14, touch: 26 }; // pixels: a dot's radius, and 
 
 /* Tools on the first figure of a viewer.
 
-   `host` gives `state()`, the joints' `names` and `maxHeight` in metres, and takes `drag(joint, frame, position, done)`,
+   `host` gives `state()`, the joints' `names`, and takes `drag(joint, frame, position, done)`,
    `drew(points, done)` and `hold()`, which stops the motion. */
 export function figureTools(host) {
   const joint = (name) => host.names.indexOf(name), handles = Object.keys(HANDLES).filter((name) => joint(name) >= 0);
@@ -21,7 +21,7 @@ export function figureTools(host) {
   const pointAt = (lens, [x, y], depth) => viewer.rayThrough(lens, x, y).map((v, i) => lens.eye[i] + depth * v);
   const reached = (at, depth) => {
     const [x, y, z] = pointAt(viewer.lens(0), at, depth);
-    return [x, Math.min(Math.max(y, viewer.floor(0)), host.maxHeight), z];
+    return [x, Math.max(y, viewer.floor(0)), z];
   };
   /* Moves a joint at the frame that is shown by pixels, as dragging does. */
   const nudge = (name, right, down) => {
