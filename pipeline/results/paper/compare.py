@@ -7,6 +7,7 @@ from importlib import resources
 from pathlib import Path
 
 from rich.console import Console
+from rich.markdown import Markdown
 from rich.table import Table
 
 from motionloom.datasets.base.files import write_text
@@ -39,12 +40,14 @@ def compare_with_paper(
         require_file_place(out)
     names = [name for name in shipped_tables() if name.startswith(f"{table}/")] or [table]
     tables = [fill(name, paper_table(name), runs) for name in names]
-    if out is None:
-        for filled in tables:
-            filled.print(console)
-    else:
-        write_text(out, "\n".join(filled.markdown() for filled in tables))
+    page = "\n".join(filled.markdown() for filled in tables)
+    if out is not None:
+        write_text(out, page)
         console.print(str(out), soft_wrap=True)
+    elif console.is_terminal:
+        console.print(Markdown(page))
+    else:
+        console.print(page, markup=False, highlight=False, soft_wrap=True)
     return tables
 
 

@@ -4,235 +4,230 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, ROWS, Figure, Protocol, say_difference
-from motionloom.pipeline.results.paper.evaluations import Evaluation, evaluations_of
-from motionloom.pipeline.results.paper.filled import (
-    FilledRow,
-    FilledTable,
-    data_set_of,
-    differences,
-    notes_of,
+from motionloom.datasets.schema import UserError
+from motionloom.pipeline.evaluation.figures import (
+    FILE_NAME,
+    MODEL,
+    RECORDED,
+    ROWS,
+    Figure,
+    FigureFile,
+    say_difference,
 )
-from motionloom.pipeline.results.paper.schema import (
-    Column,
-    PaperTable,
-    Printed,
-    Row,
-    config_fits,
-    may_fill,
-    value_at,
-)
-from motionloom.pipeline.store.run_state import StageRecord
-
-_MISSING, _NO_MODEL = "missing in these runs", "missing: no model of ours"
+from motionloom.pipeline.results.paper.filled import Cell, FilledRow, FilledTable, mark_best, notes_of
+from motionloom.pipeline.results.paper.protocol import Shown, data_set_of, differences
+from motionloom.pipeline.results.paper.schema import Column, Measure, PaperTable, Row, config_fits, fits
+from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.run_state import StageRecord, finished_records
+from motionloom.pipeline.store.yaml import flatten
 
 _BASELINES = tuple(row for row in ROWS if row != MODEL)
 
 
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """A finished evaluation of a run, and the stages that it is about, by role (`schema.ROLES`)."""
+
+    run: str
+    """The run's name in the table."""
+    name: str
+    """Its stage, or the file of the command `retrieval`."""
+    file: FigureFile
+    about: Mapping[str, StageRecord]
+    data: StageRecord | None
+
+    @property
+    def label(self) -> str:
+        return f"{self.run} {self.name}"
+
+
+def evaluations_of(run: Path, label: str, measures: Iterable[Measure]) -> list[Evaluation]:
+    """All that a run has of `measures`, in the recipe's order; a `UserError` where it has none."""
+    stages, wanted, out = finished_records(run), tuple(measures), list[Evaluation]()
+    for stage in stages.values():
+        if stage.kind in wanted and (stage.folder / FILE_NAME).is_file():
+            require_consistent(run, [stage.name])
+            file = FigureFile.read(stage.folder / FILE_NAME)
+            about = {
+                role: stage.inputs[role] for role in ("tokenizer", "face_tokenizer") if role in stage.inputs
+            }
+            makers = {one.name: one for role, one in stage.inputs.items() if role.startswith("generators.")}
+            about |= {
+                role: makers[name] for role, name in file.about.get("made_by", {}).items() if name in makers
+            }
+            out.append(Evaluation(label, stage.name, file, about, stage.inputs.get("data")))
+    for path in sorted(run.glob("retrieval*.json")) if "retrieval" in wanted else ():
+        file = FigureFile.read(path)
+        judge = stages.get(str(file.about.get("stage")))
+        if judge is None:
+            raise UserError(f"{path}: not a record of motionloom retrieval on this run; run it again")
+        if file.about.get("fingerprint") != judge.fingerprint:
+            raise UserError(
+                f"{path}: measured by another '{judge.name}' than is there now; measure again: "
+                f"motionloom retrieval {run} --stage {judge.name}"
+            )
+        out.append(Evaluation(label, path.name, file, {"alignment": judge}, judge.inputs.get("data")))
+    if not out:
+        fix = f"finish a stage of kind {' or '.join(wanted)}: motionloom run {run / 'recipe.yaml'} -o {run}"
+        if "retrieval" in wanted:
+            fix = f"make one: motionloom retrieval {run}"
+        raise UserError(f"{run}: no finished evaluation that this table takes figures of; {fix}")
+    return out
+
+
 def fill(name: str, table: PaperTable, runs: Sequence[Path] = ()) -> FilledTable:
     """The table with the rows of `runs`, each under the paper's row that it is; without any, the paper's."""
-    return _Filling(name, table, runs).filled()
+    return _Filling(table, list(dict.fromkeys(runs))).filled(name)
 
 
-def _labels(runs: Sequence[Path]) -> dict[Path, str]:
-    """Run -> the last name of its folder, and as many of those above as tell the runs apart."""
-    places = [run.resolve() for run in runs]
-    names = [str(place) for place in places]
-    for depth in range(1, max((len(place.parts) for place in places), default=0) + 1):
-        short = ["/".join(place.parts[-depth:]) for place in places]
-        if len(set(short)) == len(short):
-            names = short
+def _labels(runs: Sequence[Path]) -> list[str]:
+    """The last names of the runs' folders, and as many of those above as tell the runs apart."""
+    places = [run.resolve().parts for run in runs]
+    for depth in range(1, max(map(len, places), default=1) + 1):
+        names = ["/".join(place[-depth:]) for place in places]
+        if len(set(names)) == len(names):
             break
-    return dict(zip(runs, names, strict=True))
+    return names
 
 
 class _Filling:
     """A table being filled in."""
 
-    def __init__(self, name: str, table: PaperTable, runs: Sequence[Path]) -> None:
-        self.name, self.table = name, table
-        runs = list(dict.fromkeys(runs))
-        self.evaluations = {run: evaluations_of(run, table.measures) for run in runs if table.measures}
-        self.labels = _labels(runs)
-        self.decimals = [self._decimals(at) for at in range(len(table.columns))]
-        self.used: dict[tuple[Path, str], Evaluation] = {}
-        self.compared: set[tuple[Path, str]] = set()
-        """Evaluations whose models stand in the table."""
-        self.shown: dict[tuple[Path, str], list[tuple[Column, Figure]]] = {}
+    def __init__(self, table: PaperTable, runs: Sequence[Path]) -> None:
+        self.table = table
+        self.runs = [
+            evaluations_of(run, label, table.measures)
+            for run, label in zip(runs, _labels(runs), strict=True)
+            if table.measures
+        ]
+        self.used: dict[Evaluation, None] = {}
+        """Evaluations with a row of the table."""
+        self.shown: dict[Evaluation, list[Shown]] = defaultdict(list)
         self.settings: dict[str, None] = {}
         self.remarks: dict[str, dict[str, None]] = defaultdict(dict)
-        self.seen: set[tuple[object, ...]] = set()
+        self.seen: set[tuple[str, ...]] = set()
 
-    def filled(self) -> FilledTable:
+    def filled(self, name: str) -> FilledTable:
         """The paper's rows, ours below each, and the reference baselines."""
-        # Models first: baselines are shown of those evaluations whose models stand in the table.
+        # Models first: baselines are shown of those evaluations whose models stand in the table, or of all.
         models = [self._models(row) for row in self.table.rows]
-        self.compared = set(self.used)
+        every = [one for run in self.runs for one in run]
+        compared = [one for one in every if one in self.used] or every
         rows: list[FilledRow] = []
         for row, ours in zip(self.table.rows, models, strict=True):
             printed = iter(row.printed())
-            cells = tuple(next(printed) if column.printed else None for column in self.table.columns)
+            texts = [next(printed) if column.printed else "" for column in self.table.columns]
+            cells = tuple(Cell(text) if text else None for text in texts)
             rows += [FilledRow("paper", row.method, row.method, cells), *ours]
             if row.recorded:
-                rows += self._references({}, (RECORDED,))
+                rows += self._references(compared, {}, (RECORDED,))
             if row.values:
-                rows += self._references(row.values, _BASELINES)
+                rows += self._references(compared, row.values, _BASELINES)
         if not any(row.values for row in self.table.rows):
-            rows += self._references({}, _BASELINES)
+            rows += self._references(compared, {}, _BASELINES)
         unlike = {
-            f"{self.labels[run]} {name}": found
-            for (run, name), evaluation in self.used.items()
-            if (found := differences(evaluation, self.table, self.shown.get((run, name), [])))
+            one.label: differences(one.file, one.data, self.table, self.shown[one]) for one in self.used
         }
         marked = mark_best(rows, self.table.columns)
         remarks = [*self._unlike(), *(f"{', '.join(of)}: {note}" for note, of in self.remarks.items())]
-        notes = notes_of(self.table, marked, list(self.settings), remarks, with_runs=bool(self.evaluations))
-        return FilledTable(self.name, self.table, marked, unlike, notes)
+        notes = notes_of(self.table, marked, list(self.settings), remarks, with_runs=bool(self.runs))
+        return FilledTable(name, self.table, marked, unlike, notes)
 
     def _unlike(self) -> list[str]:
         """Sentences on figures of one column that were measured differently from each other."""
-        columns: dict[str, dict[str, Protocol]] = {}
-        for (run, name), figures in self.shown.items():
+        columns = defaultdict(dict)
+        for evaluation, figures in self.shown.items():
             for column, figure in figures:
-                columns.setdefault(column.title, {})[f"{self.labels[run]} {name}"] = figure.protocol
+                columns[column.title][evaluation.label] = figure.protocol
         sentences = dict.fromkeys(say_difference(protocols) for protocols in columns.values())
         return [sentence.removesuffix(".") for sentence in sentences if sentence]
 
-    def _decimals(self, at: int) -> int:
-        """Decimals of our figures: as many as the paper prints in that column."""
-        column = self.table.columns[at]
-        if not column.printed:
-            return 1 if column.unit == "mm" else 3
-        place = sum(one.printed for one in self.table.columns[:at])
-        cells = [row.printed()[place] for row in self.table.rows]
-        return max((cell.decimals for cell in cells if cell is not None), default=3)
-
     def _models(self, row: Row) -> list[FilledRow]:
         """Our rows of one of the paper's; one that says so where there are none."""
-        if row.recorded or not self.evaluations:
+        if row.recorded or not self.runs:
             return []
-        ours = [one for run in self.evaluations for one in self._of_run(run, row)]
-        label = _NO_MODEL if row.ours is None else _MISSING
+        ours = [] if row.ours is None else [one for run in self.runs for one in self._of_run(run, row)]
+        label = "missing: no model of ours" if row.ours is None else "missing in these runs"
         return ours or [FilledRow("missing", row.method, label, (None,) * len(self.table.columns))]
 
-    def _of_run(self, run: Path, row: Row) -> list[FilledRow]:
+    def _of_run(self, run: Sequence[Evaluation], row: Row) -> list[FilledRow]:
         """One row for each model of a run, or for its set of models where the columns are settings."""
-        if row.ours is None:
-            return []
-        role, conditions = row.ours.role, row.ours.conditions()
-        fitting = [
-            (evaluation, evaluation.about[role])
-            for evaluation in self.evaluations[run]
-            if role in evaluation.about
-            and all(may_fill(match, evaluation.about.get(name)) for name, match in conditions.items())
-        ]
-        if any(column.where for column in self.table.columns):
-            made = self._ours(run, row, fitting)
-            return [made] if made.stages else []
-        names = dict.fromkeys(model.name for _, model in fitting)
-        return [self._ours(run, row, [pair for pair in fitting if pair[1].name == n], n) for n in names]
+        assert row.ours is not None
+        groups: dict[str, list[tuple[Evaluation, StageRecord]]] = defaultdict(list)
+        settings = any(column.where for column in self.table.columns)
+        for one in run:
+            model = one.about.get(row.ours.role)
+            conditions = row.ours.conditions()
+            if model and all(fits(match, one.about.get(role)) for role, match in conditions.items()):
+                groups["" if settings else model.name].append((one, model))
+        rows = [self._ours(row, name, group) for name, group in groups.items()]
+        return [made for made in rows if not settings or any(made.cells)]
 
-    def _ours(
-        self, run: Path, row: Row, fitting: Sequence[tuple[Evaluation, StageRecord]], name: str = ""
-    ) -> FilledRow:
+    def _ours(self, row: Row, name: str, group: Sequence[tuple[Evaluation, StageRecord]]) -> FilledRow:
         """A row of our models: in each column the figure of the first evaluation that has measured it."""
         assert row.ours is not None
-        cells: list[Printed | None] = []
-        models, evaluations = dict.fromkeys([name] if name else []), dict[str, None]()
-        for at, column in enumerate(self.table.columns):
-            cell = None
-            for evaluation, model in fitting:
-                figure = self._figure(column, evaluation, row.values)
-                if figure is not None and config_fits(column.where, model.config):
-                    models[model.name] = evaluations[evaluation.name] = None
-                    self.used[run, evaluation.name] = evaluation
-                    self._settings(run, model, {**row.ours.setting, **column.setting})
-                    cell = self._cell(evaluation, figure, at)
-                    break
-            cells.append(cell)
-        label = " ".join([self.labels[run], ", ".join(models)])
-        return FilledRow(
-            "ours", row.method, label, tuple(cells), self.labels[run], tuple(models), tuple(evaluations)
-        )
+        cells, models = list[Cell | None](), dict.fromkeys([name] if name else [])
+        for column in self.table.columns:
+            found = (
+                (one, model, figure)
+                for one, model in group
+                if config_fits(column.where, model.config)
+                and (figure := self._figure(column, one, row.values, MODEL))
+            )
+            one, model, figure = next(found, (None, None, None))
+            if one and model and figure:
+                models[model.name] = self.used[one] = None
+                self._settings(f"{one.run} {model.name}", model, {**row.ours.setting, **column.setting})
+            cells.append(one and figure and self._cell(one, column, figure))
+        return FilledRow("ours", row.method, f"{group[0][0].run} {', '.join(models)}", tuple(cells))
 
-    def _figure(
-        self, column: Column, evaluation: Evaluation, values: Mapping[str, str], row: str = MODEL
-    ) -> Figure | None:
+    def _figure(self, column: Column, of: Evaluation, values: Mapping[str, str], row: str) -> Figure | None:
         """The figure of a column in an evaluation; None where it measures another thing or other data."""
-        if column.figure is None or evaluation.measure != column.of:
+        if column.figure is None or of.file.kind != column.of:
             return None
-        if column.data and data_set_of(evaluation, self.table.data) != column.data:
+        if column.data and data_set_of(of.file, of.data, self.table.data) != column.data:
             return None
-        return evaluation.figure(column.figure.format(**values), row)
+        return of.file.of(column.figure.format(**values), row)
 
-    def _settings(self, run: Path, model: StageRecord, paper: Mapping[str, object]) -> None:
+    def _settings(self, label: str, model: StageRecord, paper: Mapping[str, object]) -> None:
         """Note where a model of ours has another setting than the paper's."""
-        wrong = []
-        for key, theirs in paper.items():
-            ours = value_at(model.config, key, None)
-            if ours != theirs:
-                wrong.append(f"{key} {ours} (paper: {theirs})")
+        ours = flatten(model.config)
+        wrong = [
+            f"{k} {ours.get(k)} (paper: {theirs})" for k, theirs in paper.items() if ours.get(k) != theirs
+        ]
         if wrong:
-            self.settings[f"{self.labels[run]} {model.name}: {', '.join(wrong)}"] = None
+            self.settings[f"{label}: {', '.join(wrong)}"] = None
 
-    def _cell(self, evaluation: Evaluation, figure: Figure, at: int) -> Printed:
-        column, digits = self.table.columns[at], self.decimals[at]
-        self.shown.setdefault((evaluation.run, evaluation.name), []).append((column, figure))
+    def _cell(self, of: Evaluation, column: Column, figure: Figure) -> Cell:
+        """A figure with as many decimals as the paper prints in that column."""
+        digits = 1 if column.unit == "mm" else 3
+        if column.printed:
+            place = [one for one in self.table.columns if one.printed].index(column)
+            texts = [text for row in self.table.rows if (text := row.printed()[place])]
+            digits = max((len(text.split(" ")[0].partition(".")[2]) for text in texts), default=3)
+        self.shown[of].append((column, figure))
         if figure.note:
-            self.remarks[figure.note][f"{column.title} of {self.labels[evaluation.run]}"] = None
-        mean = figure.value * column.scale
-        spread = None if figure.interval is None else figure.interval * column.scale
-        text = f"{mean:.{digits}f}" + ("" if spread is None else f" ± {spread:.{digits}f}")
-        return Printed(text=text, mean=mean, spread=spread, alike=figure.protocol_key)
+            self.remarks[figure.note][f"{column.title} of {of.run}"] = None
+        numbers = [figure.value] if figure.interval is None else [figure.value, figure.interval]
+        text = " ± ".join(f"{number * column.scale:.{digits}f}" for number in numbers)
+        return Cell(text, figure.protocol_key)
 
-    def _references(self, values: Mapping[str, str], titles: Iterable[str]) -> list[FilledRow]:
-        """Reference baselines of the evaluations whose models stand in the table, or of all where no
-        model does; equal ones once.
-        """
+    def _references(
+        self, evaluations: Sequence[Evaluation], values: Mapping[str, str], titles: Iterable[str]
+    ) -> list[FilledRow]:
+        """Reference baselines of evaluations; equal ones once."""
         out = []
         for title in titles:
-            for run, all_of_run in self.evaluations.items():
-                for evaluation in all_of_run:
-                    if self.compared and (run, evaluation.name) not in self.compared:
-                        continue
-                    row = self._reference(run, evaluation, title, values)
-                    key = (title, tuple(cell and cell.text for cell in row.cells), *values.items())
-                    if any(row.cells) and key not in self.seen:
-                        self.seen.add(key)
-                        self.used.setdefault((run, evaluation.name), evaluation)
-                        out.append(row)
+            for one in evaluations:
+                figures = [self._figure(column, one, values, title) for column in self.table.columns]
+                pairs = zip(self.table.columns, figures, strict=True)
+                cells = tuple(figure and self._cell(one, column, figure) for column, figure in pairs)
+                key = (title, *(cell.text if cell else "" for cell in cells), *values.items())
+                if any(cells) and key not in self.seen:
+                    self.seen.add(key)
+                    self.used.setdefault(one)
+                    out.append(FilledRow("reference", "", f"{title} ({one.label})", cells))
         return out
-
-    def _reference(
-        self, run: Path, evaluation: Evaluation, title: str, values: Mapping[str, str]
-    ) -> FilledRow:
-        figures = [self._figure(column, evaluation, values, title) for column in self.table.columns]
-        cells = [f if f is None else self._cell(evaluation, f, at) for at, f in enumerate(figures)]
-        label = f"{title} ({self.labels[run]} {evaluation.name})"
-        return FilledRow("reference", "", label, tuple(cells), self.labels[run], (), (evaluation.name,))
-
-
-# Which rows are shown, and which figures are the best of those measured alike.
-
-
-def mark_best(rows: Sequence[FilledRow], columns: Sequence[Column]) -> tuple[FilledRow, ...]:
-    """The rows with the best figures marked: of models of ours, two or more of them measured alike.
-
-    The paper's rows, recorded motion and other reference baselines are never ranked. Equal figures
-    are marked together; the figure as it is printed decides.
-    """
-    best: dict[int, set[int]] = defaultdict(set)
-    for at, column in enumerate(columns):
-        alike: dict[str, dict[int, float]] = defaultdict(dict)
-        for number, row in enumerate(rows):
-            cell = row.cells[at]
-            if cell is not None and row.source == "ours":
-                alike[cell.alike][number] = float(cell.text.split(" ")[0])
-        for values in alike.values() if column.better else ():
-            wanted = min(values.values()) if column.better == "lower" else max(values.values())
-            for number, value in values.items():
-                if value == wanted and len(set(values.values())) > 1:
-                    best[number].add(at)
-    return tuple(row.marked(best[number]) for number, row in enumerate(rows))

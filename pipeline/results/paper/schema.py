@@ -15,7 +15,7 @@ A model of ours is named by conditions: its kind, values of its config, and the 
 
 from __future__ import annotations
 
-import re
+import math
 from collections.abc import Mapping
 from typing import Literal
 
@@ -23,6 +23,7 @@ from pydantic import Field
 
 from motionloom.datasets.schema import Config
 from motionloom.pipeline.store.run_state import StageRecord
+from motionloom.pipeline.store.yaml import flatten
 
 Scalar = bool | int | float | str | None
 
@@ -30,14 +31,8 @@ Scalar = bool | int | float | str | None
 class Bounds(Config):
     """A number between bounds, themselves left out."""
 
-    above: float | None = None
-    below: float | None = None
-
-    def holds(self, value: object) -> bool:
-        """Whether `value` is a number within."""
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return False
-        return (self.above is None or value > self.above) and (self.below is None or value < self.below)
+    above: float = -math.inf
+    below: float = math.inf
 
 
 Condition = Bounds | list[Scalar] | Scalar
@@ -54,53 +49,31 @@ class StageMatch(Config):
     inputs: dict[str, StageMatch | None] = Field(default_factory=dict)
     """Role -> what fills it; null: nothing may."""
 
-    def fits(self, stage: StageRecord) -> bool:
-        """Whether `stage` is so."""
-        kinds = [self.kind] if isinstance(self.kind, str) else self.kind
-        return (
-            stage.kind in kinds
-            and config_fits(self.where, stage.config)
-            and all(may_fill(match, stage.inputs.get(role)) for role, match in self.inputs.items())
-        )
 
-
-def may_fill(match: StageMatch | None, stage: StageRecord | None) -> bool:
+def fits(match: StageMatch | None, stage: StageRecord | None) -> bool:
     """Whether a stage, or none, is what `match` wants; None wants none."""
     if match is None or stage is None:
         return match is None and stage is None
-    return match.fits(stage)
+    return (
+        stage.kind in ([match.kind] if isinstance(match.kind, str) else match.kind)
+        and config_fits(match.where, stage.config)
+        and all(fits(wanted, stage.inputs.get(role)) for role, wanted in match.inputs.items())
+    )
 
 
 def config_fits(where: Mapping[str, Condition], config: Mapping[str, object]) -> bool:
     """Whether every condition is met. A key that the config does not have meets none."""
-    return all(_meets(condition, value_at(config, key)) for key, condition in where.items())
-
-
-_ABSENT = object()
-
-
-def value_at(data: object, key: str, default: object = _ABSENT) -> object:
-    """The value under a dotted key of nested mappings; `default` where there is none."""
-    for name in key.split("."):
-        if not isinstance(data, Mapping) or name not in data:
-            return default
-        data = data[name]
-    return data
+    values = flatten(config)
+    return all(key in values and _meets(condition, values[key]) for key, condition in where.items())
 
 
 def _meets(condition: Condition, value: object) -> bool:
-    if value is _ABSENT:
-        return False
+    number = isinstance(value, int | float) and not isinstance(value, bool)
     if isinstance(condition, Bounds):
-        return condition.holds(value)
-    if isinstance(condition, list):
-        return any(_same(one, value) for one in condition)
-    return _same(condition, value)
-
-
-def _same(one: Scalar, value: object) -> bool:
-    """Equal, where true is no 1."""
-    return isinstance(one, bool) == isinstance(value, bool) and bool(one == value)
+        return number and condition.above < value < condition.below  # type: ignore[operator]
+    wanted = condition if isinstance(condition, list) else [condition]
+    # True is no 1.
+    return any(isinstance(one, bool) == isinstance(value, bool) and one == value for one in wanted)
 
 
 Measure = Literal["evaluate", "evaluate_dances", "retrieval"]
@@ -108,36 +81,6 @@ Measure = Literal["evaluate", "evaluate_dances", "retrieval"]
 
 ROLES = ("tokenizer", "face_tokenizer", "generator", "face_generator", "alignment")
 """Roles of measured models; the last is measured by `retrieval`."""
-
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)"
-_PRINTED = re.compile(rf"({_NUMBER})(?: ± ({_NUMBER}))?")
-
-
-class Printed(Config):
-    """A number as it is printed, the paper's with its trailing zeros, or ours."""
-
-    text: str
-    mean: float
-    spread: float | None = None
-    alike: str = ""
-    """Key of the protocol of a figure of ours: figures with equal keys were measured alike."""
-    best: bool = False
-
-    @staticmethod
-    def of(text: str) -> Printed | None:
-        """From "0.559 ± .007"; None for "-"."""
-        text = text.strip()
-        if text == "-":
-            return None
-        match = _PRINTED.fullmatch(text)
-        if match is None:
-            raise ValueError(f"'{text}' is no number; write 1.5, 1.5 ± 0.2, or - for none")
-        mean, spread = match.groups()
-        return Printed(text=text, mean=float(mean), spread=None if spread is None else float(spread))
-
-    @property
-    def decimals(self) -> int:
-        return len(self.text.split(" ")[0].partition(".")[2])
 
 
 class Column(Config):
@@ -211,8 +154,10 @@ class Row(Config):
     """Values of this row for `{...}` in a column's figure."""
     note: str = ""
 
-    def printed(self) -> tuple[Printed | None, ...]:
-        return tuple(Printed.of(cell) for cell in self.paper.split("|"))
+    def printed(self) -> list[str]:
+        """The paper's numbers, as text; empty where it has none."""
+        cells = [cell.strip() for cell in self.paper.split("|")]
+        return ["" if cell == "-" else cell for cell in cells]
 
 
 class Measured(Config):

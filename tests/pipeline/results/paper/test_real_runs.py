@@ -11,8 +11,7 @@ import pytest
 
 from motionloom.pipeline.evaluation.figures import CHANCE, RECORDED, STILL
 from motionloom.pipeline.results.paper.compare import paper_table, shipped_tables
-from motionloom.pipeline.results.paper.evaluations import Evaluation, evaluations_of
-from motionloom.pipeline.results.paper.fill import fill
+from motionloom.pipeline.results.paper.fill import Evaluation, evaluations_of, fill
 from motionloom.pipeline.results.paper.schema import Measure
 
 pytestmark = pytest.mark.slow
@@ -37,7 +36,7 @@ def require_all(evaluation: Evaluation, measure: Measure) -> None:
                 values = [row.values for row in table.rows if row.values] or [{}]
                 wanted |= {column.figure.format(**one) for one in values}
     assert wanted
-    absent = {name for name in wanted if evaluation.figure(name) is None}
+    absent = {name for name in wanted if evaluation.file.of(name) is None}
     assert all(name.startswith(OTHER_STAGES) or name == "face.vertex" for name in absent), absent
 
 
@@ -56,9 +55,9 @@ def test_figures_of_texts_and_retrieval(small_run: Any, run: Path, tmp_path: Pat
         done = call("run", recipe, "--out", run, "--until", stage)
         assert done.code == 0, done.err
     assert call("retrieval", run).code == 0
-    evaluation, alone = evaluations_of(run, ["evaluate"])
+    evaluation, alone = evaluations_of(run, "run", ["evaluate"])
     require_all(evaluation, "evaluate")
-    require_all(evaluations_of(run, ["retrieval"])[0], "retrieval")
+    require_all(evaluations_of(run, "run", ["retrieval"])[0], "retrieval")
     assert {role: stage.name for role, stage in evaluation.about.items()} == {
         "tokenizer": "tokenizer",
         "face_tokenizer": "face_tokenizer",
@@ -67,7 +66,7 @@ def test_figures_of_texts_and_retrieval(small_run: Any, run: Path, tmp_path: Pat
     }
     # Beside every figure stand the answers that need no model.
     for name, row in (("tma.m2t_r1", CHANCE), ("tma.m2t_r1", RECORDED), ("tma.fid", STILL)):
-        assert evaluation.figure(name, row) is not None
+        assert evaluation.file.of(name, row) is not None
     # A tokenizer alone is measured as it is beside generators, and nothing is generated.
     errors = [one for one in evaluation.file.figures if one.name.startswith("reconstruction.mpjpe")]
     assert errors and all(one in alone.file.figures for one in errors)
@@ -88,11 +87,11 @@ def test_figures_of_dances(ude_run: Any, tmp_path: Path, call: Call) -> None:
     run = Path(shutil.copytree(ude_run.folder, tmp_path / "run"))
     done = call("run", ude_run.recipe, "--out", run, "--until", "evaluate_dances")
     assert done.code == 0, done.err
-    (evaluation,) = evaluations_of(run, ["evaluate_dances"])
+    (evaluation,) = evaluations_of(run, "run", ["evaluate_dances"])
     require_all(evaluation, "evaluate_dances")
     assert evaluation.about["generator"].name == "ude"
     table = fill("ude/2", paper_table("ude/2"), [run])
     (row,) = [row for row in table.rows if row.source == "ours"]
-    figure = evaluation.figure("beat_align.bailando")
+    figure = evaluation.file.of("beat_align.bailando")
     assert row.method == "Ours" and row.cells[0] is not None and figure is not None
-    assert row.cells[0].mean == figure.value
+    assert row.cells[0].text.startswith(f"{figure.value:.4f}")

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
 
 from motionloom.pipeline.results.paper.compare import shipped_tables
-from motionloom.pipeline.results.paper.filled import FilledRow, FilledTable
-from motionloom.pipeline.results.paper.schema import PaperTable, Printed
+from motionloom.pipeline.results.paper.filled import Cell, FilledRow, FilledTable
+from motionloom.pipeline.results.paper.schema import PaperTable
 
 PAPER = PaperTable.parse(
     {
@@ -30,18 +29,13 @@ PAPER = PaperTable.parse(
 )
 
 
-def number(text: str, best: bool = False) -> Printed:
-    """A cell."""
-    return Printed(text=text, mean=float(text.split(" ")[0]), best=best)
-
-
 TABLE = FilledTable(
     "p/1",
     PAPER,
     (
-        FilledRow("paper", "m_1", "m_1", (number("1.50 ± .20"), None, None)),
-        FilledRow("ours", "m_1", "[red]r a|b", (number("2.0", True), number("0.1"), None)),
-        FilledRow("reference", "", "chance", (None, number("0.5"), None)),
+        FilledRow("paper", "m_1", "m_1", (Cell("1.50 ± .20"), None, None)),
+        FilledRow("ours", "m_1", "[red]r a|b", (Cell("2.0", best=True), Cell("0.1"), None)),
+        FilledRow("reference", "", "chance", (None, Cell("0.5"), None)),
     ),
     differences={"r e": [("data", "S", "D"), ("clips", "3", None)]},
     notes=("A note [n].",),
@@ -57,12 +51,6 @@ def test_markdown_has_as_many_cells_in_every_row() -> None:
     assert [cell.strip() for cell in rows[3]] == [r"\[red]r a\|b", "ours", "**2.0**", "0.1", ""]
     assert any(line.startswith("- r e: data S (paper: D); clips 3 ") for line in lines)
     assert any(line.startswith(r"- z\|z: ") for line in lines)
-
-
-def test_text_marks_the_best_and_keeps_brackets(capsys: pytest.CaptureFixture[str]) -> None:
-    TABLE.print(Console(width=100))
-    found = capsys.readouterr().out
-    assert re.search(r"\[red\]r a\|b +2.0\*", found) and "- A note [n]." in found
 
 
 Call = Callable[..., Any]
