@@ -171,8 +171,6 @@ class FigureFile:
     figures: tuple[Figure, ...]
     about: Mapping[str, Any] = field(default_factory=dict)
     """Stages evaluated and judges, by role, with their checksums, and the seed."""
-    details: Mapping[str, Any] = field(default_factory=dict)
-    """Descriptions of the worst and best clips, which are kept beside the figures (`cases.py`)."""
 
     def of(self, name: str, row: str = MODEL) -> Figure | None:
         """One figure; None where it was not measured."""
@@ -183,7 +181,7 @@ class FigureFile:
         data: dict[str, object] = {"version": VERSION, "kind": self.kind, "about": self.about}
         data["protocol"] = {one.group: dict(one.protocol) for one in self.figures}
         data["figures"] = [_entry(one) for one in self.figures]
-        write_json(path, data | ({"details": self.details} if self.details else {}))
+        write_json(path, data)
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -204,7 +202,7 @@ class FigureFile:
         try:
             protocols = data["protocol"]
             figures = tuple(Figure(**one, protocol=protocols[one["group"]]) for one in data["figures"])
-            file = cls(str(data["kind"]), figures, dict(data["about"]), dict(data.get("details", {})))
+            file = cls(str(data["kind"]), figures, dict(data["about"]))
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path}: not as an evaluation writes it ({error}); evaluate again") from None
         for one in figures:

@@ -314,12 +314,6 @@ def _measured(
     return out
 
 
-def caption_distances(text: Tensor, motion: Tensor) -> Tensor:
-    """Distances [n], 0 to 2, of the texts' latents [n, Z] from their motions', all scaled to length 1."""
-    out: Tensor = torch.linalg.vector_norm(unit_length(text) - unit_length(motion), dim=-1)
-    return out
-
-
 def unit_length(x: Tensor) -> Tensor:
     """Latents [..., Z] in float64, scaled to length 1."""
     return normalize(x.double(), dim=-1)

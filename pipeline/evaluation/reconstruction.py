@@ -9,13 +9,12 @@ body's, and so must be measured from the wrist, as here.
 Our own **[ours]**, means over clips: `pose` with root and heading aligned, so that a figure that faces
 another way is no other pose, `pose_body`, `pose_hand`; and `world`, where the path counts.
 
-Of faces: errors of expressions, and of a head's vertices where the user has the basis of one.
+Of faces: errors of expressions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ from torch import Tensor
 
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
-from motionloom.datasets.schema import HANDS, UserError
+from motionloom.datasets.schema import HANDS
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
 from motionloom.pipeline.contract.units import Row
@@ -66,10 +65,7 @@ OURS = (
     Metric("reconstruction.world", "in the world", "lower", "mm"),
 )
 
-FACES = (
-    Metric("face.expression", "expression error", "lower"),
-    Metric("face.vertex", "vertices", "lower", "mm"),
-)
+FACES = (Metric("face.expression", "expression error", "lower"),)
 
 
 def clip_errors(
@@ -176,47 +172,19 @@ def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
     return out
 
 
-EXPRESSIONS = 50
-"""Values of an expression in Motion-X, the first 50 of FLAME."""
-
-
-def read_basis(path: Path) -> NDArray[np.float64]:
-    """Floats [V, 3, 50] in metres: how far each vertex moves with each value of the expression."""
-    try:
-        basis = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise UserError(f"{path}: cannot be read as an expression basis, .npy [V, 3, 50] ({error})") from None
-    shape = list(basis.shape) if isinstance(basis, np.ndarray) else "an archive of arrays"
-    if not isinstance(basis, np.ndarray) or basis.ndim != 3 or basis.shape[1:] != (3, EXPRESSIONS):
-        raise UserError(
-            f"{path}: an expression basis has the shape [V, 3, {EXPRESSIONS}], and this is {shape}"
-        )
-    if not np.issubdtype(basis.dtype, np.floating) or not np.isfinite(basis).all():
-        raise UserError(f"{path}: an expression basis holds finite floats in metres")
-    return np.asarray(basis, dtype=np.float64)
-
-
-def face_errors(tokenizer: TrainedTokenizer, truth: Truth, basis: NDArray[np.float64] | None = None) -> Row:
+def face_errors(tokenizer: TrainedTokenizer, truth: Truth) -> Row:
     """Errors of one clip with a face, weighted by its frames: the norm of the difference of the expressions
     (50 values) by a tokenizer of faces or of everything (`expression`), and of the mean one (`_mean`).
-
-    With a `basis` [V, 3, 50], metres of a head's vertices for each value, also the mean distance of the
-    vertices in mm (`vertex`; v.-err. of Tables 2 and 6).
     """
     real = truth.face
     if real is None:
         return {}
     columns = tokenizer.layout.slice("face")
     rebuilt, mean = reconstruct_all(tokenizer, truth)[:, columns], tokenizer.stats.mean[columns]
-
     out, frames = Row(), float(len(real))
     for suffix, expression in (("", rebuilt), ("_mean", mean)):
         error = (expression - real).astype(np.float64)
         out |= weighted(f"expression{suffix}", float(np.linalg.norm(error, axis=-1).sum()), frames)
-        if basis is not None:
-            moved = np.einsum("vce,te->tvc", basis, error)
-            mm = 1000 * np.linalg.norm(moved, axis=-1).mean(-1)
-            out |= weighted(f"vertex{suffix}", float(mm.sum()), frames)
     return out
 
 

@@ -15,6 +15,7 @@ from motionloom.pipeline.evaluation.figures import (
     ROWS,
     Figure,
     FigureFile,
+    Protocol,
     say_difference,
 )
 from motionloom.pipeline.results.paper.filled import Cell, FilledRow, FilledTable, mark_best, notes_of
@@ -108,7 +109,7 @@ class _Filling:
         self.shown: dict[Evaluation, list[Shown]] = defaultdict(list)
         self.settings: dict[str, None] = {}
         self.remarks: dict[str, dict[str, None]] = defaultdict(dict)
-        self.seen: set[tuple[str, ...]] = set()
+        self.seen: set[tuple[object, ...]] = set()
 
     def filled(self, name: str) -> FilledTable:
         """The paper's rows, ours below each, and the reference baselines."""
@@ -138,7 +139,7 @@ class _Filling:
 
     def _unlike(self) -> list[str]:
         """Sentences on figures of one column that were measured differently from each other."""
-        columns = defaultdict(dict)
+        columns: dict[str, dict[str, Protocol]] = defaultdict(dict)
         for evaluation, figures in self.shown.items():
             for column, figure in figures:
                 columns[column.title][evaluation.label] = figure.protocol
@@ -171,17 +172,15 @@ class _Filling:
         assert row.ours is not None
         cells, models = list[Cell | None](), dict.fromkeys([name] if name else [])
         for column in self.table.columns:
-            found = (
-                (one, model, figure)
-                for one, model in group
-                if config_fits(column.where, model.config)
-                and (figure := self._figure(column, one, row.values, MODEL))
-            )
-            one, model, figure = next(found, (None, None, None))
-            if one and model and figure:
-                models[model.name] = self.used[one] = None
-                self._settings(f"{one.run} {model.name}", model, {**row.ours.setting, **column.setting})
-            cells.append(one and figure and self._cell(one, column, figure))
+            cell = None
+            for one, model in group:
+                figure = self._figure(column, one, row.values, MODEL)
+                if figure is not None and config_fits(column.where, model.config):
+                    models[model.name] = self.used[one] = None
+                    self._settings(f"{one.run} {model.name}", model, {**row.ours.setting, **column.setting})
+                    cell = self._cell(one, column, figure)
+                    break
+            cells.append(cell)
         return FilledRow("ours", row.method, f"{group[0][0].run} {', '.join(models)}", tuple(cells))
 
     def _figure(self, column: Column, of: Evaluation, values: Mapping[str, str], row: str) -> Figure | None:
@@ -224,7 +223,7 @@ class _Filling:
             for one in evaluations:
                 figures = [self._figure(column, one, values, title) for column in self.table.columns]
                 pairs = zip(self.table.columns, figures, strict=True)
-                cells = tuple(figure and self._cell(one, column, figure) for column, figure in pairs)
+                cells = tuple(self._cell(one, column, found) if found else None for column, found in pairs)
                 key = (title, *(cell.text if cell else "" for cell in cells), *values.items())
                 if any(cells) and key not in self.seen:
                     self.seen.add(key)

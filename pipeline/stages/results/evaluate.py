@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import FACE_ALIGNMENT, GENERATOR, Every, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, as_rows
-from motionloom.pipeline.evaluation.cases import Case, extreme_cases, write_cases
 from motionloom.pipeline.evaluation.clip_metrics import Performance, clip_figures, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.figures import (
     MODEL,
@@ -27,23 +24,17 @@ from motionloom.pipeline.evaluation.figures import (
     Figure,
     FigureFile,
 )
-from motionloom.pipeline.evaluation.latent_metrics import (
-    GUO_BATCH,
-    caption_distances,
-    judged_figures,
-    reconstructed_figures,
-)
+from motionloom.pipeline.evaluation.latent_metrics import GUO_BATCH, judged_figures, reconstructed_figures
 from motionloom.pipeline.evaluation.movement import Features, all_features, movement_figures
 from motionloom.pipeline.evaluation.reconstruction import clip_error_figures, face_figures
 from motionloom.pipeline.evaluation.reference_baselines import LOOKUPS, mean_poses
-from motionloom.pipeline.evaluation.truth import Truth, digest_of, reconstruct_truth, spread_any, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, digest_of, spread_any, truth_of
 from motionloom.pipeline.stages.results.evaluate_units import (
     CAPTIONS,
     CLIP,
     FACE,
     JOINTS,
     LATENT,
-    MOTION,
     MOVEMENT,
     EvaluateConfig,
     EvaluationUnits,
@@ -65,15 +56,6 @@ class EvaluateStage(EvaluationStage):
         Every("generators", GENERATOR),
     )  # fmt: skip
 
-    def external(self, config: Any) -> dict[str, str]:
-        """Checksum of the head whose vertices are measured."""
-        path = config.face_basis
-        if path is None:
-            return {}
-        if not path.is_file():
-            raise UserError(f"evaluate: face_basis {path}: no such file")
-        return {path.name: sha256_of(path)}
-
     def evaluation(self, context: StageContext) -> _Evaluation:
         return _Evaluation(context)
 
@@ -81,12 +63,8 @@ class EvaluateStage(EvaluationStage):
 class _Evaluation(EvaluationUnits):
     """Results of all processes."""
 
-    def __init__(self, context: StageContext) -> None:
-        super().__init__(context)
-        self.cases: list[Case] = []
-
     def measured(self) -> FigureFile:
-        """All figures, each beside its reference baselines; `cases.safetensors` is written beside them."""
+        """All figures, each beside its reference baselines."""
         context, split = self.context, self.dataset.split
         figures = self.reconstruction()
         if not self.truths and not figures:
@@ -106,8 +84,7 @@ class _Evaluation(EvaluationUnits):
             for role, stage in stages.items()
         }
         about = self.about(self.bundle) | {"judges": judges}
-        details = write_cases(context.folder, self.cases, self.dataset.layout)
-        return FigureFile("evaluate", tuple(figures), about, details)
+        return FigureFile("evaluate", tuple(figures), about)
 
     def _weights(self, role: str) -> str:
         return sha256_of(self.context.input(role) / "model.safetensors")
@@ -154,11 +131,6 @@ class _Evaluation(EvaluationUnits):
                     repeats=self.config.repeats,
                     seed=self.context.seed,
                 )
-        tokenizer = self.tokenizer
-        self.cases += extreme_cases(
-            "reconstruction", self.shown, [row["mpjpe"] for row in rows],
-            lambda k: joints_of(reconstruct_truth(tokenizer, self.shown[k]), tokenizer.layout),
-        )  # fmt: skip
         return out
 
     def by_judges(self, made: Sequence[Arrays]) -> list[Figure]:
@@ -169,9 +141,6 @@ class _Evaluation(EvaluationUnits):
             others = judge.judged(self.others)
             nearest = {} if judge.of_faces else self._nearest_captions
             latents = judge.latents(truths, self._latents(made, role), others, nearest)
-            if role == "tma":
-                far = caption_distances(latents.text, latents.made[0]).tolist()
-                self.cases += extreme_cases("generated", truths, far, self._first(made).__getitem__)
             out += judged_figures(
                 role,
                 _NAMES[role],
@@ -241,10 +210,6 @@ class _Evaluation(EvaluationUnits):
 
     def _rows(self, some: Sequence[Arrays]) -> list[Row]:
         return [row for table in some for row in as_rows(table, CLIP)]
-
-    def _first(self, made: Sequence[Arrays]) -> list[NDArray[np.float64]]:
-        """Joints [T, N, 3] of the first repeat."""
-        return [table[name] for table in made for name in sorted(table) if name.startswith(MOTION)]
 
     def _latents(self, made: Sequence[Arrays], role: str) -> list[torch.Tensor]:
         """A judge's latents [n, Z] of all clips, once for each repeat."""

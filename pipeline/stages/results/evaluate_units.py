@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from motionloom.datasets.motion.features.joints import joints_of
@@ -19,7 +16,7 @@ from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
 from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.movement import all_features
-from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors, read_basis
+from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors
 from motionloom.pipeline.evaluation.reference_baselines import NearestClip
 from motionloom.pipeline.evaluation.truth import (
     Truth,
@@ -38,8 +35,8 @@ from motionloom.pipeline.store.networks import TrainedTokenizer
 
 _RECONSTRUCTED, _GENERATED = 16, 64
 """Clips at a time, at most."""
-JOINTS, FACE, CLIP, MOVEMENT, MOTION = "joints/", "face/", "clip/", "movement/", "motion/"
-"""Begin the names of what is measured of a clip, or made for it."""
+JOINTS, FACE, CLIP, MOVEMENT = "joints/", "face/", "clip/", "movement/"
+"""Begin the names of what is measured of a clip."""
 CAPTIONS = "texts.json"
 """The member of a clip that holds its captions."""
 LATENT = {"tma": "latent", "evaluator": "latent_evaluator", "face_evaluator": "latent_face"}
@@ -63,9 +60,6 @@ class EvaluateConfig(StageConfig):
     """How long generated motions are: as the generator decides, or as the recorded clip is (at most what the
     generator makes), which is all that VAEs and diffusion models can do."""
     sampling: SamplingConfig = SamplingConfig()
-    face_basis: Path | None = None
-    """A head's expression basis, `.npy` of floats [V, 3, 50] in metres (such as the expression part of
-    SMPL-X's `shapedirs`, which its licence lets nobody pass on): with it errors of vertices are measured."""
 
     @field_validator("sampling")
     @classmethod
@@ -119,12 +113,6 @@ class EvaluationUnits(Evaluation):
             found: LoadedEvaluator = given["evaluator"]
             found.require_layout(self.dataset.layout, self.context.inputs["evaluator"].name)
         return {role: Judge(given[role]) for role in LATENT if role in given}
-
-    @cached_property
-    def basis(self) -> NDArray[np.float64] | None:
-        """The head whose vertices are measured."""
-        path = self.config.face_basis
-        return None if path is None else read_basis(path)
 
     @cached_property
     def performed_by(self) -> dict[str, Judge]:
@@ -201,7 +189,7 @@ class EvaluationUnits(Evaluation):
         faces = self.context.given.get("face_tokenizer", tokenizer)
         models_faces = faces.layout.has("face") and faces.net.part in ("face", "all")
         if models_faces:
-            out |= as_table([face_errors(faces, truth, self.basis) for truth in truths], FACE)
+            out |= as_table([face_errors(faces, truth) for truth in truths], FACE)
         for role, judge in self.judges.items():
             some = judge.judged(truths)
             if not judge.of_faces:
@@ -236,8 +224,6 @@ class EvaluationUnits(Evaluation):
         out = as_table([measure_clip(metrics_of("captions"), one) for one in made_for], CLIP)
         moves = all_features((m.joints for m in motions), fps)
         out |= {MOVEMENT + kind: rows for kind, rows in moves.items()}
-        if draw == 0:
-            out |= {f"{MOTION}{number:03d}": m.joints for number, m in enumerate(motions)}
         for role, judge in self.performed_by.items():
             if judge.of_faces:
                 made = [m.face for t, m in zip(truths, motions, strict=True) if t.face is not None]

@@ -22,7 +22,6 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
 )
 from motionloom.pipeline.contract.units import Arrays, even_slices
-from motionloom.pipeline.evaluation.cases import shown_cases
 from motionloom.pipeline.evaluation.clip_metrics import CLIP_METRICS
 from motionloom.pipeline.evaluation.figures import (
     FILE_NAME,
@@ -64,10 +63,9 @@ class EvaluationStage(StageKind):
         context.units.clear()
 
     def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
-        """The tables, and the worst and the best to watch."""
+        """The tables."""
         found = FigureFile.read(stage.folder / FILE_NAME)
-        tables = [FigureTable(*table) for table in figure_tables(found.figures)]
-        return [*tables, *shown_cases(stage.folder, found.details)]
+        return [FigureTable(*table) for table in figure_tables(found.figures)]
 
 
 class Evaluation:

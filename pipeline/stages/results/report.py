@@ -29,7 +29,6 @@ from motionloom.pipeline.contract.stage import (
     register,
     stage_kind,
 )
-from motionloom.pipeline.evaluation.cases import Clips
 from motionloom.pipeline.evaluation.dances import dance_to, dances_of, seed_frames, with_music
 from motionloom.pipeline.evaluation.truth import Truth, perform, reconstruct_all, spread_truths, truth_at
 from motionloom.pipeline.inference.bundle import Bundle
@@ -104,7 +103,6 @@ class ReportStage(StageKind):
             for thing in stage.kind.show(stage, context.stage_cache.given(stage.inputs))
         ]
         draw_showings(page, "Figures on held-out clips", FigureTable, shown)
-        draw_showings(page, "Worst and best", Clips, shown)
         draw_curves(page, stages if state is None else _logged(stages, state), samples=state is not None)
         draw_showings(page, "Codebooks", Bars, shown)
         if state is not None:

@@ -15,7 +15,6 @@ from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
 from motionloom.pipeline.contract.stage import CompletedStage, StageContext, stage_kind
-from motionloom.pipeline.evaluation.cases import Clips
 from motionloom.pipeline.render.charts import curve_label, log_lines
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
@@ -44,9 +43,6 @@ def draw_showings(page: Page, heading: str, kind: type[Showing], shown: Sequence
     for thing in things:
         if isinstance(thing, FigureTable):
             page.add_table(list(thing.columns), [list(row) for row in thing.rows], thing.title, pinned=True)
-        elif isinstance(thing, Clips):
-            page.add_subheading(thing.title)
-            page.add_viewer(thing.motions, thing.note)
         elif isinstance(thing, Bars):
             uses, ends = {thing.y_label: thing.values}, (0, len(thing.values))
             page.add_histogram(uses, ends, thing.title, thing.x_label, thing.y_label)

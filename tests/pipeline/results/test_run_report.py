@@ -12,8 +12,6 @@ from typing import Any
 
 import pytest
 
-from motionloom.pipeline.evaluation.figures import FigureFile
-
 pytestmark = pytest.mark.slow
 
 
@@ -37,15 +35,9 @@ def text_of(page: Path) -> str:
     return unescape(re.sub(r"<[^>]+>", " ", re.sub(r"<(script|style).*?</\1>", "", html, flags=re.S)))
 
 
-def test_a_finished_run_keeps_its_worst_and_best_to_watch(small_run: Any) -> None:
-    folder = small_run.folder / "stages/evaluate"
-    cases = FigureFile.read(folder / "metrics.json").details["cases"]
-    assert (folder / "cases.safetensors").is_file()
-    for of in ("reconstruction", "generated"):
-        error = {one["place"]: one["error"] for one in cases if one["of"] == of}
-        assert error["worst 1"] >= error["best 1"] > 0
+def test_the_report_of_a_finished_run(small_run: Any) -> None:
     text = text_of(small_run.folder / "stages/report/report.html")
-    for words in ("best reconstructions", "best generated motions", "Settings of every", "52 joints at 20 "):
+    for words in ("Figures on held-out clips", "Settings of every", "52 joints at 20 "):
         assert words in text, words
     assert "in training" not in text and "Still missing" not in text
 

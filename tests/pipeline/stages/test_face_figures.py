@@ -1,4 +1,4 @@
-"""Faces judged by a TMA of faces, vertices of a head, motion beside what was recorded for its caption."""
+"""Faces judged by a TMA of faces, motion beside what was recorded for its caption."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, STILL, THROUGH, TRAINING, FigureFile
-from motionloom.pipeline.evaluation.reconstruction import face_errors, read_basis
 from motionloom.pipeline.evaluation.truth import reconstruct_all, spread_any, truth_of
 from motionloom.pipeline.results.paper.compare import compare_with_paper
 from motionloom.pipeline.runs.api import run_recipe
@@ -30,7 +28,7 @@ stages:
     net: {latent: 8, ff: 16, layers: 1, frame_stride: 1}
     loss: {contrastive: 0.1}
     train: {steps: 4, batch_size: 8, checkpoint_every: 4, validate_every: 4}
-  evaluate: {clips: 9, repeats: 2, size: 4, face_basis: BASIS}
+  evaluate: {clips: 9, repeats: 2, size: 4}
   # As in the recipes of the baselines.
   evaluate_face_vae:
     kind: evaluate
@@ -52,8 +50,7 @@ def judged(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with an evaluator of faces, evaluated by it."""
     root = tmp_path_factory.mktemp("faces")
     shutil.copy(small_run.recipe, root / small_run.recipe.name)
-    np.save(root / "head.npy", np.random.default_rng(0).normal(size=(5, 3, 50)) * 0.01)
-    (root / "faces.yaml").write_text(RECIPE.replace("BASIS", str(root / "head.npy")))
+    (root / "faces.yaml").write_text(RECIPE)
     shutil.copytree(small_run.folder, root / "run")
     wanted = "evaluate,evaluate_face_vae,evaluate_face_diffusion"
     run_recipe(root / "faces.yaml", root / "run", select=Selection(until=wanted), console=Console(quiet=True))
@@ -61,7 +58,7 @@ def judged(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_faces_have_a_judge_and_vertices(judged: Path) -> None:
+def test_faces_have_a_judge(judged: Path) -> None:
     file = FigureFile.read(judged / "run/stages/evaluate/metrics.json")
     made = {one.name: one.value for one in file.figures if one.row == MODEL}
     tops = {f"face_evaluator.{name}" for name in ("top-1", "top-2", "top-3", "matching_score")}
@@ -72,21 +69,16 @@ def test_faces_have_a_judge_and_vertices(judged: Path) -> None:
     assert 0 <= made["reconstruction.face_evaluator.top-3"] <= 1
     top = file.of("face_evaluator.top-1")
     assert top is not None and (top.protocol["clips"], top.protocol["candidates"]) == (7, 4)
-    # By hand: one clip's vertices.
+    # By hand: one clip's expressions.
     stages, stage_cache = finished_stages(judged / "run"), StageCache()
     data, tokenizer = stage_cache.get(stages["data"]).split("test"), stage_cache.get(stages["face_tokenizer"])
-    basis = read_basis(judged / "head.npy")
     errors, frames = 0.0, 0
-    for index in spread_any(data, 9):
-        truth = truth_of(data, index)
-        if truth.face is None:
-            continue
-        off = reconstruct_all(tokenizer, truth)[:, data.layout.slice("face")].astype(np.float64) - truth.face
-        moved = np.stack([(basis @ row) for row in off])
-        errors += 1000 * np.sqrt(np.square(moved).sum(-1)).mean(-1).sum()
-        frames += len(off)
-        assert "vertex" not in face_errors(tokenizer, truth)
-    assert made["face.vertex"] == pytest.approx(errors / frames, abs=2e-5)
+    for truth in (truth_of(data, index) for index in spread_any(data, 9)):
+        if truth.face is not None:
+            rebuilt = reconstruct_all(tokenizer, truth)[:, data.layout.slice("face")].astype(np.float64)
+            errors += np.sqrt(np.square(rebuilt - truth.face).sum(-1)).sum()
+            frames += len(rebuilt)
+    assert made["face.expression"] == pytest.approx(errors / frames, abs=2e-5)
 
 
 @pytest.mark.slow
@@ -112,20 +104,3 @@ def test_each_facial_generator_has_a_row(judged: Path) -> None:
     for row in ours.values():
         assert all(cell is not None for cell in row.cells[:6]), row
     assert len({ours[method].cells[0].text for method in ours}) == 3  # type: ignore[union-attr]
-
-
-@pytest.mark.parametrize(
-    ("values", "said"),
-    [
-        (np.zeros((5, 50)), "shape"),
-        (np.full((5, 3, 50), np.nan), "finite"),
-        (np.zeros((5, 3, 50), int), "floats"),
-        (None, "cannot be read"),
-    ],
-)
-def test_a_wrong_basis_is_refused(values: np.ndarray | None, said: str, tmp_path: Path) -> None:
-    (tmp_path / "head.npy").write_bytes(b"\x80\x04not an array")
-    if values is not None:
-        np.save(tmp_path / "head.npy", values)
-    with pytest.raises(UserError, match=said):
-        read_basis(tmp_path / "head.npy")

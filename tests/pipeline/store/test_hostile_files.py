@@ -34,8 +34,6 @@ from motionloom.datasets.shards.sample import captions_from_json
 from motionloom.datasets.text.cache import CacheInfo, TextCache
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.contract.lookup import open_exported
-from motionloom.pipeline.evaluation.cases import shown_cases
-from motionloom.pipeline.evaluation.reconstruction import read_basis
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.tokens import TokenStore
 from motionloom.pipeline.store.weights import load_weights
@@ -121,7 +119,6 @@ SAFETENSORS: dict[str, Callable[[Path], object]] = {
     "stats.safetensors": FeatureStats.load,
     "audio.safetensors": FrameStats.load,
     "tokens-train.safetensors": lambda path: TokenStore.load(path, {"body": 1}),
-    "cases.safetensors": lambda path: shown_cases(path.parent, {"cases": [{}]}),
 }
 DISGUISES = {
     "a pickle": lambda: pickle.dumps(Payload()),
@@ -164,8 +161,6 @@ ARRAYS: dict[str, Callable[[Path], object]] = {
     "a release's statistics": lambda f: FeatureStats.of_arrays(
         put(f, "mean.npy", objects((263,))), f / "std.npy", MotionLayout.named("h3d263")
     ),
-    "an expression basis": lambda f: read_basis(put(f, "basis.npy", objects((9, 3, 50)))),
-    "a basis that is a pickle": lambda f: read_basis(put(f, "basis.npy", pickle.dumps(Payload()))),
     "a body's poses": lambda f: NpzFile(put(f, "a.npz", archive("poses"))).numbers("poses"),
     "a body model": lambda f: BodyModel.load(put(f, "model.npz", archive("kintree_table")), "smpl22"),
     "a body model's pickle": lambda f: BodyModel.load(put(f, "model.pkl", pickle.dumps(Payload())), "smpl22"),
