@@ -16,7 +16,6 @@ from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.stages.networks.tma import between
 
 RECIPE = """
 name: made
@@ -75,14 +74,6 @@ def test_a_stopped_training_goes_on_exactly_and_its_export_generates(
     if kind in ("motiondiffuse", "mld"):
         with pytest.raises(UserError, match=r"0\.05 to 2\.0 s"):
             model.generate(["a person walks"], seconds=2.1)
-
-
-def test_frames_between_are_on_the_line() -> None:
-    values = np.array([[0.0], [4.0], [2.0]], dtype=np.float32)
-    assert between(values, 9, 4)[:, 0].tolist() == [0, 1, 2, 3, 4, 3.5, 3, 2.5, 2]
-    assert between(values, 11, 4)[:, 0].tolist()[-3:] == [2, 2, 2]
-    assert between(values, 6, 4)[:, 0].tolist() == [0, 1, 2, 3, 4, 4], "of 6 frames the third is never read"
-    assert between(values, 3, 1) is not values and between(values, 2, 1)[:, 0].tolist() == [0, 4]
 
 
 FITTING = (

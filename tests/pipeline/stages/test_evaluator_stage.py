@@ -20,7 +20,7 @@ from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.retrieval import retrieve
 from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.stages.networks.evaluator import EvaluatorStage, EvaluatorStageConfig
+from motionloom.pipeline.stages.networks.evaluator import EvaluatorStage
 from motionloom.pipeline.store.evaluator import LoadedEvaluator, StageWords
 from motionloom.pipeline.store.weights import load_facts
 
@@ -117,16 +117,3 @@ def test_other_layouts_and_words_are_refused(run: Path) -> None:
     ):
         with pytest.raises(UserError, match=said):
             refused()
-
-
-@pytest.mark.parametrize(
-    ("settings", "sentence"),
-    [
-        ({"movement_steps": 10, "train": {"steps": 10}}, "movement_steps 10 leave none of train.steps 10"),
-        ({"train": {"batch_size": 1}}, "a batch of one clip has no mismatching pair"),
-        ({"max_frames": 50}, "key 'max_frames' = 50"),
-    ],
-)
-def test_settings_that_cannot_work_are_refused(settings: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(UserError, match=sentence):
-        EvaluatorStageConfig.parse(settings, "recipe")

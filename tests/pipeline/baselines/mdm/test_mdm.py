@@ -12,7 +12,6 @@ from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.module import TextDenoiserModule
 from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.diffusion.schedule import ScheduleConfig
-from motionloom.models.training.distributed import mean_of_rows
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.baselines.mdm.network import Mdm
 from motionloom.pipeline.baselines.mdm.stage import published_names
@@ -59,31 +58,6 @@ def test_equals_one_of_torchs_parts() -> None:
     for row, frames, said in ((0, 9, text[0]), (1, 6, torch.zeros(7))):
         wanted = slow(published(net), x[row, :frames], int(step[row]), said)
         torch.testing.assert_close(found[row, :frames], wanted, atol=1e-5, rtol=1e-5)  # waves are float32
-
-
-def test_dropout_reaches_positions_and_the_inside_of_blocks() -> None:
-    """With nearly all of it dropped, nothing of the input is left."""
-    net = Mdm(SMALL.model_copy(update={"dropout": 0.999}), 5, 7).train()
-    assert [m.p for m in net.modules() if isinstance(m, nn.Dropout)] == [0.999] * 3
-    seen = []
-    for block in net.stack.blocks:
-        block.ff_out.register_forward_pre_hook(lambda _, given: seen.append(given[0]))
-    net(
-        torch.randn(2, 9, 5), torch.tensor([1, 2]), torch.randn(2, 7), torch.ones(2, 9) > 0, torch.ones(2) > 0
-    )
-    assert all((inner == 0).float().mean() > 0.98 for inner in seen)
-
-
-def test_each_clip_counts_alike() -> None:
-    """MDM's masked loss, clip by clip; a clip without the columns counts for nothing."""
-    torch.manual_seed(0)
-    error, length = torch.rand(4, 6, 3), [6, 2, 4, 5]
-    mask = torch.arange(6) < torch.tensor(length)[:, None]
-    present = torch.tensor([[True] * 3, [True, False, True], [True] * 3, [False] * 3])
-    each = [error[row, :n][:, present[row]].mean() for row, n in enumerate(length)]
-    torch.testing.assert_close(mean_of_rows(error, mask), torch.stack(
-        [error[row, :n].mean() for row, n in enumerate(length)]).mean())  # fmt: skip
-    torch.testing.assert_close(mean_of_rows(error, mask, present), torch.stack(each[:3]).mean())
 
 
 def test_the_loss_beside_a_slow_one() -> None:

@@ -22,7 +22,6 @@ from motionloom.pipeline.baselines.mld.network import (
     MotionVae,
     MotionVaeConfig,
     MotionVaeLossConfig,
-    Positions,
 )
 from motionloom.pipeline.baselines.mld.stage import (
     LatentDiffusionStage,
@@ -96,11 +95,6 @@ def test_a_release_is_read_and_refused_where_it_differs(tmp_path: Path) -> None:
     vae = MotionVae(MotionVaeConfig(**SMALL), 5)
     with pytest.raises(UserError, match=r"denoiser\.safetensors: tensor "):
         MotionVaeStage().release(vae).fill(tmp_path / "denoiser.safetensors", vae)
-
-
-def test_positions_start_between_zero_and_one_and_end() -> None:
-    table = Positions(MotionVaeConfig(positions=64)).table
-    assert table.shape == (64, 1, 256) and 0 <= table.min() < 0.01 and 0.99 < table.max() <= 1
 
 
 @pytest.mark.usefixtures("float64")
@@ -210,9 +204,3 @@ def test_sampling_is_ddim_under_guidance_and_each_motion_its_own() -> None:
         x = after**0.5 * clean + (1 - after) ** 0.5 * noise
     # Errors of single precision grow by the guidance and 1 / sqrt(kept) = 11 at the first step.
     torch.testing.assert_close(alone.double(), x, rtol=1e-3, atol=1e-3)
-
-
-@pytest.mark.parametrize(("steps", "first"), [(50, 981), (1000, 999)])
-def test_time_steps_are_offset_where_there_is_room(steps: int, first: int) -> None:
-    taken = LatentDiffusionConfig().schedule.sampler("ddim", steps).timesteps.tolist()
-    assert taken[0] == first and len(taken) == steps and taken[-1] == (1 if steps == 50 else 0)

@@ -142,18 +142,6 @@ def test_equal_figures_are_best_together_or_not_at_all(baselines: Make) -> None:
     assert best(filled("humantomato/7", run)) == {}
 
 
-def test_two_sizes_share_a_row(tmp_path: Path) -> None:
-    def vq(codes: int) -> dict[str, Any]:
-        return {"kind": "vq", "config": {"net": {"part": "bodyhand", "num_codes": codes}}}
-
-    stages: dict[str, Any] = {"data": {"kind": "synth", "config": {"clips": 8}}}
-    for codes, mpjpe in ((512, 3.0), (1024, 2.0), (4096, 1.0)):
-        stages[f"vq{codes}"] = vq(codes)
-        stages[f"of{codes}"] = measured(f"vq{codes}", records.reconstruction(mpjpe))
-    run = records.write_run(tmp_path / "sizes", stages)
-    assert ours(filled("humantomato/3", run)) == {"sizes vq512, vq1024, vq4096": ["3.0", "2.0", "1.0"]}
-
-
 @pytest.mark.parametrize(
     ("kind", "path", "hands", "columns"),
     [
