@@ -76,10 +76,10 @@ def test_a_file_comes_back(tmp_path: Path) -> None:
         Figure("a.x", 2.0, None, "mm", "lower", RECORDED, facts, "A", "X", note="few"),
         Figure("b.y", 0.5, protocol={"clips": 4}, group="B", title="Y", unit="share"),
     )
-    FigureFile("evaluate", figures, {"stage": "e"}, {"fps": 20}).write(tmp_path / "metrics.json")
+    FigureFile("evaluate", figures, {"stage": "e"}).write(tmp_path / "metrics.json")
     again = FigureFile.read(tmp_path / "metrics.json")
     assert again.figures == (replace(figures[0], value=0.12346), *figures[1:])
-    assert (again.about, again.details, again.kind) == ({"stage": "e"}, {"fps": 20}, "evaluate")
+    assert (again.about, again.kind) == ({"stage": "e"}, "evaluate")
     first, second = figure_tables(again.figures)
     assert first[1:] == (["", "X, mm"], [["model", "0.1 ± 0.0"], [RECORDED, "2.0"]])
     assert all(words in first[0] for words in ("A", "3 clips", "over clips", "X: few"))
