@@ -90,7 +90,6 @@ def edit(
         wanted,
         title=f"{clip.name}, edited",
         note=page_note(len(motions), Path(run_folder).resolve().name, seed, remarks, model.bundle.terms),
-        seed=seed,
         names=[clip.stem, *[f"{clip.stem} edited" for _ in motions]],
         labels=["the clip", *["edited" for _ in motions]],
         figure=posing,

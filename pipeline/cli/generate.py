@@ -130,7 +130,6 @@ def generate(
                 wanted,
                 title=title,
                 note=page_note(len(motions), Path(folder).resolve().name, seed, notes, bundle.terms),
-                seed=seed,
                 names=None if texts else each([Excerpt.named(path).path.stem for path in songs]),
                 figure=posing,
                 say=partial(say, aside),

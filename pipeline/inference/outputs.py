@@ -38,7 +38,6 @@ def write_motions(
     *,
     title: str,
     note: str = "",
-    seed: int,
     scores: Sequence[Score] | None = None,
     names: Sequence[str] | None = None,
     labels: Sequence[str] | None = None,
@@ -48,11 +47,10 @@ def write_motions(
     """Write every motion in every format; the page holds all of them. Returns the paths.
 
     What was written there before is removed. `title` and `note` are the page's. `scores`, one for each
-    motion: sound, beats and segments for the page. Without them each motion comes
-    with what drove it. `names` are what files are called after, instead of the captions; `labels` are what
-    the page says above each. `figure` says how
-    the shown figure follows the generated joints, and `say` is given a line on each motion that it is far
-    from.
+    motion, are sound, beats and segments for the page; without them each motion comes with what drove it.
+    `names` are what files are called after, instead of the captions; `labels` are what the page says above
+    each. `figure` says how the shown figure follows the generated joints, and `say` is given a line on each
+    motion that it is far from.
     """
     require_folder(folder)
     options = figure or FigureOptions()
@@ -69,7 +67,7 @@ def write_motions(
     for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
         name = file_stem(number, names[number])
         label = "generated" if labels is None else labels[number]
-        clips.append(OutputClip(shown(motion, options), score, options, seed, label, "arkit" in formats))
+        clips.append(OutputClip(shown(motion, options), score, options, label, "arkit" in formats))
         if say is not None and (remark := clips[-1].shown.remark):
             say(f"{name}: {remark}")
         for _, writer in writers:
@@ -107,7 +105,7 @@ def save(path: Path, motion: GeneratedMotion, note: str = "") -> None:
 def clip_of(motion: GeneratedMotion) -> OutputClip:
     """The motion with all that drove it."""
     options = FigureOptions()
-    return OutputClip(shown(motion, options), score_of(motion), options, motion.seed)
+    return OutputClip(shown(motion, options), score_of(motion), options)
 
 
 def frame_of(motion: GeneratedMotion, height: int = 480) -> str:

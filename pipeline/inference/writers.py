@@ -35,7 +35,6 @@ class OutputClip:
     shown: ShownMotion
     score: Score
     options: FigureOptions
-    seed: int | None = None
     label: str = "generated"
     """Heading of its figure on the page."""
     arkit: bool = False
@@ -117,7 +116,7 @@ def write_npz(path: Path, outputs: Outputs) -> None:
         "joint_names": list(motion.layout.skeleton.joints),
         "up": "y",
         "unit": "m",
-        "seed": clip.seed,
+        "seed": motion.seed,
         "figure": figure.facts(),
     }
     arrays: dict[str, Any] = {

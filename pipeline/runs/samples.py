@@ -68,7 +68,7 @@ def draw_samples(run: Path, stage: str) -> Path:
     out = place / f"step={artifact.step:08d}"
     title = f"{stage} at step {artifact.step:,}"
     note = page_note(len(made), run.resolve().name, 0, terms=bundle.terms)
-    write_motions(out, made, default_formats(), title=title, note=note, seed=0)
+    write_motions(out, made, default_formats(), title=title, note=note)
     with open_own(place / SAMPLE_FIGURES, "ab") as file:
         file.write(json.dumps(row).encode() + b"\n")
     return out

@@ -77,7 +77,6 @@ class GenerateStage(StageKind):
             config.formats,
             title=f"Generated motions of {context.recipe}",
             note=page_note(len(motions), context.recipe, context.seed, mismatches, terms),
-            seed=context.seed,
             scores=[Score()] * len(said) + [clip.score() for _, clip in danced],
             figure=config.figure,
         )

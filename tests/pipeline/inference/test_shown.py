@@ -52,7 +52,7 @@ def write(folder: Path, motions: list[GeneratedMotion], **options: Any) -> tuple
     said: list[str] = []
     figure = FigureOptions.parse(options, "figure")
     formats = ["npz", "bvh", "html", "glb", "smplx"]
-    paths = write_motions(folder, motions, formats, title="t", seed=0, figure=figure, say=said.append)
+    paths = write_motions(folder, motions, formats, title="t", figure=figure, say=said.append)
     return paths, said
 
 
@@ -106,7 +106,7 @@ def test_new_motions_take_the_place_of_old_ones(motions: list[GeneratedMotion], 
     (out / "notes.txt").write_text("mine")
     (out / "mine.npz").write_text("mine")
     names = ["歩く ひと", "шаг_вперёд"]
-    paths = write_motions(out, motions, ["npz", "html"], title="t", seed=0, names=names)
+    paths = write_motions(out, motions, ["npz", "html"], title="t", names=names)
     assert [path.name for path in paths] == ["00-歩く-ひと.npz", "01-шаг-вперёд.npz", "index.html"]
     left = {path.name for path in out.iterdir() if not path.name.startswith(".")}
     assert left == {"notes.txt", "mine.npz", *(path.name for path in paths)}
@@ -120,7 +120,7 @@ def test_faces_are_written_as_arkit_weights_by_the_users_bases(
     np.savez(tmp_path / "bases.npz", source=arkit[:50], arkit=arkit)
     options = FigureOptions(arkit_bases=tmp_path / "bases.npz")
     paths = write_motions(
-        tmp_path / "out", motions[:1], ["arkit", "glb"], title="t", seed=0, figure=options
+        tmp_path / "out", motions[:1], ["arkit", "glb"], title="t", figure=options
     )  # fmt: skip
     assert [path.name for path in paths] == ["00-a-person-walks.glb", "00-a-person-walks_arkit.csv"]
     rows = np.loadtxt(paths[1], delimiter=",", skiprows=1)
@@ -131,7 +131,7 @@ def test_faces_are_written_as_arkit_weights_by_the_users_bases(
     np.testing.assert_allclose(rows[0, 1:], reference, atol=1e-3)
     assert len(pygltflib.GLTF2().load(paths[0]).meshes[1].primitives[0].targets) == 52
     with pytest.raises(UserError, match="makes no face"):
-        write_motions(tmp_path / "no", motions, ["arkit"], title="t", seed=0)
+        write_motions(tmp_path / "no", motions, ["arkit"], title="t")
 
 
 def test_planted_feet_say_what_they_cost(

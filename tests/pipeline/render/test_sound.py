@@ -127,7 +127,7 @@ def test_generated_motions_pass_their_scores_to_the_page(
         GeneratedMotion(Prompt(name), np.zeros((8, 623), np.float32), walk(8), None, layout) for name in "ab"
     ]
     scores = [Score(song(1.0), [0.1], [(0, 0.2, "walks")]), Score()]
-    write_motions(tmp_path / "out", motions, ["html"], title="t", seed=0, scores=scores)
+    write_motions(tmp_path / "out", motions, ["html"], title="t", scores=scores)
     data = data_of(tmp_path / "out" / "index.html")
     assert [m.get("sound") for m in data["motions"]] == [0, None]
     assert data["scores"][0]["segments"] == [[0, 0.2, "walks", "text"]]
