@@ -24,7 +24,7 @@ from motionloom.datasets.convert.registry import converter_named, names
 from motionloom.datasets.schema import MANIFEST_FILE, Manifest, UserError, nearest
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.options import Part
-from motionloom.pipeline.cli.options import AsJson, Commands, Workers, fields_of, print_json, set_option
+from motionloom.pipeline.cli.options import Commands, Workers, fields_of, set_option
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
 
@@ -65,8 +65,6 @@ class ConverterGroup(TyperGroup):
         """The command that `args` name; a misspelt one is answered with the nearest."""
         if args and args[0] not in names() and not args[0].startswith("-"):
             raise UserError(f"data convert {args[0]}: no such source{nearest(args[0], list(names()))}")
-        if "--json" in args:
-            raise UserError(f"give --json before the source: motionloom data convert --json {args[0]} …")
         return super().resolve_command(ctx, args)
 
 
@@ -78,33 +76,20 @@ convert_app = typer.Typer(
 )
 
 
-@convert_app.callback()
-def _convert(context: typer.Context, as_json: AsJson = False) -> None:
-    """Real motion capture to shards. Begin with --plan."""
-    context.obj = as_json
-
-
 def _command(name: str) -> Any:
     """The command of a converter: its arguments, its everyday fields, and how to run it."""
     entry = converter_named(name)
     config = entry.config_class
 
     def run(source: Path, out: Path, plan: bool, part: str | None, workers: int, sets: list[str] | None,
-            context: typer.Context, **everyday: Any) -> None:  # fmt: skip
-        as_json = bool(context.obj)
-        if as_json and not plan:
-            raise UserError("--json is for the plan: give --plan too")
+            **everyday: Any) -> None:  # fmt: skip
         settings = {key: value for key, value in everyday.items() if value is not None}
         settings |= fields_of(sets, "--set")
         fields = {**settings, "source": source}
-        console = make_console(aside=as_json)
         share = None if part is None else Part.parse(part)
-        convert_command(
-            name, fields, out, plan=plan, part=share, workers=workers, console=console, as_json=as_json
-        )
+        convert_command(name, fields, out, plan=plan, part=share, workers=workers, console=make_console())
 
     parameters = [
-        _parameter("context", typer.Context),
         _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),
         _parameter("out", Annotated[Path, typer.Argument(help="Folder for the shards.")]),
     ]
@@ -183,7 +168,6 @@ def convert_command(
     part: Part | None = None,
     workers: int,
     console: Console,
-    as_json: bool = False,
 ) -> None:
     """Plan a conversion, or run it."""
     from motionloom.datasets.convert.common.conversion import run_conversion
@@ -198,16 +182,13 @@ def convert_command(
         licensed = bool(conversion.converter.licence(planned))
         line = proposed(kind, config, out, planned, licensed=licensed) if planned.items else ""
         line += f" --part {part}" if part and line else ""
-        share = conversion.share(part) if part else {}
-        if as_json:
-            print_json(planned.dump() | {"command": line, "part": share, "moved": conversion.moved})
-        else:
-            _say_plan(planned, console)
-            if conversion.moved:
-                say(console, conversion.moved)
-            if part:
-                say(console, f"part {part}: {share['shards']:,} shards, {share['clips']:,} clips")
-            say(console, f"convert it: {line}" if line else "nothing of it can be converted")
+        _say_plan(planned, console)
+        if conversion.moved:
+            say(console, conversion.moved)
+        if part:
+            share = conversion.share(part)
+            say(console, f"part {part}: {share['shards']:,} shards, {share['clips']:,} clips")
+        say(console, f"convert it: {line}" if line else "nothing of it can be converted")
         return
     require_folder(out)
     conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown)

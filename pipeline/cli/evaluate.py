@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.cli.options import AsJson, At, Device, print_json
+from motionloom.pipeline.cli.options import At, Device
 from motionloom.pipeline.launch.console import make_console
-from motionloom.pipeline.launch.process import process_rank
 
 
 def evaluate(
@@ -32,7 +31,6 @@ def evaluate(
         ),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Markdown file for a table.")] = None,
-    as_json: AsJson = False,
 ) -> None:
     """Figures on the test split, each beside its trivial answer; with --table, beside a paper's.
 
@@ -44,8 +42,6 @@ def evaluate(
     """
     runs = run_folders or []
     if table is not None:
-        if as_json:
-            raise UserError("--json is of figures measured anew; leave it out")
         _show_table(table, runs, out, measuring=clips or repeats or at or device != "auto")
         return
     if out is not None:
@@ -55,15 +51,11 @@ def evaluate(
             f"{len(runs)} run folders to evaluate; name one, like: motionloom evaluate runs/NAME "
             f"(several only with --table)"
         )
-    from motionloom.pipeline.evaluation.figures import figures_in
     from motionloom.pipeline.runs.api import evaluate_run
 
-    console = make_console(aside=as_json)
-    folder = evaluate_run(
-        runs[0], at=at, clips=clips, repeats=repeats, device=device, share=True, console=console
+    evaluate_run(
+        runs[0], at=at, clips=clips, repeats=repeats, device=device, share=True, console=make_console()
     )
-    if as_json and process_rank() == 0:
-        print_json(figures_in(folder))
 
 
 def _show_table(table: str, runs: list[Path], out: Path | None, *, measuring: object) -> None:

@@ -225,14 +225,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def figures_in(folder: Path) -> dict[str, Any]:
-    """The files of an evaluation by their folders, relative to `folder`: what `evaluate --json` prints."""
-    return {
-        path.relative_to(folder).with_suffix("").as_posix(): json.loads(path.read_text(encoding="utf-8"))
-        for path in sorted(folder.rglob(FILE_NAME))
-    }
-
-
 def figure_tables(figures: Iterable[Figure]) -> list[TableRows]:
     """A table for each group of figures; the terminal and the report show the same ones."""
     groups: dict[str, list[Figure]] = {}

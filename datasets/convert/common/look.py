@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -176,9 +176,6 @@ class Look:
     @property
     def clips(self) -> int:
         return sum(subset.clips for subset in self.subsets)
-
-    def dump(self) -> dict[str, object]:
-        return asdict(self)
 
     def table(self) -> Table:
         of = "" if len(self.subsets) == self.all_subsets else f" ({len(self.subsets)} of {self.all_subsets})"

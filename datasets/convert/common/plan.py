@@ -212,27 +212,6 @@ class ConversionPlan(Generic[C]):
             table.add_row("stops here", "", "", escape(self.stop))
         return table
 
-    def dump(self) -> dict[str, object]:
-        left: dict[str, list[dict[str, str]]] = {
-            name: [{"source": drop.source, "reason": drop.reason} for drop in drops]
-            for name, drops in (
-                ("missing", self.missing), ("rejected", [*self.rejected, *self.dropped]),
-                ("unreadable", self.broken),
-            )
-        }  # fmt: skip
-        return {
-            "name": self.name,
-            "found": self.found,
-            "clips": dict(self.counts()),
-            "frames": dict(self.frames),
-            **left,
-            "uncaptioned": list(self.uncaptioned),
-            "notes": list(self.notes),
-            "licences": dict(self.licences),
-            "bytes_needed": self.bytes_needed,
-            "look": None if self.look is None else self.look.dump(),
-        }
-
     def left_out(self) -> list[Dropped]:
         return [
             *(drop.model_copy(update={"kind": "missing"}) for drop in self.missing),

@@ -208,11 +208,11 @@ def test_parts_are_planned_made_and_joined(tmp_path: Path, call: Call) -> None:
     words = ("data", "convert", "bvh", tmp_path / "mocap", "--licence", "CC0", "--workers", 1)
     splits, out, whole = ("--set", f"splits={tmp_path / 'splits'}"), tmp_path / "out", tmp_path / "whole"
     assert call("data", "join", tmp_path).code == 2 and call(*words, out, "--part", "3/2").code == 2
-    plan = json.loads(call(*words[:2], "--json", *words[2:], out, *splits, "--part", "1/2", "--plan").out)
-    assert plan["command"].endswith("--part 1/2") and not list(out.glob("*.tar"))
+    plan = call(*words, out, *splits, "--part", "1/2", "--plan").out.splitlines()
+    assert plan[-1].endswith("--part 1/2") and not list(out.glob("*.tar"))
     assert call(*words, out, *splits, "--part", "1/2").code == 0
     tars = [ShardIndex.load_json(path) for path in out.glob("*.index.json")]
-    assert plan["part"] == {"shards": len(tars), "clips": sum(len(tar.clips) for tar in tars)}
+    assert f"part 1/2: {len(tars)} shards, {sum(len(tar.clips) for tar in tars)} clips" in plan
     assert call(*words, out, *splits, "--set", "fps=10", "--part", "2/2").code == 0
     other = call("data", "join", out)
     assert other.code == 2 and "fps 20.0 -> 10.0" in other.err and not (out / "manifest.json").exists()
@@ -304,21 +304,6 @@ def test_a_check_of_shards(call: Call, shards: Path, damaged: Path) -> None:
     assert shown.code == 0 and found["problems"] == 0 and found["clips"] == 24 and "no problems" in shown.err
 
 
-def test_a_conversions_plan(call: Call, tmp_path: Path) -> None:
-    text = write_clip(tmp_path / "mocap" / "a.bvh", 1).read_text()
-    (tmp_path / "mocap/frame_time_zero.bvh").write_text(re.sub(r"Frame Time: .*", "Frame Time: 0.0", text))
-    words = ("data", "convert", "bvh", tmp_path / "mocap", tmp_path / "out", "--licence", "x")
-    words += ("--set", f"joint_map={write_map(tmp_path / 'map.json')}", "--workers", "1")
-    json_of = ("data", "convert", "--json", *words[2:])
-    plan = loaded(call(*json_of, "--plan").out)
-    assert sum(plan["clips"].values()) == 1 and "frame_time_zero.bvh" in json.dumps(plan["unreadable"])
-    assert call(*words, "--plan", "--json").code == 2
-    refused = call(*json_of)
-    assert refused.code == 2 and "give --plan too" in refused.err and not (tmp_path / "out").exists()
-    wrong = call(*words, "--set", "strict=true")
-    assert wrong.code == 2 and "'strict'" in wrong.err
-
-
 def test_info_the_version_and_a_table(call: Call) -> None:
     shown, facts = call("--version"), loaded(call("info", "--json").out)
     assert shown.code == 0 and shown.out == f"motionloom {facts['motionloom']}\n"
@@ -326,5 +311,3 @@ def test_info_the_version_and_a_table(call: Call) -> None:
     said = call("info").out
     for word in ("motionloom 0.", "torch 2.", "runs on:", "encoder: minilm", "humantomato-tiny", "bvh-body"):
         assert word in said
-    refused = call("evaluate", "--table", "list", "--json")
-    assert refused.code == 2 and "leave it out" in refused.err

@@ -101,7 +101,7 @@ def test_every_command(begun: Path, small_run: Any, tmp_path: Path, call: Callab
     assert before == sorted(begun.rglob("*"))
     with run_at(small_run.folder, "24") as folder:  # of a training that is finished
         assert_same(drawn(tmp_path / "model"), drawn(folder))
-    assert call("evaluate", begun, "--at", "newest", "--json").code == 0
+    assert call("evaluate", begun, "--at", "newest").code == 0
     assert call("report", begun, "--at", "newest").code == 0
     place = begun / "at/small-gpt-30"
     figures, finished = (
