@@ -45,8 +45,6 @@ class Started(Config):
     fingerprint: str
     training: TrainingFacts | None = None
     """None of a stage that trains nothing."""
-    request: str | None = None
-    """The request for which the stage is run again."""
     changed: tuple[Change, ...] = ()
     """Settings that have changed since the training began."""
 

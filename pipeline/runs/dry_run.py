@@ -218,7 +218,7 @@ def replaced_stages(run: Path, plan: Sequence[PlannedStage]) -> list[Replaced]:
     out = []
     for row in plan:
         folder, trained = stage_folder(run, row.stage.name), row.stage.kind.trains
-        if row.action != "run" or row.request is not None:
+        if row.action != "run" or row.again is not None:
             continue
         if Artifact.find(folder) is not None:
             seconds = _seconds(folder)

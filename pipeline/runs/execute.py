@@ -204,11 +204,14 @@ def _begin(recipe: Recipe, run: Path, plan: Sequence[PlannedStage]) -> None:
     with file_lock(run / LOCK_FILE):  # other jobs of the run write here too
         remove_temporaries(run)
         write_text(run / "recipe.yaml", recipe.to_yaml(run))
-        request = next((row.request for row in plan if row.request is not None), None)
-        if request is None:
-            (run / REQUEST_FILE).unlink(missing_ok=True)
+        asked = [row for row in plan if row.again is not None]
+        for row in asked:
+            if row.action == "run":
+                remove_tree(stage_folder(run, row.stage.name))
+        if asked:  # behind the removal: a command that is killed before this begins again
+            write_json(run / REQUEST_FILE, asked[0].again)
         else:
-            write_json(run / REQUEST_FILE, request.dump())
+            (run / REQUEST_FILE).unlink(missing_ok=True)
         for row in plan:
             if row.action == "skip":
                 row.stage.kind.settle(row.stage.config, stage_folder(run, row.stage.name))

@@ -7,15 +7,13 @@ else runs, and whatever is below it has another fingerprint and runs too.
 
 A training whose settings have changed may go on from its newest checkpoint (`continuation.py`).
 
-`--from` runs stages again. Until all of them are done the run folder keeps a note of that
-request, and each stage a note that it was begun for it, so the same command after a kill goes on instead of
-beginning again.
+`--from` runs stages again: what they made is removed as the run begins, and the run folder notes the
+selection until all of them are done, so that the same command after a kill goes on, not begins again.
 """
 
 from __future__ import annotations
 
 import json
-import secrets
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +21,7 @@ from typing import Literal
 
 from motionloom.datasets.base.licences import UNKNOWN
 from motionloom.datasets.base.register import code_of
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import Every, Stage, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.continuation import Continuation, Started, continuation, training_facts
@@ -32,12 +30,12 @@ from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.runs.resolve import Tree
 from motionloom.pipeline.store.artifact import Artifact, InputStage, Terms
 from motionloom.pipeline.store.data import Data
-from motionloom.pipeline.store.files import fingerprint_of
+from motionloom.pipeline.store.files import fingerprint_of, read_record
 from motionloom.pipeline.store.run_folder import identity_of, stage_folder
 from motionloom.pipeline.store.yaml import flatten
 
 REQUEST_FILE = ".again.json"
-"""In the run folder, while stages are run again by request."""
+"""In the run folder, while stages are run again: the selection that names them."""
 
 Action = Literal["skip", "run", "resume", "leave"]
 
@@ -52,13 +50,6 @@ class Selection:
     """Stop after this stage: only it and what it needs. Several with commas between them."""
 
 
-class Request(Config):
-    """`.again.json`: which command asked for stages to be run again."""
-
-    id: str
-    select: dict[str, str | None]
-
-
 @dataclass(frozen=True)
 class PlannedStage:
     """One row of the plan."""
@@ -68,8 +59,8 @@ class PlannedStage:
     reason: str
     started: Started
     """Content of `started.json` in the stage's folder."""
-    request: Request | None
-    """The request for which the stage is run again: the selection names it (`--from`)."""
+    again: Mapping[str, str | None] | None
+    """The selection by which the stage is run again (`--from`)."""
     identities: Mapping[str, str]
     """Identities of its inputs from outside when the plan was made."""
     code: Mapping[str, str]
@@ -97,23 +88,17 @@ def make_plan(
             raise UserError(f"--go-on {name}: this stage trains nothing; name one that does")
         if name in forced:
             raise UserError(f"--go-on {name} --from {select.first}: the latter begins it anew; leave one out")
-    request, done = _request(run, select, forced) if forced else (None, set())
+    goes_on_again = _begun_again(run, select, forced)
     rows: dict[str, PlannedStage] = {}
     # In the recipe's order, since a fingerprint needs those of the inputs.
     for stage in recipe.stages:
         require_elsewhere(run, stage, recipe.outside)
         facts, folder = _facts(recipe, stage, rows), stage_folder(run, stage.name)
-        before, again = Started.find(folder), request if stage.name in forced else None
-        started = Started(
-            fingerprint=fingerprint_of(facts),
-            training=training_facts(stage, facts),
-            request=None if again is None else again.id,
-        )
-        # A request overrules the fingerprints, until this stage is done for it.
-        if again is not None and stage.name not in done:
-            action, reason = _decide_again(started, before, select)
-        else:
-            action, reason = _decide(recipe, stage, started, before, folder, rows, forced)
+        before, again = Started.find(folder), asdict(select) if stage.name in forced else None
+        started = Started(fingerprint=fingerprint_of(facts), training=training_facts(stage, facts))
+        action, reason = _decide(recipe, stage, started, before, folder, rows)
+        if again is not None and not goes_on_again:
+            action, reason = "run", f"from {select.first}"
         changed = before.changed if before is not None and action == "resume" else ()
         goes_on: Continuation | str | None = None
         if before is not None and action == "run" and again is None:
@@ -187,28 +172,12 @@ def _fingerprint(recipe: Recipe, name: str, rows: Mapping[str, PlannedStage]) ->
     return str(identity_of(recipe.outside[name].folder))
 
 
-def _request(run: Path, select: Selection, forced: set[str]) -> tuple[Request, set[str]]:
-    """The request of this command, begun before or now, and the stages that are done for it."""
-    path, selection = run / REQUEST_FILE, asdict(select)
-    if path.is_file():
-        request = Request.load_json(path)
-        if request.select == selection:
-            done = {name for name in forced if _done(stage_folder(run, name), request)}
-            if done != forced:
-                return request, done
-    return Request(id=secrets.token_hex(8), select=selection), set()
-
-
-def _done(folder: Path, request: Request) -> bool:
-    started = Started.find(folder)
-    return started is not None and started.request == request.id and Artifact.find(folder) is not None
-
-
-def _decide_again(started: Started, before: Started | None, select: Selection) -> tuple[Action, str]:
-    """The action of a stage that must run again and has not yet."""
-    reason = f"from {select.first}"
-    same = before and (before.request, before.fingerprint) == (started.request, started.fingerprint)
-    return ("resume", f"{reason}; started earlier, not finished") if same else ("run", reason)
+def _begun_again(run: Path, select: Selection, forced: set[str]) -> bool:
+    """Whether this very selection has begun to run stages again, and some of them are not done."""
+    note = run / REQUEST_FILE
+    if not note.is_file() or read_record(note) != asdict(select):
+        return False
+    return any(Artifact.find(stage_folder(run, name)) is None for name in forced)
 
 
 def _decide(
@@ -218,7 +187,6 @@ def _decide(
     before: Started | None,
     folder: Path,
     rows: Mapping[str, PlannedStage],
-    forced: set[str],
 ) -> tuple[Action, str]:
     artifact = Artifact.find(folder)
     if artifact is None or artifact.fingerprint != started.fingerprint:
@@ -232,9 +200,6 @@ def _decide(
     gone = artifact.missing(folder)
     if gone:
         return "run", f"output {gone} is gone or has another size"
-    above = [n for n in stage.inputs.values() if n in forced and rows[n].action in {"run", "resume"}]
-    if above:
-        return "run", f"below {above[0]}"
     return "skip", "finished"
 
 
