@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 import typer
 from bvh_clips import write_clip, write_map
+from program import commands
 from rich.console import Console
 
 from motionloom.datasets.convert.registry import converters
@@ -34,15 +35,7 @@ Call = Callable[..., Any]
 ROOT = Path(__file__).parents[3]
 
 
-def commands(group: Any, *path: str) -> list[tuple[str, ...]]:
-    """Every command of the program as its words."""
-    if not hasattr(group, "list_commands"):
-        return [path]
-    names = group.list_commands(None)
-    return [found for name in names for found in commands(group.get_command(None, name), *path, name)]
-
-
-COMMANDS = commands(typer.main.get_command(app))
+COMMANDS = dict(commands())
 
 
 def text_of(out: str) -> str:
@@ -59,10 +52,7 @@ OTHERS = {
 
 def test_every_option_and_setting_that_a_string_of_the_sources_names_exists() -> None:
     known = {f"--{name}" for names in OTHERS.values() for name in names.split()}
-    for words in COMMANDS:
-        command: Any = typer.main.get_command(app)
-        for word in words:
-            command = command.get_command(None, word)
+    for command in COMMANDS.values():
         known |= {option for each in command.params for option in (*each.opts, *each.secondary_opts)}
     known |= {option for each in typer.main.get_command(app).params for option in each.opts}
     configs = [kind.config_class for kind in converters()] + [SynthConfig, ServeConfig]

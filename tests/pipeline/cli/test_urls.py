@@ -9,24 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.main import get_command
+from program import commands
 
 from motionloom.datasets.base.register import discover
 from motionloom.datasets.convert.registry import converter_named, names
 from motionloom.datasets.schema import Config, UserError
-from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.contract.stage import stage_kinds
 from motionloom.pipeline.stages.data.data import ShardsStageConfig
 
 URL = "s3://bucket/x"
-
-
-def commands(command: Any, name: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
-    if not hasattr(command, "list_commands"):
-        yield name, command
-        return
-    for each in command.list_commands(None):
-        yield from commands(command.get_command(None, each), (*name, each))
 
 
 def is_place(parameter: Any) -> bool:
@@ -38,7 +29,7 @@ def is_place(parameter: Any) -> bool:
 def calls() -> Iterator[list[str]]:
     """Each command once for each of its places, the others being harmless."""
     discover()
-    for name, command in commands(get_command(app)):
+    for name, command in commands():
         for place in command.params:
             if not is_place(place):
                 continue

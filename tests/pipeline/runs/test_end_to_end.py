@@ -228,16 +228,3 @@ def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..
     done = call("report", copy, "-o", page)
     assert done.code == 0 and done.out.strip() == str(page)
     assert "Figures on held-out clips" in page.read_text()
-
-
-def test_alignment_works_with_the_sentence_prior_too(
-    copy: Path, small_run: Any, call: Callable[..., Any]
-) -> None:
-    change = ("--set", "gpt.prior=sentence", "--until", "gpt")
-    refused = call("run", small_run.recipe, "--out", copy, *change)
-    assert refused.code == 2 and "  gpt: " in refused.err and "prior tma -> sentence" in refused.err
-    done = call("run", small_run.recipe, "--out", copy, *change, "--replace")
-    assert done.code == 0, done.out
-    log = [json.loads(line) for line in (copy / "stages/gpt/metrics.jsonl").read_text().splitlines()]
-    assert all(row["val/align"] > 0 for row in log if "val/align" in row) and log
-    assert any("val/align" in row for row in log)
