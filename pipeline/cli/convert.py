@@ -7,11 +7,15 @@ never differ. The few fields of `config.everyday` have an option too. A converte
 
 from __future__ import annotations
 
+import ast
 import inspect
 import json
 import shlex
 import typing
+from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
+from textwrap import dedent
 from typing import Annotated, Any, Literal
 
 import typer
@@ -21,7 +25,7 @@ from typer.core import TyperGroup
 from typer.main import get_command
 
 from motionloom.datasets.convert.registry import converter_named, names
-from motionloom.datasets.schema import MANIFEST_FILE, Manifest, UserError, nearest
+from motionloom.datasets.schema import MANIFEST_FILE, Config, Manifest, UserError, nearest
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.options import Part
 from motionloom.pipeline.cli.options import Commands, Workers, fields_of, set_option
@@ -80,6 +84,7 @@ def _command(name: str) -> Any:
     """The command of a converter: its arguments, its everyday fields, and how to run it."""
     entry = converter_named(name)
     config = entry.config_class
+    docs = field_docs(config)
 
     def run(source: Path, out: Path, plan: bool, part: str | None, workers: int, sets: list[str] | None,
             **everyday: Any) -> None:  # fmt: skip
@@ -90,18 +95,18 @@ def _command(name: str) -> Any:
         convert_command(name, fields, out, plan=plan, part=share, workers=workers, console=make_console())
 
     parameters = [
-        _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source"))]),
+        _parameter("source", Annotated[Path, typer.Argument(help=_help(config, "source", docs))]),
         _parameter("out", Annotated[Path, typer.Argument(help="Folder for the shards.")]),
     ]
     for key in config.everyday:
-        option = typer.Option(_flag(key), help=_help(config, key))
+        option = typer.Option(_flag(key), help=_help(config, key, docs))
         kind: Any = config.model_fields[key].annotation
         kind = list[str] | None if typing.get_origin(kind) is tuple else kind  # given again for each
         parameters.append(_parameter(key, Annotated[kind, option], None))
     parameters += [_parameter(key, kind, default) for key, (kind, default) in _RUN_OPTIONS.items()]
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    listed = "\n".join(f"- `{key}`: {_help(config, key)}" for key in _settings(config))
+    listed = "\n".join(f"- `{key}`: {_help(config, key, docs)}" for key in _settings(config))
     run.__doc__ = (
         f"{entry.summary}\n\nExample: `motionloom data convert {name} {entry.example} --plan`\n\n"
         f"In eight parts: `motionloom data convert {name} … --part 1/8` to `--part 8/8`, in any order on "
@@ -127,10 +132,26 @@ def _settings(config: type[ConvertConfig]) -> list[str]:
     return [key for key in config.model_fields if key not in ("source", *config.everyday)]
 
 
-def _help(config: type[ConvertConfig], key: str) -> str:
+def field_docs(config: type[ConvertConfig]) -> dict[str, str]:
+    """The docstrings of a config's fields; a class that gives a field another default may leave its out.
+
+    Read from the source where help is made: pydantic would read it whenever the class is imported.
+    """
+    docs = {}
+    for base in reversed(config.__mro__):
+        if not issubclass(base, Config):
+            continue
+        body = ast.parse(dedent(inspect.getsource(base))).body[0]
+        for field, text in pairwise(getattr(body, "body", ())):
+            value = getattr(getattr(text, "value", None), "value", None)
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(value, str):
+                docs[ast.unparse(field.target)] = " ".join(value.split())
+    return docs
+
+
+def _help(config: type[ConvertConfig], key: str, docs: Mapping[str, str]) -> str:
     """The field's docstring, with the words that it takes and its default."""
-    field = config.model_fields[key]
-    text = " ".join((field.description or "").split())
+    field, text = config.model_fields[key], docs.get(key, "")
     if choices := _choices(field.annotation):
         text += f" One of: {', '.join(choices)}."
     default = field.get_default(call_default_factory=True)

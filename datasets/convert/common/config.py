@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar, get_args
 
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
 from motionloom.datasets.convert.common.facts import parse_where
@@ -19,7 +19,6 @@ END_TOLERANCE = 0.5
 class ConvertConfig(Config):
     """Options that every converter has. The docstrings of the fields are the command line's help."""
 
-    model_config = ConfigDict(use_attribute_docstrings=True)
     layouts: ClassVar[tuple[str, ...]] = LAYOUTS
     """Layouts that can be made from the source."""
     everyday: ClassVar[tuple[str, ...]] = ()
@@ -53,19 +52,6 @@ class ConvertConfig(Config):
     most_rejected: float = Field(default=0.5, ge=0, le=1, json_schema_extra={"runtime": True})
     """Share of the clips that may turn out unreadable or unfit; a conversion that loses more fails, although
     what is left of it is written."""
-
-    @classmethod
-    def __pydantic_init_subclass__(cls, **_: object) -> None:
-        """Let fields to which a subclass gives another default keep their docstrings."""
-        docs: dict[str, str] = {}
-        for base in reversed(cls.__mro__):
-            fields = getattr(base, "model_fields", {})
-            docs |= {key: field.description for key, field in fields.items() if field.description}
-        bare = [key for key, field in cls.model_fields.items() if not field.description and key in docs]
-        for key in bare:
-            cls.model_fields[key].description = docs[key]
-        if bare:
-            cls.model_rebuild(force=True)
 
     @field_validator("*")
     @classmethod

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
@@ -108,6 +107,8 @@ class EditFrames:
 
     def to_world(self, figure: RigidMotion) -> RigidMotion:
         """A figure in the clip's world, the floor at height 0."""
+
+        from scipy.spatial.transform import Rotation  # not with every command
 
         def put(points: NDArray[np.float64]) -> NDArray[np.float64]:
             plane = ground(points) * np.exp(1j * self.turn) + self.origin

@@ -6,8 +6,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from pydantic import ConfigDict
-
 from motionloom.datasets.convert.captions.options import digest_of
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
@@ -23,10 +21,7 @@ from motionloom.pipeline.store.data import SHARDS
 def _stage_config(kind: type[AnyConverter]) -> type[StageConfig]:
     """A class that stands in this module, so that worker processes of a conversion can unpickle it."""
     name, bases = f"{kind.__name__}StageConfig", (kind.config_class, StageConfig)
-    # Fields have their docstrings from the converter's class; looking for them again takes longest of all.
-    settings = ConfigDict(use_attribute_docstrings=False)
-    space = {"__doc__": kind.summary, "__module__": __name__, "model_config": settings}
-    stage_config = type(name, bases, space)
+    stage_config = type(name, bases, {"__doc__": kind.summary, "__module__": __name__})
     globals()[name] = stage_config
     return stage_config
 
