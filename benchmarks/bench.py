@@ -160,14 +160,22 @@ def report(
 def table_of(record: Record) -> str:
     """A record as Markdown, with its protocol below."""
     columns = record["columns"]
-    head = [record.get("corner", ""), *(column["title"] for column in columns)]
+    head = [record.get("corner", ""), *(_title(column, record["rows"]) for column in columns)]
     lines = []
     for row in record["rows"]:
         cells = [shown(row["cells"].get(column["figure"], ""), column) for column in columns]
         count = len(row.get("seeds", []))
         short = f" ({count} seed{'s' * (count > 1)})" if 0 < count < len(SEEDS) else ""
-        lines.append([row["title"] + short, *cells])
+        variant = f" [{', '.join(row['variant'])}]" if row.get("variant") else ""
+        lines.append([row["title"] + variant + short, *cells])
     return markdown(head, lines) + _protocol(record)
+
+
+def _title(column: Mapping[str, Any], rows: Sequence[Record]) -> str:
+    """A column's title, with the candidates among which the rows were measured."""
+    found = (row.get("candidates", {}).get(column["figure"]) for row in rows)
+    among = dict.fromkeys(str(one) for one in found if one is not None)
+    return str(column["title"]).format(candidates=" and ".join(among) or "not recorded")
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -193,15 +201,15 @@ def _protocol(record: Record) -> str:
     undrawn = [row["title"] for row in record["rows"] if not row.get("seeds") and row["title"] in each]
     for title in undrawn:  # recordings and nearest clips, of which sampling settings say nothing
         each[title] = {key: value for key, value in each[title].items() if not key.startswith("sampling.")}
-    common = {
-        key: value
-        for key, value in next(iter(each.values())).items()
-        if all(own.get(key, value if title in undrawn else None) == value for title, own in each.items())
-    }
+    first = next(iter(each.values()))
+    common = {key: value for key, value in first.items() if all(
+        own.get(key, value if title in undrawn else None) == value for title, own in each.items()
+    )}  # fmt: skip
     groups: dict[str, list[str]] = defaultdict(list)
     for title, own in each.items():
         groups[_facts({k: v for k, v in own.items() if k not in common})].append(title)
-    parts = [_facts(common)] + [f"{' and '.join(titles)}: {own}" for own, titles in groups.items() if own]
+    parts = [_facts(common), *(f"{' and '.join(titles)}: {own}" for own, titles in groups.items() if own)]
+    parts.append(record.get("completed", ""))
     return f"\n\n*Measured {record.get('measured', 'now')}: {'; '.join(part for part in parts if part)}.*"
 
 

@@ -1,7 +1,7 @@
 """Fill the tables of `docs/results.md` from the records in `benchmarks/records`.
 
     python benchmarks/results.py                     # updates docs/results.md
-    python benchmarks/results.py --collect WORK/run  # first makes records of a run of ude_ingredients.py
+    python benchmarks/results.py --collect RUN...    # first makes records of runs of one recipe
 
 A record is a table: its title, day, commit, command, protocol, columns, and rows whose cells are values, one
 a seed, or text (`imported`: of an earlier journal, not measured again). Several values are shown as their
@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from bench import HERE, RECORDS, SEEDS, Column, Record, arguments, command_line, report, table_of
 
+from motionloom.pipeline.contract.stage import stage_kinds
 from motionloom.pipeline.evaluation.figures import (
     FILE_NAME,
     MODEL,
@@ -29,6 +30,8 @@ from motionloom.pipeline.evaluation.figures import (
     RECORDED,
     FigureFile,
 )
+from motionloom.pipeline.store.run_state import finished_records
+from motionloom.pipeline.store.yaml import flatten
 
 PAGE = HERE.parent / "docs" / "results.md"
 TABLE = re.compile(r"(<!--(\w+)-->\n)(?:\|.*\n)*(?:\n\*Measured .*\n)?")
@@ -44,14 +47,10 @@ class Table(NamedTuple):
 
 
 TEXT = (
-    Column("Top-1 among 61, %", "tma.top-1", 1, 100),
-    Column("FID_k", "movement.fid_k"),
-    Column("FID_m", "movement.fid_m"),
-    Column("Div_k", "movement.div_k", 2),
-    Column("Div_m", "movement.div_m", 2),
-    Column("MM_k", "movement.mm_k", 2),
-    Column("MM_m", "movement.mm_m", 2),
-)
+    Column("Top-1 among {candidates}, %", "tma.top-1", 1, 100),
+    *(Column(f"{name}_{kind}", f"movement.{name.lower()}_{kind}", digits)
+      for name, digits in (("FID", 1), ("Div", 2), ("MM", 2)) for kind in "km"),
+)  # fmt: skip
 MUSIC = (Column("Beat Align", "beat_align.bailando", 3), *TEXT[1:])
 ANSWERS = {"recorded": RECORDED, "nearest training caption": NEAREST_WORDS}
 VARIANTS = {
@@ -68,21 +67,16 @@ ADVERSARIAL = {
     "weight 1, spectral norm": "adv1sn",
     "weight 1 (the paper)": "adv1",
 }
-RIVALS = {
-    "T2M-GPT": "evaluate_t2m",
-    "TEMOS": "evaluate_temos",
-    "MDM": "evaluate_mdm",
-    "MLD": "evaluate_mld",
-    "MotionDiffuse": "evaluate_motiondiffuse",
-    "HumanTOMATO": "evaluate",
-}
-RIVALS_TEXT = {
-    "TEMOS": "evaluate_temos",
-    "MotionCLIP": "evaluate_motionclip",
-    "TM2T": "evaluate_tm2t",
-    "UDE": "evaluate",
-}
-RIVALS_MUSIC = {"FACT": "evaluate_fact", "Bailando": "evaluate_bailando", "UDE": "evaluate_dances"}
+
+
+def _evaluated(*methods: str) -> dict[str, str]:
+    return {name: f"evaluate_{name.lower()}" for name in methods}
+
+
+RIVALS = {"T2M-GPT": "evaluate_t2m", **_evaluated("TEMOS", "MDM", "MLD", "MotionDiffuse"),
+          "HumanTOMATO": "evaluate"}  # fmt: skip
+RIVALS_TEXT = {**_evaluated("TEMOS", "MotionCLIP", "TM2T"), "UDE": "evaluate"}
+RIVALS_MUSIC = {**_evaluated("FACT", "Bailando"), "UDE": "evaluate_dances"}
 
 
 def _of(prefix: str, stages: Mapping[str, str], answers: Mapping[str, str]) -> dict[str, tuple[str, str]]:
@@ -106,7 +100,7 @@ TABLES = {
         (
             Column("FID", "evaluator.fid", 2),
             Column("R-Precision, top 3", "evaluator.top-3", 3),
-            Column("TMA-R-Precision (32), top 3", "tma.m2t_r3", 3),
+            Column("TMA-R-Precision ({candidates}), top 3", "tma.m2t_r3", 3),
             Column("Matching", "evaluator.matching_score", 2),
             Column("MModality", "evaluator.multimodality", 2),
             Column("everything right, %", "agreement.everything", 0, 100),
@@ -134,7 +128,7 @@ TABLES = {
         "CMU's clips and words: UDE",
         _of("", {"generated": "evaluate"}, ANSWERS),
         (
-            Column("R@1 among 9, text to motion", "tma.t2m_r1", 2),
+            Column("R@1 among {candidates}, text to motion", "tma.t2m_r1", 2),
             Column("Matching", "tma.matching_score", 2),
             Column("FID (TMA)", "tma.fid", 0),
             Column("FID_k", "movement.fid_k", 0),
@@ -172,7 +166,6 @@ TABLES = {
         ),
     ),
 }  # fmt: skip
-INGREDIENTS = "python benchmarks/ude_ingredients.py CLIPS WORK"
 COMMANDS = {
     "dances": "motionloom run ude-dance",
     "mocap_cmu": "motionloom run mocap-cmu",
@@ -182,20 +175,39 @@ COMMANDS = {
 """The command that was run before `--collect`; otherwise the script of UDE's ingredients."""
 
 
-def collect(run: Path, names: Iterable[str]) -> None:
-    """Write a record of each of these tables of which a stage has finished."""
+PROTOCOL = ("split", "clips", "songs", "repeats", "decodings", "lengths", "seed_motion", "reference", "steps")
+"""Facts that a record keeps, beside settings of sampling; steps are those of the training."""
+
+
+def collect(runs: Sequence[Path], names: Iterable[str]) -> None:
+    """Write a record of each of these tables of which a stage has finished, one value for each run."""
     for name in names:
         table = TABLES[name]
-        rows = [row for row in (row_of(run, table, title) for title in table.rows) if row["cells"]]
-        if rows:
-            report(table.title, table.columns, rows, name, COMMANDS.get(name, INGREDIENTS))
+        rows = [merged([row_of(run, table, title) for run in runs]) for title in table.rows]
+        if rows := [row for row in rows if row["cells"]]:
+            command = COMMANDS.get(name, "python benchmarks/ude_ingredients.py CLIPS WORK")
+            report(table.title, table.columns, rows, name, command + f", {len(runs)} runs" * (len(runs) > 1))
+
+
+def merged(rows: Sequence[Record]) -> Record:
+    """One row of those of several runs: their values and seeds in turn; facts that differ, joined."""
+    rows = [row for row in rows if row["cells"]] or list(rows[:1])
+    out = rows[0] | {"seeds": [seed for row in rows for seed in row["seeds"]], "cells": {}}
+    for row in rows:
+        for figure, values in row["cells"].items():
+            out["cells"].setdefault(figure, []).extend(values)
+    for key in ("candidates", "protocol"):
+        names = dict.fromkeys(name for row in rows for name in row[key])
+        facts = {name: dict.fromkeys(row[key].get(name) for row in rows) for name in names}
+        out[key] = {k: next(iter(v)) if len(v) == 1 else " and ".join(map(str, v)) for k, v in facts.items()}
+    return out
 
 
 def row_of(run: Path, table: Table, title: str) -> Record:
     """The cells of a row, one value for each seed that has finished, and how it was measured."""
     stage, row = table.rows[title]
     cells: dict[str, list[float]] = {}
-    seeds, protocol = [], {}
+    seeds, protocol, candidates, variant = [], {}, {}, list[str]()
     for seed in SEEDS if row == MODEL else SEEDS[:1]:
         folder = run / "stages" / f"{stage}_{seed}"
         if seed == SEEDS[0] and (run / "stages" / stage).is_dir():  # of a recipe that has one
@@ -203,17 +215,31 @@ def row_of(run: Path, table: Table, title: str) -> Record:
         if not (folder / "artifact.json").is_file():
             continue
         found = FigureFile.read(folder / FILE_NAME) if (folder / FILE_NAME).is_file() else None
-        seeds.append(seed)
+        seeds.append(found.about.get("seed", seed) if found else seed)
         for column in table.columns:
             value = logged(run, stage, seed, column) if row == MODEL else None
             figure = found.of(column.figure, row) if found else None
             if figure is not None:
                 value, protocol = figure.value, {**protocol, **figure.protocol}
+                if "candidates" in figure.protocol:
+                    candidates[column.figure] = figure.protocol["candidates"]
             if value is not None:
                 cells.setdefault(column.figure, []).append(value)
-    shown = ("split", "clips", "songs", "repeats", "decodings")
-    drawn = {k: v for k, v in protocol.items() if k in shown or k.startswith("sampling")}
-    return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], "protocol": drawn}
+        if found and row == MODEL:
+            model = finished_records(run).get(found.about.get("made_by", {}).get("generator", ""))
+            protocol |= {"steps": flatten(model.config if model else {}).get("train.steps", "not recorded")}
+            variant = unlike_published(model.kind, model.config) if model else []
+    kept = [name for name in protocol if name in PROTOCOL or name.startswith("sampling")]
+    drawn = {name: protocol[name] for name in kept if protocol[name] is not None}
+    facts = {"protocol": drawn, "candidates": candidates, "variant": variant}
+    return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], **facts}
+
+
+def unlike_published(kind: str, config: Mapping[str, object]) -> list[str]:
+    """Choices of a network, sizes aside, other than its kind's and the published norm behind the sums."""
+    usual, own = flatten(stage_kinds()[kind].config().dump()) | {"net.norm": "post"}, flatten(config)
+    chosen = [key for key in own if key.startswith("net.") and usual.get(key) != own[key]]
+    return [f"{key.split('.')[-1]} {own[key]}".lower() for key in chosen if isinstance(own[key], str | bool)]
 
 
 def logged(run: Path, stage: str, seed: int, column: Column) -> float | None:
@@ -232,19 +258,14 @@ def page(text: str, records: Mapping[str, Record]) -> str:
     return TABLE.sub(lambda found: found[1] + table_of(records[found[2]]) + "\n", text)
 
 
-def read_records() -> dict[str, Record]:
-    return {
-        path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(RECORDS.glob("*.json"))
-    }
-
-
 def rendered() -> str:
-    return page(PAGE.read_text(encoding="utf-8"), read_records())
+    records = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in RECORDS.glob("*.json")}
+    return page(PAGE.read_text(encoding="utf-8"), records)
 
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("--collect", type=Path, help="the folder of a run")
+    parser.add_argument("--collect", type=Path, nargs="+", help="folders of runs of one recipe")
     parser.add_argument(
         "--tables", nargs="+", choices=TABLES, default=list(TABLES), help="which records are made of it"
     )

@@ -152,6 +152,33 @@ def test_no_figure_is_typed_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not re.findall(r"\d+\.\d+|\d ?%|±.?\d|\d ?mm\b", words)
 
 
+def test_titles_say_what_records_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Candidates in titles and variants in names of rows are the record's; each drawn row says how it was."""
+    results = loaded(FOLDER / "results.py", monkeypatch)
+    for name, table in results.TABLES.items():
+        record = json.loads((results.RECORDS / f"{name}.json").read_text(encoding="utf-8"))
+        assert [one["title"] for one in record["columns"]] == [column.title for column in table.columns]
+        assert not any(re.search(r"among \d|\(\d", column.title) for column in table.columns)
+        assert "not recorded" not in results.table_of(record).splitlines()[0], name
+        for row in record["rows"]:
+            asked = {one.figure for one in table.columns if "{candidates}" in one.title} & row["cells"].keys()
+            assert asked <= row.get("candidates", {}).keys(), (name, row["title"])
+            if name.startswith("rivals") and row["seeds"]:
+                assert {"steps", "repeats", "clips"} <= row["protocol"].keys(), (name, row["title"])
+                assert "lengths" in row["protocol"] or name == "rivals_ude_music"
+    column, run = {"title": "R ({candidates})", "figure": "r", "digits": 1, "scale": 1.0}, {"title": "MDM"}
+    runs = [
+        {**run, "cells": {"r": [value]}, "seeds": [seed], "variant": ["norm pre"], "candidates": {"r": 32},
+         "protocol": {"clips": clips}} for value, seed, clips in ((1.0, 7, 97), (3.0, 1, 95))
+    ]  # fmt: skip
+    page = results.table_of({"columns": [column], "rows": [results.merged(runs)]})
+    assert (
+        "| R (32) |" in page and "| MDM [norm pre] (2 seeds) | 2.0 ± " in page and "clips 97 and 95" in page
+    )
+    old = {**runs[0], "candidates": {}, "variant": []}
+    assert "| R (not recorded) |" in results.table_of({"columns": [column], "rows": [old]})
+
+
 def test_several_seeds_are_a_mean_with_its_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     results = loaded(FOLDER / "results.py", monkeypatch)
     column = {"title": "pose, mm", "figure": "pose", "digits": 1, "scale": 1.0}
