@@ -22,7 +22,7 @@ PROGRAM = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main"]
 
 def shards(run: Path) -> dict[Path, bytes]:
     data = run / "stages/data/shards"
-    found = (path for path in data.rglob("*") if path.is_file() and path.name != ".scan.json")
+    found = (path for path in data.rglob("*") if path.is_file())
     return {path.relative_to(data): path.read_bytes() for path in found}
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from motionloom.datasets import convert as _folder
 from motionloom.datasets.convert import sets as _sets
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, Conversion, moved_clips
+from motionloom.datasets.convert.common.conversion import Conversion, moved_clips
 from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter, Converter, PlanSettings
 from motionloom.datasets.convert.common.removed import Removed
 from motionloom.datasets.schema import REMOVED_FILE, UserError
@@ -67,23 +67,20 @@ def prepare(
     *,
     kind: type[AnyConverter] | None = None,
     out: Path | None = None,
-    maps: Path | None = None,
     workers: int = 1,
     progress: bool = False,
 ) -> Conversion[Any]:
     """Look at the whole source and decide what becomes of every file; nothing is converted yet.
 
-    `kind` is the converter, by default the one whose config it is. With `out`, the folder of the shards, a
-    source whose listing must read every file is read once and not again by the next run or by the other parts
-    of a conversion. Joint maps that are guessed are written into `maps`, by default `out`.
+    `kind` is the converter, by default the one whose config it is. Joint maps that are guessed are written
+    into `out`, the folder of the shards.
     """
     kind = kind or next((one for one in converters() if one.config_class is type(config)), None)
     if kind is None:
         raise UserError(f"no converter takes a {type(config).__name__}; register its converter, or name it")
-    converter, folder = kind(config), maps or out
-    scan = None if out is None else out / SCAN_FILE
-    plan = converter.plan(PlanSettings(workers, progress, scan, folder))
-    if folder is None:
+    converter = kind(config)
+    plan = converter.plan(PlanSettings(workers, progress, out))
+    if out is None:
         return Conversion(converter, plan)
-    plan.leave_removed(Removed.of(folder).has, REMOVED_FILE)
-    return Conversion(converter, plan, moved_clips(folder, plan))
+    plan.leave_removed(Removed.of(out).has, REMOVED_FILE)
+    return Conversion(converter, plan, moved_clips(out, plan))

@@ -107,6 +107,10 @@ def mirror(joints: NDArray[Float], skeleton: Skeleton) -> NDArray[Float]:
     return mirrored
 
 
+MOST_STRETCH = 100
+"""Frames that one frame becomes at most: 240 a second are made of 2.4 [ours]."""
+
+
 def resample(values: NDArray[Float], fps_in: float, fps_out: float) -> NDArray[Float]:
     """Linear resampling in time of [T, ...] from one frame rate to another; frame 0 stays at time 0.
 
@@ -150,6 +154,8 @@ def _source_frames(
         raise UserError(f"frame rates must be positive, not {fps_in} and {fps_out}")
     if frames == 0:
         raise UserError("a clip without frames cannot be resampled")
+    if fps_out > MOST_STRETCH * fps_in:  # a minute a frame in a header would fill the memory
+        raise UserError(f"{fps_in:.3g} frames a second are too few for {fps_out:g}; is the frame rate right?")
     count = int(np.floor((frames - 1) * fps_out / fps_in + 1e-6)) + 1
     at = np.arange(count) * fps_in / fps_out
     whole = np.round(at)

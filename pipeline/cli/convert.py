@@ -198,7 +198,7 @@ def convert_command(
     config = converter.config_class.parse(fields, f"data convert {kind}")
     shown = not console.quiet
     if plan:
-        conversion = prepare(config, kind=converter, maps=out, workers=workers, progress=shown).looked()
+        conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown).looked()
         planned = conversion.plan
         licensed = bool(conversion.converter.licence(planned))
         line = proposed(kind, config, out, planned, licensed=licensed) if planned.items else ""

@@ -123,12 +123,12 @@ def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped
     hands = layout.num_joints > BODY_JOINTS
     with TemporaryDirectory() as maps:
         try:
-            conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), maps=Path(maps))
+            conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), out=Path(maps))
         except UserError:
             if not hands:
                 raise
             hands, given["fingers"] = False, "missing"
-            conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), maps=Path(maps))
+            conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), out=Path(maps))
         plan, converter = conversion.plan, conversion.converter
         yield from (*plan.broken, *plan.rejected, *plan.dropped)
         clips = [clip for _, clip in plan.items]

@@ -113,10 +113,10 @@ class Aistpp(BodyRelease[AistppConfig]):
         music = self._music()
         here = sorted(path.stem for path in folder.glob("*.pkl") if path.name[0] != ".")
         for name in here:
-            try:
+            facts: dict[str, str] = {}
+            with draft.reading(f"{MOTIONS}/{name}.pkl"):
                 facts = _facts(name)
-            except UserError as error:
-                draft.fail(f"{MOTIONS}/{name}.pkl", error)
+            if not facts:
                 continue
             problem = "on the ignore list" if name in self.ignored else ""
             if self.config.has_band and facts["music"] not in TEMPI:
@@ -193,13 +193,12 @@ class Aistpp(BodyRelease[AistppConfig]):
         return replace(sample, meta=sample.meta.model_copy(update={"truth": truth}), audio=audio, wav=wav)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
-        return len(read_aist_motion(path, label).poses), FPS
+        return len(read_aist_motion(path, label)[0]), FPS
 
     def figure(self, clip: ReleaseClip) -> Figure:
         label = clip.entry.file
-        motion = read_aist_motion(self.path_of(label), label)
-        rotations = motion.poses.reshape(-1, SMPL_JOINTS, 3).astype(np.float64)
-        return Figure(rotations=rotations, trans=np.asarray(motion.metres(), dtype=np.float64))
+        poses, trans = read_aist_motion(self.path_of(label), label)
+        return Figure(rotations=poses.reshape(-1, SMPL_JOINTS, 3).astype(np.float64), trans=trans)
 
 
 def _facts(sequence: str) -> dict[str, str]:

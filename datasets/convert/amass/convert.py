@@ -7,7 +7,6 @@ files that may be used, but only for their headers and a few scalars.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -36,7 +35,7 @@ from motionloom.datasets.convert.common.features import (
     require_human,
     upright,
 )
-from motionloom.datasets.convert.common.files import check_id, inside
+from motionloom.datasets.convert.common.files import check_id, walk_files
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
@@ -268,26 +267,17 @@ class Amass(Release[AmassConfig]):
 
 
 def list_files(source: Path, draft: ConversionPlan[ReleaseClip]) -> list[str]:
-    """Paths of the motion files in the source, in name order; what cannot be opened goes to `draft.broken`.
+    """Paths of the motion files in the source, in name order; names that cannot be ids go to `draft.broken`.
 
     Files that hold the shape of a subject without motion (`shape.npz`, `..._stagei.npz`) are none.
     """
     labels: list[str] = []
-    for folder, folders, names in os.walk(source):
-        links = [name for name in folders if (Path(folder) / name).is_symlink()]
-        for name in (*names, *links):
-            relative = (Path(folder) / name).relative_to(source).as_posix()
+    for relative in walk_files(source):
+        name = relative.rsplit("/", 1)[-1]
+        if name.endswith(SUFFIX) and name != "shape.npz" and not name.endswith("_stagei.npz"):
             label = relative.encode("utf-8", "backslashreplace").decode()  # names may be any bytes
-            try:
-                if name in links:
-                    raise UserError("a link to a folder, which is not followed; put the folder in its place")
-                if name.endswith(SUFFIX) and name != "shape.npz" and not name.endswith("_stagei.npz"):
-                    check_id(relative, label)
-                    inside(source, relative).stat()
-                    labels.append(label)
-            except (UserError, OSError) as error:
-                draft.fail(label, error)
+            with draft.reading(label):
+                labels.append(check_id(relative, label))
     if not labels:
         raise UserError(f"{source}: no {SUFFIX} file with motion in it")
-    draft.broken.sort(key=lambda drop: drop.source)
-    return sorted(labels)
+    return labels

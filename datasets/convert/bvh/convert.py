@@ -18,7 +18,6 @@ from motionloom.datasets.convert.common.look import SourceJoints, named_unit
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.bvh.joint_map import JointMap, metres, skeleton_key
-from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
@@ -74,16 +73,13 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def joints(self, clip: BvhClip) -> SourceJoints:
         """The joints as the map reads them."""
-        motion = self._motion(clip)
-        joint_map = self._map_of(motion)
-        joints = self._world(clip, motion, joint_map)
+        joints, joint_map = self._world(clip)
         return SourceJoints(joints, clip.fps, mapped=True, up=joint_map.up or self.config.up)
 
     def encode(self, clip: BvhClip) -> NDArray[np.float32]:
         """Features [T', D] of a clip."""
-        config, motion = self.config, self._motion(clip)
-        joint_map = self._map_of(motion)
-        joints = self._world(clip, motion, joint_map)
+        config = self.config
+        joints, joint_map = self._world(clip)
         try:
             if len(self.layout.skeleton) > joints.shape[1]:
                 joints = with_resting_hands(joints)
@@ -94,13 +90,17 @@ class Bvh(Converter[BvhConfig, BvhClip]):
             unit, up = joint_map.unit or config.unit, joint_map.up or config.up
             raise UserError(f"{clip.label()}: {error} (read with unit '{unit}', up '{up}')") from None
 
-    def _world(self, clip: BvhClip, motion: BvhMotion, joint_map: JointMap) -> NDArray[np.float64]:
-        """Joints [T, N, 3] in metres, Y up, without an added first frame.
+    def _world(self, clip: BvhClip) -> tuple[NDArray[np.float64], JointMap]:
+        """Joints [T, N, 3] in metres, Y up, without an added first frame; and the map that reads them.
 
         Where the unit is settled by the skeleton's first clips and makes no person of this one's figure, but
         another known unit does, that one counts: writers of one skeleton may use several.
         """
-        config = self.config
+        config, motion = self.config, clip.read()
+        motion = replace(motion, values=motion.values[config.cut(clip.found.path)])
+        joint_map = self.maps.get(skeleton_key(motion.joints, motion.parents))
+        if joint_map is None:
+            raise UserError(f"{motion.name}: its skeleton has no joint map")
         unit = joint_map.unit or ("cm" if config.unit == "auto" else config.unit)
         up = "y" if config.up == "auto" else config.up
         joints = joint_map.apply(motion, unit=unit, up=up)
@@ -111,17 +111,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
                 joints *= metres(own) / metres(unit)
         added = added_frames(joints)
         if clip.span is None:
-            return joints[added:]
+            return joints[added:], joint_map
         # The index counts the recording's own frames: one is the writer's, those after it are only blended.
         first, last = clip.span
-        return joints[min(added, 1) :][max(first, added - 1) : last]
-
-    def _motion(self, clip: BvhClip) -> BvhMotion:
-        motion = clip.read()
-        return replace(motion, values=motion.values[self.config.cut(clip.found.path)])
-
-    def _map_of(self, motion: BvhMotion) -> JointMap:
-        try:
-            return self.maps[skeleton_key(motion.joints, motion.parents)]
-        except KeyError:
-            raise UserError(f"{motion.name}: its skeleton has no joint map") from None
+        return joints[min(added, 1) :][max(first, added - 1) : last], joint_map

@@ -33,7 +33,7 @@ from motionloom.datasets.convert.common.facts import Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.scan import FoundFile, Scan, list_files, read_file, scan_files
+from motionloom.datasets.convert.common.scan import FoundFile, list_files, read_file, scan_files
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -66,13 +66,9 @@ def load_maps(choice: Path | str, target: Skeleton) -> list[JointMap]:
 
 
 def choose_maps(
-    config: BvhConfig,
-    own_maps: Sequence[JointMap],
-    plan: ConversionPlan[BvhClip],
-    joints: Mapping[str, tuple[str, ...]],
-    folder: Path | None,
+    config: BvhConfig, own_maps: Sequence[JointMap], plan: ConversionPlan[BvhClip], folder: Path | None
 ) -> JointMaps:
-    """A map for every skeleton (`joints` of each) of the planned clips: the user's, else a certain guess.
+    """A map for every skeleton of the planned clips: the user's, else a certain guess.
 
     Clips of other skeletons leave the plan. Guesses are written into `folder`, where there is one, to be
     completed. `UserError` when no skeleton has a map, and when one of `own_maps` fits none.
@@ -81,15 +77,13 @@ def choose_maps(
     maps: dict[str, JointMap] = {}
     doubts: dict[str, str] = {}
     misfits: dict[str, str] = {}
-    skeletons = {
-        clip.found.skeleton: clip.found.path for _, clip in reversed(plan.items) if clip.found.skeleton
-    }
+    skeletons = {clip.found.skeleton: clip.found for _, clip in reversed(plan.items) if clip.found.skeleton}
     # The user's own maps come first: what a person wrote down is never overruled by a guess.
-    for key, label in skeletons.items():
+    for key, first in skeletons.items():
         for one in own_maps:
             if one.skeleton in ("", key) and key not in maps:
                 try:
-                    one.require_fit(joints[key], label)
+                    one.require_fit(first.joints, first.path)
                     maps[key] = one
                 except UserError as error:
                     misfits.setdefault(one.where, str(error))
@@ -99,11 +93,15 @@ def choose_maps(
     for key, motions in first_clips.items():
         if key in maps:
             continue
-        guess = guess_joint_map(motions[0], target)
-        kept = _kept(guess, key, joints[key], folder)
+        label = motions[0].name
+        try:
+            guess = guess_joint_map(motions[0], target)
+            kept = _kept(guess, key, skeletons[key].joints, folder)
+        except ArithmeticError as error:  # bones of no length
+            doubts[key] = f"{label}: its figure cannot be measured ({error}); give it a joint map"
+            continue
         if kept is None:
             cure = _cure(key, target, folder)
-            label = motions[0].name
             doubts[key] = f"the joint map of {label} is not certain: no joint for {guess.doubts()}; {cure}"
             continue
         maps[key] = kept
@@ -124,7 +122,8 @@ def choose_maps(
     plan.items = [item for item in plan.items if item[1].found.skeleton not in doubts]
     plan.notes += doubts.values()
     for key in [key for key in first_clips if key in maps and key in settles]:  # in the plan's order
-        maps[key] = _settle(config, maps[key], first_clips[key], plan)
+        with suppress(UserError):  # an End Site that the map names and the files lack: each file says so
+            maps[key] = _settle(config, maps[key], first_clips[key], plan)
     for clip in left:
         plan.reject(clip.label(), f"no certain joint map for its skeleton ({doubts[clip.found.skeleton]})")
     return maps
@@ -159,7 +158,7 @@ def _first_clips(plan: ConversionPlan[BvhClip], skeletons: Set[str]) -> dict[str
     for _, clip in plan.items:
         key = clip.found.skeleton
         if key in skeletons and len(found.get(key, ())) < _MEASURED:
-            with suppress(UserError):  # told when it is converted; the next clip may be whole
+            with suppress(Exception):  # told when it is converted; the next clip may be whole
                 motion = clip.read()
                 found[key].append(motion)  # no entry for a skeleton of which no file can be read
     return found
@@ -191,7 +190,7 @@ def _place(key: str, target: Skeleton) -> str:
 def _cure(key: str, target: Skeleton, folder: Path | None) -> str:
     """Return what the user can do about a map that is not certain."""
     if folder is None:
-        return "planned with `maps=FOLDER` it writes a map to complete"
+        return "planned with `out=FOLDER` it writes a map to complete"
     # As the manifest has it, where no path of a machine stands: from the folder of the shards on.
     where = _place(key, target)
     return f"complete {where} and give the command again, elsewhere with --set joint_map={MAPS_FOLDER}"
@@ -296,15 +295,13 @@ def plan_bvh(
 ) -> tuple[ConversionPlan[BvhClip], JointMaps]:
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
     folder, names = config.files()
-    scan = scan_files(
-        folder, names, read_header, keep=settings.scan, workers=settings.workers, progress=settings.progress
-    )
+    found = scan_files(folder, names, read_header, workers=settings.workers, progress=settings.progress)
     if config.humanml_index is None:
-        draft = _decide(config, folder, scan, stated)
+        draft = _decide(config, folder, found, stated)
     else:
         draft = ConversionPlan[BvhClip](config, stated=stated)
-        _decide_by_index(config, config.humanml_index, folder, scan, draft)
-    maps = choose_maps(config, own_maps, draft, scan.joints, settings.maps)
+        _decide_by_index(config, config.humanml_index, folder, found, draft)
+    maps = choose_maps(config, own_maps, draft, settings.maps)
     draft.limit(lambda clip: clip.id)
     layout = config.motion_layout()
     draft.finish(
@@ -315,8 +312,7 @@ def plan_bvh(
     return draft, maps
 
 
-def _decide(config: BvhConfig, folder: Path, scan: Scan, stated: str) -> ConversionPlan[BvhClip]:
-    found = scan.files.values()
+def _decide(config: BvhConfig, folder: Path, found: list[FoundFile], stated: str) -> ConversionPlan[BvhClip]:
     listing = config.listing([file.path for file in found])
     draft = ConversionPlan[BvhClip](config, notes=listing.notes, stated=stated)
     contents: dict[str, str] = {}
@@ -349,10 +345,10 @@ def _decide(config: BvhConfig, folder: Path, scan: Scan, stated: str) -> Convers
 
 
 def _decide_by_index(
-    config: BvhConfig, index: Path, folder: Path, scan: Scan, draft: ConversionPlan[BvhClip]
+    config: BvhConfig, index: Path, folder: Path, scan: list[FoundFile], draft: ConversionPlan[BvhClip]
 ) -> None:
     """Plan the clips that HumanML3D's index cuts from the free originals."""
-    files = {file.path: file for file in scan.files.values()}
+    files = {file.path: file for file in scan}
     for file in files.values():
         if file.problem:
             draft.fail(file.path, UserError(file.problem))

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -225,27 +226,16 @@ def index_clips(
             yield IndexClip(f"M{row.id}", row, file, split, row.id)
 
 
-class Originals:
-    """Recordings of a source by the names that the index has for them."""
-
-    def __init__(self, paths: Iterable[str]) -> None:
-        self._by_end: dict[str, list[str]] = {}
-        for path in paths:
-            for end in _ends(path):
-                self._by_end.setdefault(end, []).append(path)
-
-    def find(self, row: IndexRow) -> tuple[str | None, str]:
-        """The file that a row means by as much of its name as fits, and why it is none although one fits."""
-        for end in _ends(row.source):
-            if fits := self._by_end.get(end):
-                if len(fits) > 1:
-                    return None, f"the index means {fits[0]} or {fits[1]}; convert one of them"
-                # Two people of one trial: AMASS says who by a first name, the originals by a number.
-                *_, folder, trial = clip_key(row.source).split("/")
-                if row.subset == "CMU" and trial.partition("_")[0] != folder:
-                    return None, f"a trial of two people: which of them '{folder}' is, the files do not say"
-                return fits[0], ""
-        return None, ""
+def _original_of(row: IndexRow, by_end: Mapping[str, Sequence[str]]) -> tuple[str | None, str]:
+    """The file that a row means by as much of its name as fits, and why it is none although one fits."""
+    fits = next((by_end[end] for end in _ends(row.source) if end in by_end), ())
+    # Two people of one trial: AMASS says who by a first name, the originals by a number.
+    *_, folder, trial = clip_key(row.source).split("/")
+    if len(fits) > 1:
+        return None, f"the index means {fits[0]} or {fits[1]}; convert one of them"
+    if fits and row.subset == "CMU" and trial.partition("_")[0] != folder:
+        return None, f"a trial of two people: which of them '{folder}' is, the files do not say"
+    return (fits[0] if fits else None), ""
 
 
 def find_originals(
@@ -255,11 +245,14 @@ def find_originals(
 
     What is not there, is in no row, or waits for a `licence` that names it, is said in the plan.
     """
-    originals, used = Originals(paths), set[str]()
+    used, by_end = set[str](), defaultdict[str, list[str]](list)
+    for path in paths:
+        for end in _ends(path):
+            by_end[end].append(path)
     rows: dict[str, list[tuple[IndexRow, str | None, str]]] = {subset: [] for subset in ORIGINALS}
     for row in read_index(index):
         if row.subset in ORIGINALS:
-            rows[row.subset].append((row, *originals.find(row)))
+            rows[row.subset].append((row, *_original_of(row, by_end)))
     known = sorted(set(ORIGINALS.values()))
     if config.licence not in (None, *known):
         raise UserError(

@@ -90,16 +90,13 @@ class Listing:
         return listed or hash_split(rule.name(self.id_of(path), path), rule.seed)
 
     def empty_splits(self, paths: Mapping[str, Split]) -> list[str]:
-        """Return a note on splits that a hash leaves without a clip, with what helps; none for lists."""
+        """Return a note on splits that a hash leaves without a clip; none for lists."""
         empty = [split for split in SPLITS if split not in paths.values()]
         stated = self.rule is None and any(row.split for row in self.rows.values())
         if not empty or not paths or stated or self.splits is not None:
             return []
-        rule = self.rule or SplitRule()
-        other = rule.another(rule.name(self.id_of(path), path) for path in paths)
-        cure = f" or a rule that fills them (--set splits={other})" if other else ""
         lists = ", ".join(f"{split}.txt" for split in SPLITS)
-        return [f"no clip is in {' or '.join(empty)}; give lists ({lists}: --set splits=FOLDER){cure}"]
+        return [f"no clip is in {' or '.join(empty)}; give lists ({lists}: --set splits=FOLDER)"]
 
     def texts_of(self, path: str) -> tuple[Caption, ...]:
         return self.rows[path].texts if path in self.rows else ()
@@ -107,9 +104,6 @@ class Listing:
     def problem(self, path: str) -> str:
         """Return the reason that the lists leave a file out; empty when they do not."""
         return "in no split file" if self.splits is not None and path not in self.splits else ""
-
-    def nearest(self, row: CaptionRow) -> list[str]:
-        return nearest(row.file or row.id, self.free)
 
 
 def list_clips(
@@ -155,14 +149,6 @@ def list_clips(
             raise UserError(f"{split}.txt: none of its clips is in the source, so the split would be empty")
     free = tuple(path for path in paths if path not in found)
     return Listing(found, None if listed is None else splits, missing, unused, free, notes)
-
-
-def nearest(name: str, candidates: Sequence[str], number: int = 2) -> list[str]:
-    """The candidates nearest to a name by their last names, best first; none that has nothing in common."""
-    stems: dict[str, str] = {}
-    for candidate in sorted(candidates):
-        stems.setdefault(_stem(candidate), candidate)
-    return [stems[stem] for stem in difflib.get_close_matches(_stem(name), list(stems), n=number)]
 
 
 def _stem(name: str) -> str:
@@ -283,12 +269,12 @@ def _some(names: list[str]) -> str:
 
 def _unused(found: Listing) -> str:
     """Count the clips that have captions and no file, and name the first with the nearest names."""
-    shown = []
-    for row in found.unused[:_SHOWN]:
-        near = found.nearest(row)
-        shown.append(f"'{row.file or row.id}'" + (f", nearest: {' and '.join(near)}" if near else ""))
     if all(row.catalogue for row in found.unused):
         return f"{len(found.unused)} clips of its collection that are not in the source"
+    shown, stems = [], {_stem(path): path for path in sorted(found.free, reverse=True)}
+    for name in (row.file or row.id for row in found.unused[:_SHOWN]):
+        near = [stems[stem] for stem in difflib.get_close_matches(_stem(name), list(stems), n=2)]
+        shown.append(f"'{name}'" + (f", nearest: {' and '.join(near)}" if near else ""))
     more = f"; and {len(found.unused) - _SHOWN} more" if len(found.unused) > _SHOWN else ""
     which = "clip that is" if len(found.unused) == 1 else "clips that are"
     return f"{len(found.unused)} {which} not in the source ({'; '.join(shown)}{more})"

@@ -21,6 +21,7 @@ from pydantic import AliasChoices, ConfigDict, Field, FiniteFloat
 from motionloom.datasets.convert.captions.humanml_text import parse_caption
 from motionloom.datasets.convert.common.files import check_id, read_text_file
 from motionloom.datasets.convert.common.splits import split_named
+from motionloom.datasets.convert.common.tables import DELIMITERS, table_rows
 from motionloom.datasets.schema import Caption, Config, Split, UserError, nearest, parse_json
 
 SOURCE = "captions"
@@ -35,7 +36,6 @@ _SUFFIX = re.compile(r"\.(?:bvh|amc|npz|npy|pkl|fbx|c3d|glb|txt|json|csv|mp4|wav
 _NUMBER = r"\s*(?:nan|[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|[-+]?\.\d+)\s*"
 _HUMANML = re.compile(rf"[^#].*#.*#{_NUMBER}#{_NUMBER}")
 _AMASS = re.compile(r"_(?:poses|stageii)$")
-_DELIMITERS = {",": "a ','", "\t": "a tab", ";": "a ';'"}
 CATALOGUE = "<catalogue>"
 _RECORD = '{"id": "walk-001", "captions": ["a person walks"]}'
 
@@ -267,29 +267,13 @@ def _of_table(path: Path, text: str, columns: dict[str, str]) -> Records:
     lines = text.split("\n")
     first = next(number for number, line in enumerate(lines) if line.strip())
     delimiter, names = _header(path, lines[first], first + 1, columns)
-    # The reader wants the newlines back: those inside quotes belong to the caption.
-    reader = csv.reader((f"{line}\n" for line in lines[first + 1 :]), delimiter=delimiter, strict=True)
-    while True:
-        place = f"{path}:{first + 2 + reader.line_num}"  # the line on which the next row starts
-        try:
-            row = next(reader)
-        except StopIteration:
-            return
-        except csv.Error:
-            raise UserError(f"{place}: a quote is not closed before the next column") from None
-        if not any(field.strip() for field in row):
-            continue
-        if len(row) != len(names):
-            raise UserError(
-                f"{place}: {len(row)} columns, but the first line names {len(names)} ({', '.join(names)}); "
-                f"put a caption that holds {_DELIMITERS[delimiter]} in quotes"
-            )
-        yield place, dict(zip(names, row, strict=True))
+    for place, row in table_rows(lines[first + 1 :], first + 2, names, delimiter, str(path)):
+        yield place, {**row}
 
 
 def _header(path: Path, line: str, number: int, columns: dict[str, str]) -> tuple[str, list[str]]:
     usual = "\t" if path.suffix.lower() in (".tsv", ".tab") else ","
-    for delimiter in dict.fromkeys((usual, *_DELIMITERS)):
+    for delimiter in dict.fromkeys((usual, *DELIMITERS)):
         try:
             fields = next(csv.reader([line], delimiter=delimiter))
         except csv.Error:

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import IO
 
 import numpy as np
-from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.npz import ArrayHeader, read_npy_header
@@ -32,15 +30,9 @@ def load_array(
     `UserError` for everything listed in the module's docstring, naming frame and column of a bad value.
     """
     label = str(path) if name is None else name
-    try:
-        with path.open("rb") as file:
-            header = read_array_header(file, label)
-            _check_header(header, width, label)
-            file.seek(0)
-            found = npy_format.read_array(file, allow_pickle=False)
-    except OSError as error:
-        raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None
-    values = np.ascontiguousarray(found, dtype=header.dtype.newbyteorder("="))
+    check_array_header(path, width=width, name=label)
+    found = np.load(path, allow_pickle=False)
+    values = np.ascontiguousarray(found, dtype=found.dtype.newbyteorder("="))
     check_values(values, limit, label)
     return values
 
@@ -50,19 +42,14 @@ def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | 
     label = str(path) if name is None else name
     try:
         with path.open("rb") as file:
-            header = read_array_header(file, label)
+            size = os.fstat(file.fileno()).st_size
+            if size == 0:
+                raise UserError(f"{label}: empty file")
+            header = read_npy_header(file, label, size)
     except OSError as error:
         raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None
     _check_header(header, width, label)
     return header.shape[0]
-
-
-def read_array_header(file: IO[bytes], label: str) -> ArrayHeader:
-    """The header of a whole `.npy` file; `UserError` when it is cut or too long."""
-    size = os.fstat(file.fileno()).st_size
-    if size == 0:
-        raise UserError(f"{label}: empty file")
-    return read_npy_header(file, label, size)
 
 
 def _check_header(header: ArrayHeader, width: int | tuple[int, ...], label: str) -> None:

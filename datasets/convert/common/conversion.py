@@ -23,9 +23,6 @@ from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tasks import plan_shards
 from motionloom.datasets.shards.writer import dataset_writer
 
-SCAN_FILE = ".scan.json"
-"""Inside the folder of the shards: what converters remember of their source; may be deleted at any time."""
-
 _label = operator.methodcaller("label")
 
 

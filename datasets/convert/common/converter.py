@@ -33,8 +33,6 @@ class PlanSettings:
 
     workers: int = 1
     progress: bool = False
-    scan: Path | None = None
-    """A file that remembers what unchanged files hold."""
     maps: Path | None = None
     """Folder for the joint maps that are guessed."""
 

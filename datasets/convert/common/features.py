@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
+from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, resample, resample_quaternions, retarget
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS, smpl75_of
@@ -27,11 +26,6 @@ MAX_SPEED = 40.0
 
 MOST_JUMPS = 0.01
 """Share of the frames that a joint may jump in: markers are mistaken in good recordings too."""
-
-
-def body_of(model: Path | None, skeleton: SkeletonName) -> BodyModel:
-    """The user's body model, or the neutral skeleton of the package where none is given."""
-    return BodyModel.neutral(skeleton) if model is None else BodyModel.load(model, skeleton)
 
 
 def features_of(

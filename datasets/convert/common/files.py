@@ -108,14 +108,14 @@ def walk_files(root: Path) -> list[str]:
 
 
 def read_in_threads(
-    read: Callable[[T], R], items: Sequence[T], *, workers: int, progress: bool, before: int = 0
+    read: Callable[[T], R], items: Sequence[T], *, workers: int, progress: bool
 ) -> Iterator[R]:
-    """Yield `read(item)` for every item, in their order; the bar counts `before` items as done already.
+    """Yield `read(item)` for every item, in their order.
 
     Threads are enough: opening many files waits for the disk, unpacking and hashing run outside the
     interpreter's lock.
     """
-    meter = Meter("reading the source", before + len(items), done=before, shown=progress)
+    meter = Meter("reading the source", len(items), shown=progress)
     with meter, ThreadPoolExecutor(max(workers, 1)) as pool:
         for made in pool.map(read, items):
             yield made

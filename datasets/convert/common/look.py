@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -48,18 +48,19 @@ class Suggestion:
 
 
 @dataclass(frozen=True)
-class SeenClip:
-    """One clip that was read: its frames at about ten a second."""
+class SourceJoints:
+    """A clip as a converter reads it, before anything is made canonical."""
 
-    subset: str
-    joints: NDArray[np.float64]
+    joints: NDArray[np.floating]
+    """World positions [T, N, 3] in metres, Y up, after the options for unit and axis."""
     fps: float
-    file_fps: float
+    mapped: bool = False
+    """Whether a joint map was used."""
     up: str = "y"
-    """The upward axis of its file."""
+    """The upward axis of the file."""
 
 
-def stats_of(clips: Iterable[SeenClip]) -> PlausibilityStats:
+def stats_of(clips: Iterable[SourceJoints]) -> PlausibilityStats:
     """The clips measured."""
     stats = PlausibilityStats()
     for clip in clips:
@@ -67,7 +68,7 @@ def stats_of(clips: Iterable[SeenClip]) -> PlausibilityStats:
     return stats
 
 
-def _suggest(clips: list[SeenClip], config: ConvertConfig, mapped: bool) -> list[Suggestion]:
+def _suggest(clips: list[SourceJoints], config: ConvertConfig) -> list[Suggestion]:
     """Changes that together make people of the clips: axis, unit, sides."""
     out: list[Suggestion] = []
     seen = stats_of(clips)
@@ -83,6 +84,7 @@ def _suggest(clips: list[SeenClip], config: ConvertConfig, mapped: bool) -> list
     if not out and any(oddity.kind == "left and right" and oddity.is_error for oddity in seen.oddities()):
         why = "the feet point backwards"
         rows = Suggestion("joint_map", "exchange the left and the right rows", why)
+        mapped = any(clip.mapped for clip in clips)
         out.append(rows if mapped else Suggestion("source", "exchange left and right in the source", why))
     return out
 
@@ -95,20 +97,20 @@ def named_unit(height: float) -> NamedUnit | None:
 
 def _suggest_unit(height: float, config: ConvertConfig) -> Suggestion:
     """The unit that makes people of figures that are `height` metres tall in the unit that was taken."""
-    own: Any = getattr(config, "unit", "m")
-    in_files = height / (1.0 if own == "auto" else metres(own))
+    own: Any = getattr(config, "unit", None)
+    in_files = height / (1.0 if own in (None, "auto") else metres(own))
     unit = named_unit(in_files)
     if unit is None:
+        value = f"{ADULT_METRES / max(in_files, 1e-9):.4g}"
         why = f"the figures are {height:.3g} m tall, and no unit makes 1.2 to 2.2 m of it"
-        scale = Suggestion("unit", f"{ADULT_METRES / max(in_files, 1e-9):.4g}", why)
-        return scale if hasattr(config, "unit") else Suggestion("source", "scale the files", why)
-    why = f"then the figures are {in_files * METRES[unit]:.2f} m tall"
-    if hasattr(config, "unit"):
-        return Suggestion("unit", unit, why)
-    return Suggestion("source", f"the lengths look like {unit}: scale the files to metres", why)
+    else:
+        value, why = unit, f"then the figures are {in_files * METRES[unit]:.2f} m tall"
+    if own is None:
+        return Suggestion("source", f"scale the files to metres, from {value}", why)
+    return Suggestion("unit", value, why)
 
 
-def head_axis(clips: Iterable[SeenClip]) -> str:
+def head_axis(clips: Iterable[SourceJoints]) -> str:
     """The axis of the files along which the head lies from the pelvis in most clips."""
     votes: Counter[str] = Counter()
     for clip in clips:
@@ -125,19 +127,6 @@ MOST_CLIPS = 96
 _FRAMES_A_SECOND = 10.0
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class SourceJoints:
-    """A clip as a converter reads it, before anything is made canonical."""
-
-    joints: NDArray[np.floating]
-    """World positions [T, N, 3] in metres, Y up, after the options for unit and axis."""
-    fps: float
-    mapped: bool = False
-    """Whether a joint map was used."""
-    up: str = "y"
-    """The upward axis of the file."""
 
 
 @dataclass(frozen=True)
@@ -223,9 +212,9 @@ def look_at(
 ) -> Look:
     """Read and measure `config.look` clips of every subset, chosen by a hash of their names."""
     chosen, subsets = _choose(items, subset_of, config.look, label)
-    clips: list[SeenClip] = []
+    clips: dict[str, list[SourceJoints]] = {name: [] for name, _ in chosen}
+    rates: dict[str, set[float]] = defaultdict(set)
     failed: list[tuple[str, Dropped]] = []
-    mapped = False
     for name, item in chosen:
         try:
             seen = see(item)
@@ -237,20 +226,18 @@ def look_at(
         # Ten frames a second are enough for medians, and keep hundreds of clips in memory.
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))
         body = np.asarray(seen.joints[::step, :BODY_JOINTS], dtype=np.float64)
-        clips.append(SeenClip(name, body, seen.fps / step, seen.fps, seen.up))
-        mapped = mapped or seen.mapped
+        clips[name].append(replace(seen, joints=body, fps=seen.fps / step))
+        rates[name].add(seen.fps)
     unreadable = Counter(name for name, _ in failed)
-    found = [
-        _subset(name, [clip for clip in clips if clip.subset == name], unreadable[name])
-        for name in dict.fromkeys(name for name, _ in chosen)
-    ]
-    oddities = stats_of(clips).oddities()
+    found = [_subset(name, seen_there, unreadable[name], rates[name]) for name, seen_there in clips.items()]
+    all_clips = [clip for seen_there in clips.values() for clip in seen_there]
+    oddities = stats_of(all_clips).oddities()
     problems = [oddity.text for oddity in oddities if oddity.is_error]
     warnings = [oddity.text for oddity in oddities if not oddity.is_error]
-    suggestions = _suggest(clips, config, mapped) if problems else []
+    suggestions = _suggest(all_clips, config) if problems else []
     # One reason for every clip is a wrong option or map; several reasons are damaged files.
     groups = grouped([drop for _, drop in failed])
-    if failed and not clips and len(groups) == 1:
+    if failed and not all_clips and len(groups) == 1:
         problems = [f"none could be read: {groups[0]}"]
     else:
         warnings += [f"cannot be read: {group}" for group in groups]
@@ -284,7 +271,7 @@ def _choose(
     return chosen, len(by_subset)
 
 
-def _subset(name: str, clips: list[SeenClip], unreadable: int) -> SubsetLook:
+def _subset(name: str, clips: list[SourceJoints], unreadable: int, rates: set[float]) -> SubsetLook:
     stats = stats_of(clips)
     return SubsetLook(
         name=name,
@@ -294,5 +281,5 @@ def _subset(name: str, clips: list[SeenClip], unreadable: int) -> SubsetLook:
         upright=round(stats.upright * len(clips)) if clips else 0,
         head=head_axis(clips) if clips else "",
         above_floor=round(stats.above_floor, 4) if clips else None,
-        fps=tuple(sorted({clip.file_fps for clip in clips})),
+        fps=tuple(sorted(rates)),
     )

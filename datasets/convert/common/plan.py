@@ -7,7 +7,8 @@ and why, so nothing is skipped silently (`convert ... --plan` prints it and stop
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
@@ -39,7 +40,6 @@ class PlannedClip(Protocol):
         ...
 
 
-T = TypeVar("T")
 C = TypeVar("C", bound=PlannedClip)
 
 
@@ -143,12 +143,21 @@ class ConversionPlan(Generic[C]):
         """This one cannot be read."""
         self.broken.append(drop(source, error))
 
+    @contextmanager
+    def reading(self, source: str) -> Iterator[None]:
+        """What cannot be read within is said of `source`, and the plan goes on without it."""
+        try:
+            yield
+        except Exception as error:  # whatever a bad file, name or number makes of the libraries below
+            self.fail(source, error)
+
     def limit(self, key: Callable[[C], str]) -> None:
         """Keep `config.limit` clips at most, chosen by a hash of their key, with a note of the choice."""
-        kept = limited(self.items, key, self.config.limit)
-        if len(kept) < len(self.items):
-            self.notes.append(f"limited to {self.config.limit} of {len(self.items)} clips")
-        self.items = kept
+        most = self.config.limit
+        if most is not None and most < len(self.items):
+            self.notes.append(f"limited to {most} of {len(self.items)} clips")
+            kept = set(sorted(sha256_of_json(key(clip)) for _, clip in self.items)[:most])
+            self.items = [item for item in self.items if sha256_of_json(key(item[1])) in kept]
 
     def finish(
         self, *, found: int, frames: Callable[[C], int], licence: Callable[[C], str]
@@ -229,16 +238,6 @@ def facts_of(clip: PlannedClip) -> Facts:
     """Facts of a clip by name, for `where`: id, split, and the clip's own `facts`."""
     facts: Facts = getattr(clip, "facts", {})
     return {"id": clip.id, "split": clip.split, **facts}
-
-
-def limited(
-    items: Sequence[tuple[Split, T]], key: Callable[[T], str], limit: int | None
-) -> list[tuple[Split, T]]:
-    """At most `limit` items, chosen by a hash of their key, in the old order."""
-    if limit is None or len(items) <= limit:
-        return list(items)
-    kept = set(sorted(sha256_of_json(key(item)) for _, item in items)[:limit])
-    return [item for item in items if sha256_of_json(key(item[1])) in kept]
 
 
 def _some(lines: Sequence[object], limit: int = 5) -> str:

@@ -123,12 +123,8 @@ class Figure:
 
     def cut(self, first: int, last: int) -> Figure:
         """Frames [first, last) of it."""
-
-        def part(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-            return None if values is None else values[first:last]
-
-        moving = {name: part(getattr(self, name)) for name in ("joints", "rotations", "trans", "face")}
-        return replace(self, **moving)
+        moving = {name: getattr(self, name) for name in ("joints", "rotations", "trans", "face")}
+        return replace(self, **{name: v[first:last] for name, v in moving.items() if v is not None})
 
     def __len__(self) -> int:
         return len(next(values for values in (self.joints, self.rotations) if values is not None))
@@ -180,7 +176,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         found = read_in_threads(self._scan, files, workers=settings.workers, progress=settings.progress)
         scanned = dict(zip(files, found, strict=True))
         for file, state in scanned.items():
-            if isinstance(state, UserError):
+            if isinstance(state, Exception):
                 draft.fail(file, state)
         named = {entry.id for entry in entries}
         for clip_id, split in (self.listed or {}).items():
@@ -190,7 +186,7 @@ class Release(Converter[Cfg, ReleaseClip]):
             state = scanned[entry.file]
             if state is None:
                 draft.miss(entry.file, f"clip '{entry.id}' is listed, but its file is not in the source")
-            elif not isinstance(state, UserError):
+            elif not isinstance(state, Exception):
                 clip, problem = self._clip(entry, state, draft)
                 reason = clip.entry.problem or problem
                 captioned, keep = bool(clip.entry.texts), config.uncaptioned == "keep"
@@ -238,14 +234,14 @@ class Release(Converter[Cfg, ReleaseClip]):
         """The last frame before the sound ends, and why the clip is left out if it ends too early."""
         return last, ""
 
-    def _scan(self, file: str) -> tuple[int, float, int] | UserError | None:
-        """Frames, rate and bytes of a motion file; None when it is not there."""
+    def _scan(self, file: str) -> tuple[int, float, int] | Exception | None:
+        """Frames, rate and bytes of a motion file; None when it is not there, an error when it is damaged."""
         try:
             path = self.path_of(file)
             if not path.is_file():
                 return None
             return (*self.length(path, file), path.stat().st_size)
-        except UserError as error:
+        except Exception as error:  # whatever a bad file or name makes of the libraries below
             return error
 
     def _clip(

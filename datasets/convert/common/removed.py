@@ -39,7 +39,7 @@ from motionloom.datasets.shards.reader import load_manifest, manifest_layout
 from motionloom.datasets.shards.sample import Sample, meta_from_json
 from motionloom.datasets.shards.tasks import Result, ShardItem, ShardTask, without, write_shard
 
-_DERIVED = (".scan.json", "search.npz", "report.html", "clean.html")
+_DERIVED = ("search.npz", "report.html", "clean.html")
 """Files beside the shards that are made of them, with names, words or motions of clips."""
 
 

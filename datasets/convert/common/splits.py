@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
@@ -60,8 +59,9 @@ def hash_split(name: str, seed: int = 0) -> Split:
 
 
 def hash_share(clip_id: str) -> float:
-    """A number in [0, 1) by the id alone."""
-    return int.from_bytes(hashlib.sha256(clip_id.encode()).digest()[:8], "big") / 2**64
+    """A number in [0, 1) by the id alone, which may be a file's name in any bytes."""
+    name = clip_id.encode("utf-8", "surrogateescape")
+    return int.from_bytes(hashlib.sha256(name).digest()[:8], "big") / 2**64
 
 
 def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
@@ -140,7 +140,6 @@ def subject_of(path: str) -> str:
 
 
 _RULE = re.compile(r"(subjects|clips)(?::(\d{1,9}))?")
-_SEEDS_TRIED = 500
 
 
 @dataclass(frozen=True)
@@ -159,21 +158,6 @@ class SplitRule:
     def name(self, clip_id: str, path: str) -> str:
         """Return what of a clip is hashed."""
         return subject_of(path) if self.by == "subjects" else clip_id
-
-    def another(self, names: Iterable[str]) -> str:
-        """Return the rule with the seed that gives every split some of these names of clips, nearest to
-        80/5/15 of the clips; empty where there is none.
-        """
-        clips, best = Counter(names), (float(len(SPLITS)), "")
-        wanted = {"train": TRAIN_SHARE, "val": VAL_SHARE, "test": 1 - TRAIN_SHARE - VAL_SHARE}
-        for seed in range(1, _SEEDS_TRIED if len(clips) >= len(SPLITS) else 1):
-            counts = Counter[str]()
-            for name, count in clips.items():
-                counts[hash_split(name, seed)] += count
-            far = sum(abs(counts[split] / clips.total() - wanted[split]) for split in SPLITS)
-            if all(counts[split] for split in SPLITS) and far < best[0]:
-                best = far, f"{self.by}:{seed}"
-        return best[1]
 
 
 def _stem(path: str) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.schema import Caption, UserError, parse_json
 from motionloom.datasets.text.clean import clean_caption
+
+DELIMITERS = {",": "a ','", "\t": "a tab", ";": "a ';'"}
 
 
 def read_json(path: Path, name: str) -> object:
@@ -34,24 +36,40 @@ def require_record(value: object, place: str) -> dict[str, object]:
 def read_csv(path: Path, columns: Iterable[str]) -> list[tuple[str, dict[str, str]]]:
     """(place, row) of a table with a header; `UserError` names a missing column or a row that is cut."""
     lines = read_text_file(path, path.name).split("\n")
-    reader = csv.reader((f"{line}\n" for line in lines), strict=True)
-    rows = []
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        missing = [name for name in columns if name not in header]
-        if missing:
+    header = [name.strip() for name in next(csv.reader(lines[:1]), [])]
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise UserError(
+            f"{path.name}: no column '{missing[0]}'; there are {', '.join(header[:12]) or 'none'}"
+        )
+    return list(table_rows(lines[1:], 2, header, ",", path.name))
+
+
+def table_rows(
+    lines: Sequence[str], first: int, header: Sequence[str], delimiter: str, name: str
+) -> Iterator[tuple[str, dict[str, str]]]:
+    """(place, row) of the lines below a header, which begin at line `first`; blank rows say nothing.
+
+    `UserError` names the line on which a row starts that is cut, or a quote that is not closed.
+    """
+    # The reader wants the newlines back: those inside quotes belong to the text.
+    reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter, strict=True)
+    while True:
+        place = f"{name}:{first + reader.line_num}"
+        try:
+            row = next(reader)
+        except StopIteration:
+            return
+        except csv.Error:
+            raise UserError(f"{place}: a quote is not closed before the next column") from None
+        if not any(field.strip() for field in row):
+            continue
+        if len(row) != len(header):
             raise UserError(
-                f"{path.name}: no column '{missing[0]}'; there are {', '.join(header[:12]) or 'none'}"
+                f"{place}: {len(row)} columns, the header has {len(header)} ({', '.join(header[:12])}); put "
+                f"text that holds {DELIMITERS[delimiter]} in quotes"
             )
-        for row in reader:
-            place = f"{path.name}:{reader.line_num}"
-            if any(cell.strip() for cell in row):
-                if len(row) != len(header):
-                    raise UserError(f"{place}: {len(row)} columns, the header has {len(header)}")
-                rows.append((place, dict(zip(header, row, strict=True))))
-    except csv.Error as error:
-        raise UserError(f"{path.name}:{reader.line_num}: not a table ({error})") from None
-    return rows
+        yield place, dict(zip(header, row, strict=True))
 
 
 def captions_of(words: object, source: str, start: float = 0.0, end: float | None = None) -> list[Caption]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.features import body_of, features_of, require_human
+from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
@@ -55,16 +55,12 @@ from motionloom.datasets.convert.motionx.parameters import (
 )
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import Caption, Dropped, Split, UserError
-from motionloom.datasets.shards.left_out import drop
+from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.text.clean import emotion_of
 
 FPS = 30.0
 AIST = "aist"
-MOCAP = ("humanml", "EgoBody", "GRAB")
-"""Subsets whose faces come in files of their own."""
-
 LICENCE = "Motion-X-noncommercial"
 LICENCES = {
     "humanml": "AMASS-noncommercial",
@@ -117,8 +113,8 @@ class MotionXEntry(Entry):
         return (self.file, self.face) if self.face else (self.file,)
 
 
-_Found = tuple[MotionXEntry, list[Dropped], list[str]]
-"""A clip; its files that cannot be read; and what is wrong with its captions."""
+_Found = tuple[MotionXEntry, ConversionPlan[ReleaseClip]]
+"""A clip; and what is said of its files."""
 
 
 class MotionX(Release[MotionXConfig]):
@@ -134,7 +130,8 @@ class MotionX(Release[MotionXConfig]):
 
     def __init__(self, config: MotionXConfig) -> None:
         super().__init__(config)
-        self.body = body_of(config.body_model, config.skeleton)  # a wrong one fails here
+        model = config.body_model  # a wrong one fails here
+        self.body = BodyModel.load(model, config.skeleton) if model else BodyModel.neutral(config.skeleton)
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         config = self.config
@@ -147,17 +144,16 @@ class MotionX(Release[MotionXConfig]):
         how = self.settings
         read = partial(self._entry, files)
         made: list[_Found] = list(read_in_threads(read, ids, workers=how.workers, progress=how.progress))
-        entries = [entry for entry, _, _ in made]
+        entries = [entry for entry, _ in made]
         unwanted = len(motion) - len(ids)
         texts_alone = [clip_id for clip_id in files.by_kind["captions"] if clip_id not in motion]
         draft.dropped += files.repeated
-        draft.broken += [*files.broken, *(problem for _, broken, _ in made for problem in broken)]
+        draft.broken += [*files.broken, *(one for _, said in made for one in said.broken)]
         draft.notes += [
             *files.notes(),
-            *self._subset_notes(entries),
             *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),
             *([f"{len(texts_alone)} caption files have no motion"] if texts_alone else []),
-            *(problem for _, _, problems in made for problem in problems),
+            *(note for _, said in made for note in said.notes),
         ]
         return entries
 
@@ -177,29 +173,23 @@ class MotionX(Release[MotionXConfig]):
 
     def _entry(self, files: MotionXFiles, clip_id: str) -> _Found:
         """A clip with its texts. Segments of humanml's captions are checked when its length is known."""
-        source, broken, problems = self.config.source, list[Dropped](), list[str]()
+        source, said = self.config.source, ConversionPlan[ReleaseClip](self.config)
 
         def read(kind: Kind, reader: Callable[..., tuple[list[Caption], list[str]]]) -> tuple[Caption, ...]:
-            file = files.by_kind[kind].get(clip_id)
-            if file is None:
-                return ()
-            try:
-                texts, wrong = reader(source / file, name=file)
-            except UserError as error:
-                broken.append(drop(file, error))
-                return ()
-            problems.extend([f"{file}: {'; '.join(wrong)}"] if wrong else [])
+            file, texts = files.by_kind[kind].get(clip_id), list[Caption]()
+            if file is not None:
+                with said.reading(file):
+                    texts, wrong = reader(source / file, name=file)
+                    said.notes += [f"{file}: {'; '.join(wrong)}"] if wrong else []
             return tuple(texts)
 
         in_grammar = subset_of(clip_id) == HUMANML
         captions = partial(read_humanml_captions, seconds=None) if in_grammar else read_sentences
-        face = files.by_kind["face motion"].get(clip_id)
-        if face is not None:
-            try:
-                check_array_header(source / face, width=FACE_WIDTH, name=face)
-            except UserError as error:
-                broken.append(drop(face, error))
-                face = None
+        face, stored = None, files.by_kind["face motion"].get(clip_id)
+        if stored is not None:
+            with said.reading(stored):
+                check_array_header(source / stored, width=FACE_WIDTH, name=stored)
+                face = stored
         subset = subset_of(clip_id)
         entry = MotionXEntry(
             clip_id, files.by_kind["motion"][clip_id],
@@ -209,29 +199,7 @@ class MotionX(Release[MotionXConfig]):
             face_texts=read("face texts", partial(read_sentences, source="face")),
             face=face,
         )  # fmt: skip
-        return entry, broken, problems
-
-    def _subset_notes(self, entries: list[MotionXEntry]) -> list[str]:
-        """Notes on captions and faces that subsets lack."""
-        notes = []
-        by_subset: dict[str, list[MotionXEntry]] = {}
-        for entry in entries:
-            by_subset.setdefault(subset_of(entry.id), []).append(entry)
-        humanml = by_subset.get(HUMANML, [])
-        if humanml and not any(entry.texts for entry in humanml):
-            notes.append(
-                "humanml/ has no captions: unpack HumanML3D's texts.zip as humanml/ beside the others"
-            )
-        mocap = [entry for subset in MOCAP for entry in by_subset.get(subset, [])]
-        if faceless := sum(entry.face is None for entry in mocap):
-            notes.append(
-                f"{faceless} of {len(mocap)} clips of {', '.join(MOCAP)} have no face motion file: unless "
-                f"their own columns hold an expression, their face is masked"
-            )
-        return notes
-
-    def _load(self, file: str) -> NDArray[np.floating]:
-        return load_array(self.path_of(file), width=RAW.dim, name=file, limit=value_limits())
+        return entry, said
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return check_array_header(path, width=RAW.dim, name=label), FPS
@@ -278,7 +246,8 @@ class MotionX(Release[MotionXConfig]):
     def parameters(self, clip: ReleaseClip) -> NDArray[np.float64]:
         """The clip's columns [T, 322], repaired: metres, face motion written in."""
         entry, subset = _with_face(clip), subset_of(clip.id)
-        values = self._load(entry.file).astype(np.float64)
+        path, limits = self.path_of(entry.file), value_limits()
+        values = load_array(path, width=RAW.dim, name=entry.file, limit=limits).astype(np.float64)
         if len(values) != clip.last:
             raise UserError(
                 f"{entry.file}: {len(values)} frames, {clip.last} when the plan was made; convert again"

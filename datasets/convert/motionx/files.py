@@ -12,16 +12,14 @@ loader takes 20). Everywhere else a file is plain sentences, one a line, some of
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
-from motionloom.datasets.convert.common.files import check_id, inside, read_text_file
+from motionloom.datasets.convert.common.files import check_id, inside, read_text_file, walk_files
 from motionloom.datasets.schema import Caption, Dropped, UserError
 from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.text.clean import clean_caption, usable_caption
@@ -82,15 +80,12 @@ class MotionXFiles:
     """Names that cannot be ids, and links that leave their folder."""
     repeated: list[Dropped] = field(default_factory=list)
     """Motion files whose id another file has already."""
-    second: Counter[Kind] = field(default_factory=Counter)
-    """Other files whose id a file of their kind has already."""
 
     def notes(self) -> list[str]:
         lines = []
         for kind, folders in self.folders.items():
             named = [f"{folder or '.'}/ ({count} files)" for folder, count in sorted(folders.items())]
             lines.append(f"{kind}: {', '.join(named) if named else 'none in this source'}")
-        lines += [f"{kind}: {count} files of clips that have one" for kind, count in self.second.items()]
         return lines
 
 
@@ -111,16 +106,17 @@ def find_files(source: Path) -> MotionXFiles:
         raise UserError(f"{source}: no such folder")
     placed: list[tuple[_Place, str, str]] = []
     broken: list[Dropped] = []
-    for parts, entry in _walk(source, (), frozenset()):
-        place, name = _place(parts), "/".join((*parts, entry.name))
-        if place is None or entry.name.startswith(".") or not entry.name.endswith(_KINDS[place.kind][1]):
+    for name in walk_files(source):
+        *parts, file = name.split("/")
+        place = _place(tuple(parts))
+        if place is None or file.startswith(".") or not file.endswith(_KINDS[place.kind][1]):
             continue
         shown = name.encode("utf-8", "backslashreplace").decode()
         try:
-            clip_id = "/".join((*place.rest, entry.name.removesuffix(_KINDS[place.kind][1])))
+            clip_id = "/".join((*place.rest, file.removesuffix(_KINDS[place.kind][1])))
             check_id(clip_id, shown)
-            if entry.is_symlink():
-                inside(source.joinpath(*parts), entry.name, shown)
+            # A folder may be a link: people keep the parts of a release on different disks.
+            inside(source.joinpath(*parts), file, shown)
         except UserError as error:
             broken.append(drop(shown, error))
             continue
@@ -134,13 +130,9 @@ def find_files(source: Path) -> MotionXFiles:
             continue
         found.folders[kind][place.root] += 1
         first = found.by_kind[kind].setdefault(clip_id, name)
-        if first == name:
-            continue
-        if kind == "motion":
+        if first != name and kind == "motion":
             reason = f"second file for clip id '{clip_id}'; the first is {first}"
             found.repeated.append(Dropped(source=name, reason=reason))
-        else:
-            found.second[kind] += 1
     if not found.by_kind["motion"]:
         raise UserError(
             f"{source}: no Motion-X motion in it; give the folder that holds motion_data/smplx_322/ "
@@ -157,32 +149,6 @@ def official_id(clip_id: str) -> str:
 def subset_of(clip_id: str) -> str:
     """First folder of an id; empty for clips that lie in none."""
     return clip_id.split("/", 1)[0] if "/" in clip_id else ""
-
-
-def _walk(
-    folder: Path, parts: tuple[str, ...], above: frozenset[str]
-) -> Iterator[tuple[tuple[str, ...], os.DirEntry[str]]]:
-    """Every file below a folder in the order of names, with the folders above it.
-
-    Linked folders are followed down to the subsets (people keep the parts of a release on different disks),
-    but never into a folder that they lie in.
-    """
-    try:
-        with os.scandir(folder) as listed:
-            entries = sorted(listed, key=lambda entry: entry.name)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be listed ({error.strerror})") from None
-    real = os.path.realpath(folder)
-    for entry in entries:
-        if entry.is_dir(follow_symlinks=False):
-            yield from _walk(folder / entry.name, (*parts, entry.name), above | {real})
-        elif entry.is_symlink() and entry.is_dir():
-            target = os.path.realpath(entry.path)
-            place = _place((*parts, entry.name))
-            if len(place.rest if place else parts) <= 1 and target not in above | {real}:
-                yield from _walk(folder / entry.name, (*parts, entry.name), above | {real})
-        else:
-            yield parts, entry
 
 
 @lru_cache(maxsize=256)

@@ -108,16 +108,15 @@ class Beat2(BodyRelease[Beat2Config]):
         path = self.config.source / file
         if not path.is_file():
             return
-        try:
+        words: list[tuple[float, float, str]] = []
+        with draft.reading(file):
             tier = _TIER.search(read_text_file(path, file))
             if tier is None:
                 raise UserError(f'{file}: no tier "words" in it')
-        except UserError as error:
-            draft.fail(file, error)
-            return
+            found = _WORD.findall(tier[0])
+            words = [(float(a), float(b), text.strip()) for a, b, text in found if text.strip()]
         phrase: list[str] = []
         start = end = 0.0
-        words = [(float(a), float(b), text.strip()) for a, b, text in _WORD.findall(tier[0]) if text.strip()]
         for begin, stop, word in words:
             if phrase and begin - end > self.config.pause:
                 yield from captions_of(" ".join(phrase), "speech", start, end)

@@ -10,14 +10,14 @@ person's.
 from __future__ import annotations
 
 import sys
-from functools import lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.common.scan import list_files
 from motionloom.datasets.convert.common.tables import captions_of, read_csv, read_json_lines
-from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state
+from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row
 from motionloom.datasets.schema import Caption, UserError
 
 FPS = 120.0
@@ -48,14 +48,13 @@ class BonesSeedConfig(BvhSetConfig):
             raise UserError(f"{self.source}: no {folder.name}/ in it; unpack {folder.name}.tar.gz there")
         return list_files(folder)
 
+    @cached_property
     def rows(self) -> dict[str, Row]:
-        return _rows(self.source, state(*(self.source / "metadata").glob("*")))
+        """The metadata by file name; clips of one actor stay in one split."""
+        return _rows(self.source / "metadata")
 
 
-@lru_cache(maxsize=2)
-def _rows(source: Path, made: tuple[int, ...]) -> dict[str, Row]:
-    """The metadata by file name; clips of one actor stay in one split."""
-    folder = source / "metadata"
+def _rows(folder: Path) -> dict[str, Row]:
     tables = sorted(folder.glob("seed_metadata_v*.csv"))
     if not tables:
         parquet = sorted(folder.glob("*.parquet"))

@@ -70,14 +70,12 @@ class FineDance(BodyRelease[FineDanceConfig]):
             number = path.stem
             facts: dict[str, Fact] = {}
             label = f"{LABELS}/{number}.json"
-            try:
+            with draft.reading(label):
                 if (source / label).is_file():
                     stated = require_record(read_json(source / label, label), label)
                     facts = {
                         key: str(value) for key, value in stated.items() if not isinstance(value, dict | list)
                     }
-            except UserError as error:
-                draft.fail(label, error)
             genre = next(
                 (str(facts[key]) for key in ("style2", "genre", "style1", "style") if key in facts), ""
             )

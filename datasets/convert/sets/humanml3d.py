@@ -89,12 +89,10 @@ class HumanMl3d(Release[HumanMl3dConfig]):
             texts: list[Caption] = []
             if folder and clip_id in listed:
                 label = f"{folder}/{clip_id}.txt"
-                try:
+                with draft.reading(label):
                     path = inside(self.config.source / folder, f"{clip_id}.txt", label)
                     texts, problems = read_humanml_captions(path, seconds=None, name=label)
                     draft.notes += [f"{label}: {'; '.join(problems)}"] if problems else []
-                except UserError as error:
-                    draft.fail(label, error)
             original = original_of(clip_id)
             yield Entry(
                 clip_id, file, tuple(texts), group=original or clip_id, mirror_of=original,
@@ -112,10 +110,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
         for folder in wanted:
             for name in sorted(path.name for path in (source / folder).glob("*.npy") if path.name[0] != "."):
                 label = f"{folder}/{name}"
-                try:
+                with draft.reading(label):
                     found.setdefault(check_id(name.removesuffix(".npy"), label), label)
-                except UserError as error:
-                    draft.fail(label, error)
         return found
 
     def _texts(self) -> str:

@@ -102,7 +102,7 @@ class Motion272(Release[Motion272Config]):
         path = self.config.source / file
         if not path.is_file():
             return
-        try:
+        with draft.reading(file):
             lines = [line for line in read_text_file(path, file).split("\n") if line.strip()]
             if any(line.count("#") >= 3 for line in lines):
                 captions, wrong = read_humanml_captions(path, seconds=None, name=file)
@@ -116,8 +116,6 @@ class Motion272(Release[Motion272Config]):
                     yield from captions_of(row["second"], "babel", change)
                 else:
                     yield from captions_of(line, "texts")
-        except UserError as error:
-            draft.fail(file, error)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return check_array_header(path, width=WIDTH, name=label), self.config.source_fps

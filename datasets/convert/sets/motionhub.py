@@ -138,7 +138,7 @@ class MotionHub(BodyRelease[MotionHubConfig]):
             name = row.get(field)
             if not isinstance(name, str):
                 continue
-            try:
+            with draft.reading(name):
                 path = inside(source, name)
                 if field == "speech_script_path":
                     yield from captions_of(read_text_file(path, name), "speech") if self.config.script else ()
@@ -146,8 +146,6 @@ class MotionHub(BodyRelease[MotionHubConfig]):
                 levels = require_record(read_json(path, name), name)
                 for level in self.config.levels:
                     yield from captions_of(levels.get(level), level)
-            except UserError as error:
-                draft.fail(name, error)
 
 
 def _motions(row: dict[str, object]) -> Iterator[str]:

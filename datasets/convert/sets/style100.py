@@ -7,12 +7,13 @@ frame of every movement (`FW_START`, `FW_STOP`); what is before and after is the
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
 
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.common.tables import captions_of, read_csv
-from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, state, stem
+from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, stem
 from motionloom.datasets.schema import UserError
 
 CUTS, STYLES = "Frame_Cuts.csv", "Dataset_List.csv"
@@ -37,16 +38,20 @@ class Style100Config(BvhSetConfig):
     licence: str | None = "CC-BY-4.0"
 
     def cut(self, label: str) -> slice:
-        return self._cuts().get(stem(label), slice(None))
+        return self.cuts.get(stem(label), slice(None))
 
     def unfit(self, path: str) -> str:
-        return "" if stem(path) in self._cuts() else f"no frames of it in {CUTS}"
+        return "" if stem(path) in self.cuts else f"no frames of it in {CUTS}"
 
-    def _cuts(self) -> dict[str, slice]:
-        return _cuts(self.source, state(self.source / CUTS))
+    @cached_property
+    def cuts(self) -> dict[str, slice]:
+        """First and last frame of every file that has them, by its name without suffix."""
+        return _cuts(self.source)
 
+    @cached_property
     def rows(self) -> dict[str, Row]:
-        return _rows(self.source, state(self.source / CUTS, self.source / STYLES))
+        """Captions of every file that has frames. Clips of one style stay together: new styles are tested."""
+        return _rows(self.source, self.cuts)
 
 
 class Style100(Bvh):
@@ -67,9 +72,7 @@ def _words(style: str) -> str:
     return " ".join(spaced.lower().split())
 
 
-@lru_cache(maxsize=4)
-def _cuts(source: Path, made: tuple[int, ...]) -> dict[str, slice]:
-    """First and last frame of every file that has them, by its name without suffix."""
+def _cuts(source: Path) -> dict[str, slice]:
     if not (source / CUTS).is_file():
         raise UserError(f"{source}: no {CUTS} in it; give the folder of the release")
     found = {}
@@ -86,13 +89,11 @@ def _cuts(source: Path, made: tuple[int, ...]) -> dict[str, slice]:
     return found
 
 
-@lru_cache(maxsize=4)
-def _rows(source: Path, made: tuple[int, ...]) -> dict[str, Row]:
-    """Captions of every file that has frames. Clips of one style stay together: new styles are tested."""
+def _rows(source: Path, cuts: Iterable[str]) -> dict[str, Row]:
     styles = read_csv(source / STYLES, ("Style Name", "Description")) if (source / STYLES).is_file() else []
     described = {_words(row["Style Name"]): row["Description"].strip().rstrip(".") for _, row in styles}
     found = {}
-    for name in _cuts(source, made[:1]):
+    for name in cuts:
         style, _, movement = name.rpartition("_")
         words, does = _words(style), f"a person {MOVEMENTS[movement]}"
         texts = captions_of(f"{does} in the style {words}", "style")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from motionloom.datasets.convert.aistpp.pickle_reader import load_aist_pickle, read_aist_motion
+from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.schema import UserError
 
 
@@ -35,11 +35,9 @@ def saved(folder: Path, data: object, protocol: int = 4) -> Path:
 def test_every_protocol_gives_the_same_numbers(tmp_path: Path, protocol: int) -> None:
     data = annotation(smpl_poses=np.asfortranarray(annotation()["smpl_poses"]))
     path = saved(tmp_path, data, protocol)
-    motion = read_aist_motion(path)
-    assert np.array_equal(motion.poses, data["smpl_poses"])
-    assert np.array_equal(motion.trans, data["smpl_trans"])
-    assert motion.scaling == 93.5
-    assert np.allclose(motion.metres(), data["smpl_trans"] / 93.5)
+    poses, trans = read_aist_motion(path)
+    assert np.array_equal(poses, data["smpl_poses"])
+    assert np.array_equal(trans, data["smpl_trans"] / np.float64(93.5))
 
 
 def test_big_endian_and_old_numpy_names(tmp_path: Path) -> None:
@@ -48,9 +46,7 @@ def test_big_endian_and_old_numpy_names(tmp_path: Path) -> None:
     raw = path.read_bytes()
     assert raw.count(b"numpy._core.multiarray")
     path.write_bytes(raw.replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
-    motion = read_aist_motion(path)
-    assert np.array_equal(motion.trans, data["smpl_trans"])
-    assert motion.trans.dtype == np.float32
+    assert np.array_equal(read_aist_motion(path)[1], data["smpl_trans"] / np.float64(93.5))
 
 
 @pytest.mark.parametrize(
@@ -63,9 +59,9 @@ def test_big_endian_and_old_numpy_names(tmp_path: Path) -> None:
         ({"smpl_trans": np.full((5, 3), np.nan)}, "smpl_trans: nan at frame 0, column 0"),
         ({"smpl_trans": np.full((5, 3), 1e9)}, "smpl_trans: .*1000"),
         ({"smpl_poses": np.full((5, 72), 1e6)}, "smpl_poses: .*100"),
-        ({"smpl_scaling": np.array([np.inf])}, "smpl_scaling is inf"),
-        ({"smpl_scaling": np.array([-93.0])}, "smpl_scaling is -93"),
-        ({"smpl_scaling": np.array([1.0, 2.0])}, "2 values"),
+        ({"smpl_scaling": np.array([np.inf])}, r"smpl_scaling is \[inf"),
+        ({"smpl_scaling": np.array([-93.0])}, r"smpl_scaling is \[-93"),
+        ({"smpl_scaling": np.array([1.0, 2.0])}, r"smpl_scaling is \[1.0, 2.0"),
         ({"smpl_scaling": "93"}, "smpl_scaling"),
         ({"smpl_trans": np.array([["a"] * 3] * 5)}, "array type"),
         ({"smpl_trans": np.empty((5, 3), object)}, "array type"),
@@ -118,7 +114,7 @@ def test_no_other_global_is_reached(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         (b"\x80\x05\x96" + struct.pack("<Q", 2**40) + b"x.", "damaged"),
         (b"\x80\x02" + b"N" * 2000 + b".", "more than 1000"),
         (b"cnumpy\ndtype\n.", "dict"),
-        (b"(I1\nI2\nd.", "dict"),
+        (b"(I1\nI2\nd.", "no key"),
         (b"(S'touch PWNED'\nios\nsystem\n.", r"os\.system"),  # INST names a class by itself
     ],
 )
@@ -126,7 +122,7 @@ def test_hostile_instructions(tmp_path: Path, stream: bytes, reason: str) -> Non
     path = tmp_path / "a.pkl"
     path.write_bytes(stream)
     with pytest.raises(UserError, match=rf"a\.pkl: .*{reason}"):
-        load_aist_pickle(path)
+        read_aist_motion(path)
 
 
 @pytest.mark.parametrize(
@@ -147,7 +143,7 @@ def test_allowed_names_are_not_misused(tmp_path: Path, value: bytes) -> None:
     with pytest.raises(UserError, match=r"a\.pkl: "):
         read_aist_motion(path)
     path.write_bytes(raw)
-    assert read_aist_motion(path).poses.dtype == np.float32, "nothing outlives a file"
+    assert read_aist_motion(path)[0].dtype == np.float32, "nothing outlives a file"
     assert np.dtype("f4").isnative
 
 
@@ -174,19 +170,13 @@ def test_any_cut_or_flipped_byte_is_an_error_or_other_numbers(tmp_path: Path) ->
         flipped[rng.integers(len(raw))] ^= 1 << rng.integers(8)
         path.write_bytes(flipped)
         try:
-            motion = read_aist_motion(path)
+            assert read_aist_motion(path)[0].shape == (1, 72)
         except UserError as error:
             assert "a.pkl: " in str(error)
-        else:
-            assert motion.poses.shape == (1, 72)
 
 
 def test_other_things_than_annotations(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"absent\.pkl"):
+    with pytest.raises(UserError, match=r"absent\.pkl: cannot read"):
         read_aist_motion(tmp_path / "absent.pkl")
-    path = saved(tmp_path, [1, 2])
     with pytest.raises(UserError, match="list"):
-        read_aist_motion(path)
-    path.write_bytes(b"")
-    with pytest.raises(UserError, match="0 bytes"):
-        read_aist_motion(path)
+        read_aist_motion(saved(tmp_path, [1, 2]))

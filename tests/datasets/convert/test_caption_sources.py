@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import random
-import re
 import shutil
 from pathlib import Path
 
@@ -60,17 +59,9 @@ def test_no_clip_moves_when_subjects_come_and_go(seed: int) -> None:
         )
 
 
-@pytest.mark.parametrize("subjects", [2, 3, 5, 12])
-def test_empty_splits_are_said_with_a_rule_that_fills_them(subjects: int) -> None:
-    names = [f"p{number}/a.bvh" for number in range(subjects)]
-    listing = BvhConfig(source=Path("x"), splits=Path("subjects")).listing(names)
-    notes = listing.empty_splits(dict.fromkeys(names, "train"))
-    found = re.search(r"--set splits=(subjects:\d+)", notes[0])
-    assert "val or test" in notes[0] and (found is not None) is (subjects > 2)
-    if found:
-        again = BvhConfig(source=Path("x"), splits=Path(found[1])).listing(names)
-        splits = {name: again.split_of(name) for name in names}
-        assert set(splits.values()) == {"train", "val", "test"} and not again.empty_splits(splits)
+def test_empty_splits_are_said() -> None:
+    listing = BvhConfig(source=Path("x"), splits=Path("subjects")).listing(["p1/a.bvh", "p2/a.bvh"])
+    assert "val or test" in listing.empty_splits(dict.fromkeys(["p1/a.bvh", "p2/a.bvh"], "train"))[0]
 
 
 def test_clips_that_the_user_moves_are_counted(source: Path, tmp_path: Path) -> None:

@@ -96,23 +96,6 @@ def test_humanml_index_at_250_frames_a_second_is_thinned_to_20_83(amass: ModuleT
     assert texts[0].end is None
 
 
-def test_humanml_index_with_splits(amass: ModuleType, humanml: Path) -> None:
-    splits = humanml / "splits"
-    splits.mkdir()
-    (splits / "train.txt").write_text("000000\nM000000\n009999\n")
-    (splits / "test.txt").write_text("000002\n")
-    options = {"humanml_index": humanml / "index.csv", "splits": splits, "mirror": True}
-    manifest = amass.make(humanml / "amass", humanml / "out", **options)
-    assert sorted(amass.features(humanml / "out")) == ["000000", "000002", "M000000"]
-    assert amass.reasons(manifest)["009999"].endswith("not in the source")
-    assert amass.reasons(manifest)["KIT/3/walk_left_poses.npz (000001)"] == "in no split file"
-    (splits / "test.txt").write_text("000002\nM000002\n")
-    (splits / "val.txt").write_text("M000001\n")
-    (splits / "train.txt").write_text("000001\n")
-    with pytest.raises(UserError, match=r"'M000001'.* mirrors '000001'.*leak"):
-        amass.make(humanml / "amass", humanml / "out2", **options)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [

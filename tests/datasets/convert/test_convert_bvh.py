@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import time
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +15,12 @@ from bvh_clips import unpack_bandai
 
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
 from motionloom.datasets.convert.bvh.plan import BvhClip
-from motionloom.datasets.convert.common import scan
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
+from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Manifest, Split, UserError
-from motionloom.datasets.shards.finish import join_parts
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, index_path
-from motionloom.datasets.shards.options import Part
 from motionloom.datasets.shards.reader import ShardDataset
 
 
@@ -65,9 +60,7 @@ def convert(given: BvhConfig, out: Path, *, workers: int = 1, **options: Any) ->
 
 
 def bytes_of(folder: Path) -> dict[str, str]:
-    """Of all but what a scan remembers."""
-    found = [path for path in sorted(folder.iterdir()) if path.name != SCAN_FILE]
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
+    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
 
 
 def reasons(manifest: Manifest) -> dict[str, str]:
@@ -87,7 +80,7 @@ def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_p
     assert {s.split: s.samples for s in manifest.shards} == {"train": 3, "val": 1, "test": 2}
     assert {s.split: s.frames for s in manifest.shards} == prepare(config(clips)).plan.frames
     assert str(clips) not in json.dumps(manifest.dump())
-    assert [p.name for p in (tmp_path / "out").iterdir() if p.name.startswith(".")] == [".scan.json"]
+    assert [p.name for p in (tmp_path / "out").iterdir() if p.name.startswith(".")] == []
     rows = {row["id"]: row for row in map(json.loads, (clips / "captions.jsonl").read_text().splitlines())}
     splits: tuple[Split, ...] = ("train", "val", "test")
     for split in splits:
@@ -101,71 +94,15 @@ def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_p
             assert abs(len(dataset.motion(i)) - row["frames"] * 20 / 30) < 1.5
 
 
-def test_a_single_clip_is_converted_like_the_whole(clips: Path, tmp_path: Path) -> None:
-    prepared = prepare(config(clips))
-    run_conversion(prepared, tmp_path / "out", progress=False)
-    (clip,) = [item for split, item in prepared.plan.items if split == "val"]
-    sample, dataset = prepared.converter.convert(clip), ShardDataset.open(tmp_path / "out", "val")
-    assert not isinstance(sample, list)
-    np.testing.assert_array_equal(sample.motion, dataset.motion(0))
-    assert (sample.meta, sample.texts) == (dataset.meta(0), dataset.texts(0))
-
-
-def test_a_finished_conversion_reads_nothing_again(
+def test_a_finished_conversion_converts_nothing_again(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = config(copy, unit="cm", up="y")  # what is said need not be settled by the first clips
-    time.sleep(0.05)  # a file changed in the tick in which it is read is read again
     first = convert(given, tmp_path / "out")
     before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")}
-
     monkeypatch.setattr(BvhClip, "read", pytest.fail)
-    monkeypatch.setattr("motionloom.datasets.convert.common.scan.read_file", pytest.fail)
     assert convert(given, tmp_path / "out") == first
     assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")} == before
-
-
-def test_of_parts_that_begin_at_once_one_reads_the_source(
-    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real, names = scan.read_file, list[str]()
-    time.sleep(0.05)  # as above
-
-    def counted(path: Path, label: str) -> bytes:
-        names.append(label)
-        return real(path, label)
-
-    monkeypatch.setattr(scan, "read_file", counted)
-    with ThreadPoolExecutor(3) as pool:
-        plans = list(pool.map(lambda _: prepare(config(copy), out=tmp_path / "out").plan.items, range(3)))
-    assert plans[0] == plans[1] == plans[2] and len(names) == len({*names}) == 7
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [".scan.json"]
-
-
-@pytest.mark.parametrize("count", [1, 3])
-def test_parts_and_their_join_give_the_same_bytes(copy: Path, tmp_path: Path, count: int) -> None:
-    (copy / "broken.bvh").write_text("HIERARCHY\nMOTION\nFrames: 60\nFrame Time: 0.033333\n1 2 3\n")
-    given = config(copy, uncaptioned="keep")
-    whole = convert(given, tmp_path / "whole", clips_per_shard=2)
-    out = tmp_path / "out"
-    for number in reversed(range(2, count + 1)):
-        run_part(given, out, Part(number, count))
-    if count > 1:
-        with pytest.raises(UserError, match=f"part 1/{count}"):
-            join_parts(out)
-    run_part(given, out, Part(1, count))
-    assert not (out / "manifest.json").exists()
-    assert join_parts(out) == whole
-    assert bytes_of(out) == bytes_of(tmp_path / "whole")
-    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
-    run_part(given, out, Part(1, count))  # all is there: nothing is made, and the manifest stays
-    assert join_parts(out) == whole
-    assert {path.name: path.stat().st_mtime_ns for path in out.iterdir()} == before
-
-
-def run_part(given: BvhConfig, out: Path, part: Part) -> Manifest:
-    prepared = prepare(given, out=out)
-    return run_conversion(prepared, out, clips_per_shard=2, progress=False, part=part)
 
 
 def test_ten_files_later_only_what_changed_is_converted(
@@ -199,35 +136,6 @@ def test_ten_files_later_only_what_changed_is_converted(
 
 def entries(out: Path, shard: str) -> list[ClipEntry]:
     return ShardIndex.load_json(index_path(out / shard)).clips
-
-
-def test_changed_file_and_changed_option_are_not_reused(copy: Path, tmp_path: Path) -> None:
-    first = convert(config(copy), tmp_path / "out")
-    path = clip_file(copy, "bow_childish")
-    path.write_text(path.read_text().replace("Frame Time:\t0.0333333", "Frame Time:\t0.05"))
-    second = convert(config(copy), tmp_path / "out")
-    frames = [{s.split: s.frames for s in m.shards}["val"] for m in (first, second)]
-    assert frames == [65, 98]
-    with pytest.raises(UserError, match=r"\(fps 20.0 -> 10.0\)"):
-        convert(config(copy, fps=10.0), tmp_path / "out")
-    (tmp_path / "out" / "manifest.json").unlink()
-    third = convert(config(copy, fps=10.0), tmp_path / "out")
-    assert {s.split: s.frames for s in third.shards}["val"] == 49
-
-
-def test_broken_files_are_reported_and_skipped(copy: Path, shared: Path, tmp_path: Path) -> None:
-    for path in (shared / "data/broken/bvh").glob("*.bvh"):
-        shutil.copy(path, copy)
-    given = config(copy, uncaptioned="keep", min_seconds=0)
-    plan = prepare(given).plan
-    assert len(plan.broken) == 4  # frame_time_zero, no_motion, missing_frames, extra_frames
-    manifest = convert(given, tmp_path / "out")
-    told = reasons(manifest)
-    assert "10 frames, 6 found" in told["missing_frames.bvh"]
-    assert "is not UTF-8" in told["non_utf8.bvh"]
-    assert not any(name in told for name in ("control_ok.bvh", "crlf_bom.bvh"))
-    assert len(told) == 9
-    assert all("broken/bvh" not in reason and str(copy) not in reason for reason in told.values())
 
 
 def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> None:

@@ -1,10 +1,9 @@
-"""BVH conversion without a joint map (a guess for each skeleton), without fingers, and of ASF/AMC trials."""
+"""BVH conversion without a joint map (a guess for each skeleton) and without fingers."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import tarfile
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +153,7 @@ def test_files_that_sort_first_and_captions_change_no_map(tool: str, tmp_path: P
     source, out = tmp_path / "mocap", tmp_path / "out"
     for take in range(2):
         write_figure(source / f"{5 + take}.bvh", build(BY_TOOL[tool]), frames=66, seed=take)
-    plan_of = prepare(BvhConfig(source=source), maps=out).plan
+    plan_of = prepare(BvhConfig(source=source), out=out).plan
     (path,) = (out / "joint_maps").iterdir()
     before = path.read_bytes()
     captions = tmp_path / "c.csv"
@@ -296,27 +295,3 @@ def test_a_plan_needs_no_licence_and_a_conversion_does(clips: Path, tmp_path: Pa
     assert prepared.plan.items
     with pytest.raises(UserError, match="--set licence="):
         run_conversion(prepared, tmp_path / "out", progress=False)
-
-
-TRIALS = ("HDM_bd_squat1Reps_012_120.amc", "HDM_bd_depositFloorR_001_120.amc")
-
-
-@pytest.fixture(scope="module")
-def trials(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two trials of one actor, and a third whose skeleton is not there."""
-    folder = tmp_path_factory.mktemp("trials")
-    with tarfile.open(shared / "data/real/hdm05/hdm05.tar.xz", "r|*") as archive:
-        for member in archive:
-            name = Path(member.name).name
-            file = archive.extractfile(member) if name in (*TRIALS, "HDM_bd.asf") else None
-            if file is not None:
-                (folder / name).write_bytes(file.read())
-    (folder / "HDM_xx_walk.amc").write_bytes((folder / TRIALS[0]).read_bytes())
-    return folder
-
-
-def test_trials_are_converted_by_the_skeleton_of_their_subject(trials: Path, tmp_path: Path) -> None:
-    manifest = convert(trials, tmp_path / "out")
-    assert sum(shard.samples for shard in manifest.shards) == 2
-    left_out = (tmp_path / "out" / "left-out.txt").read_text("utf-8")
-    assert "HDM_xx_walk.amc" in left_out and "HDM_xx.asf" in left_out

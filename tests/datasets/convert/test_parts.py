@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import random
 import shutil
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
+from typing import Any
 
+import amass_clips
 import pytest
+import release_trees
 from bvh_clips import write_clip
 
-from motionloom.datasets.convert.common.conversion import SCAN_FILE, run_conversion
+from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import converter_named, prepare
 from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.finish import join_parts
@@ -59,8 +64,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def bytes_of(root: Path) -> dict[str, str]:
-    """Of all but what a scan remembers."""
-    found = [path for path in sorted(root.rglob("*")) if path.is_file() and path.name != SCAN_FILE]
+    found = [path for path in sorted(root.rglob("*")) if path.is_file()]
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
 
 
@@ -91,60 +95,106 @@ def test_parts_that_run_at_once_and_die_give_the_bytes_of_one_process(source: Pa
     assert bytes_of(tmp_path / "parts") == bytes_of(tmp_path / "whole"), f"{count} parts"
 
 
-CASES = {
-    "bvh": ({"licence": "CC0-1.0"}, 12),
-    "humanml3d": ({}, 6),
-    "motionx": ({}, 6),
-    "aistpp": ({"sound": "none"}, 4),
-}
-"""Settings, and damages that are tried, of each converter."""
+SILENT = {"audio_features": False, "sound_rate": 8000}
+CASES: dict[str, dict[str, Any]] = {
+    "bvh": {"licence": "CC0-1.0"}, "humanml3d": {}, "motionx": {}, "aistpp": {"sound": "none"}, "amass": {},
+    "motionhub": SILENT, "finedance": SILENT, "bones_seed": {}, "motion272": {}, "snapmogen": {},
+    "beat2": SILENT, "style100": {},
+}  # fmt: skip
+"""Settings of each converter."""
 
 
-@pytest.mark.parametrize("kind", CASES)
-def test_one_damaged_or_misnamed_file_leaves_the_others(
-    kind: str, source: Path, shared: Path, tmp_path: Path
-) -> None:
-    settings, tries = CASES[kind]
-    root, converter = shared / "data/layouts" / kind, converter_named(kind)
-    if kind == "bvh":
-        (root := tmp_path / "bvh").mkdir()
+def source_of(kind: str, root: Path, shared: Path, mocap: Path) -> Path:
+    """A folder of a converter's source, free to change."""
+    if kind in ("humanml3d", "motionx", "aistpp"):
+        return Path(shutil.copytree(shared / "data/layouts" / kind, root))
+    if kind == "amass":
+        for number in range(3):
+            amass_clips.save(root / f"KIT/3/{number}_poses.npz", **amass_clips.walk(60.0, 2.0 + number))
+    elif kind == "bvh":
+        root.mkdir()
         for name in ("take0/0.bvh", "take1/1.bvh", "take1/3.bvh"):
-            shutil.copy(source / name, root)
+            shutil.copy(mocap / name, root)
         own = (root / "3.bvh").read_text().replace("left_wrist", "left_hand")
         (root / "3.bvh").write_text(own)  # the only file of its skeleton
-    before, seed = -1, random.randrange(2**32)
-    rng = random.Random(seed)
-    for number in range(tries):
-        case = f"{kind}: damage {number} of seed {seed}"
-        folder, out = tmp_path / f"source{number}", tmp_path / f"out{number}"
-        shutil.copytree(root, folder)
-        last = sorted(path for path in folder.rglob("*") if is_motion(path))[-1]
-        if number == 1:
-            last.write_bytes(last.read_bytes()[:-40])
-        elif number:
-            damage(rng, rng.choice(sorted(path for path in folder.rglob("*") if is_motion(path))))
-        config = converter.config_class.parse({"source": folder, "most_rejected": 1, **settings}, case)
-        planned = prepare(config, kind=converter, out=out)
-        manifest = run_conversion(planned, out, progress=False)
+        with tarfile.open(shared / "data/real/cmu/amc.tar.xz", "r|*") as archive:
+            for member in archive:
+                if member.name in ("amc/01.asf", "amc/01_01.amc", "amc/02.asf", "amc/02_01.amc"):
+                    archive.extract(member, root, filter="data")
+    else:
+        getattr(release_trees, kind)(root)
+    if kind == "snapmogen":
+        shutil.copy(root / "renamed_feats/m_ep2_00086.npy", root / "renamed_feats/other.npy")
+        said = json.loads((root / "all_caption_clean.json").read_text())
+        release_trees.put(root / "all_caption_clean.json", {**said, "other#0#90": {"manual": ["walks"]}})
+        shutil.rmtree(root / "data_split_info1")
+    return root
+
+
+@pytest.mark.parametrize("tries", [3, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kind", CASES)
+def test_one_damaged_or_misnamed_file_leaves_the_others(
+    kind: str, tries: int, source: Path, shared: Path, tmp_path: Path
+) -> None:
+    """Of any file of the folder a byte, the end or the name: the others are converted. Of a list of clips, a
+    sentence says what is wrong.
+    """
+    converter, whole = converter_named(kind), source_of(kind, tmp_path / "whole", shared, source)
+    seed = random.randrange(2**32)
+    rng, before = random.Random(seed), -1
+    for number in range(tries + 1):
+        case, folder = f"{kind}: damage {number} of seed {seed}", tmp_path / "folder"
+        out = tmp_path / f"out{number}"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(whole, folder)
+        files = sorted(path for path in folder.rglob("*") if path.is_file() and "official" not in str(path))
+        harmed = rng.choice([path for path in files if is_clip(path)] if number % 2 else files)
+        if number:
+            damage(rng, harmed)
+        given = {"source": folder, "most_rejected": 1, "look": number % 3, **CASES[kind]}
+        try:
+            planned = prepare(converter.config_class.parse(given, case), kind=converter, out=out)
+            manifest = run_conversion(planned, out, progress=False)
+        except UserError as error:
+            assert number and not is_clip(harmed), f"{case}: {harmed}: {error}"
+            assert "\n" not in str(error)
+            continue
         clips = sum(shard.samples for shard in manifest.shards)
         lost = {drop.source: drop.reason for drop in manifest.dropped}
-        assert clips >= before - 2, f"{case}: {lost}"  # a clip, and its mirrored twin
+        if is_clip(harmed):
+            assert clips >= before - 2, (
+                f"{case}: {harmed}: {lost}"
+            )  # its clips: also a mirrored one, or two cuts
         assert Manifest.load_json(out / "manifest.json") == manifest, case
         before = max(before, clips)
 
 
-def is_motion(path: Path) -> bool:
-    return path.suffix in (".bvh", ".npy", ".pkl") and "official" not in str(path)
+def is_clip(path: Path) -> bool:
+    """Whether a file is of a single clip: its motion, words, labels or sound."""
+    lists = ("train", "val", "test", "all_caption", "ignore_list", "seed_metadata")
+    own = path.suffix in (
+        ".bvh",
+        ".amc",
+        ".npy",
+        ".npz",
+        ".pkl",
+        ".wav",
+        ".TextGrid",
+        ".txt",
+        ".json",
+        ".asf",
+    )
+    return own and not any(word in path.name for word in lists) and "golden" not in str(path)
 
 
 def damage(rng: random.Random, path: Path) -> None:
     """Change a byte, cut the end off, or give it another name, in place."""
     data = bytearray(path.read_bytes())
     kind = rng.randrange(3)
-    if kind == 0:
+    if kind == 0 and data:
         data[rng.randrange(len(data))] = rng.randrange(256)
         path.write_bytes(data)
-    elif kind == 1:
+    elif kind == 1 and data:
         path.write_bytes(data[: rng.randrange(len(data))])
     else:
         name = bytes(rng.choice(b'A \n,"\\\x8f\xe9\xff') for _ in range(6))

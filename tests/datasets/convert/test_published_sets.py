@@ -141,10 +141,6 @@ def nan_at(path: Path, key: str | None = None) -> None:
     np.savez(path, **arrays)
 
 
-def cut(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
 def text(path: Path, old: str, new: str) -> None:
     path.write_text(path.read_text(encoding="utf-8").replace(old, new), encoding="utf-8")
 
@@ -225,40 +221,26 @@ HML = "HumanML3D_AMASS/smplh_52/000/000001.npz"
 LIST = "annotations/text_motion/train.json"
 META, LABELS = "metadata/seed_metadata_v004.csv", "metadata/seed_metadata_v002_temporal_labels.jsonl"
 DANCE = "motion/001.npy"
-VECTORS, FEATS, SAID = "motion_data/000000.npy", "renamed_feats/m_ep2_00086.npy", "all_caption_clean.json"
+VECTORS, SAID = "motion_data/000000.npy", "all_caption_clean.json"
 CUTS, BEAT = "Frame_Cuts.csv", "beat_english_v2.0.0"
-LIST2 = f"{BEAT}/train_test_split.csv"
 TALK, GRID = f"{BEAT}/smplxflame_30/2_scott_0_1_1.npz", f"{BEAT}/textgrid/2_scott_0_1_1.TextGrid"
 
 DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
-    ("motionhub", lambda root: cut(root / HML), f"{HML}: not an .npz file, or cut off"),
     ("motionhub", lambda root: nan_at(root / HML, "poses"), f"{HML}: poses: nan at frame 5, column 1"),
-    ("motionhub", lambda root: cut(root / LIST), f"{LIST}: not valid JSON"),
     ("motionhub", lambda root: (root / LIST).write_text('{"data_list": {"a": 3}}'), "train.json: 'a': "),
     ("motionhub", lambda root: text(root / LIST, "aist/s", "../s"), "not a plain relative"),
-    ("motionhub", lambda root: cut(root / "aist/music/m.wav"), "aist/music/m.wav"),
-    ("finedance", lambda root: cut(root / DANCE), f"{DANCE}: truncated array"),
-    ("finedance", lambda root: nan_at(root / DANCE), f"{DANCE}: nan at frame 5, column 9"),
     ("finedance", lambda root: wide(root / DANCE, 319), f"{DANCE}: expected [T, 315], found [90, 319]"),
     ("finedance", lambda root: wide(root / DANCE, 315), f"{DANCE}: no rotation at frame 0, joint 0"),
     ("bones_seed", lambda root: text(root / META, "actor_uid", "actor"), "no column 'actor_uid'"),
     ("bones_seed", lambda root: text(root / META, ",A1,", ","), "6 columns, the header has 7"),
     ("bones_seed", lambda root: text(root / META, ",361,Dances", ",long,Dances"), "move_duration_frames"),
-    ("bones_seed", lambda root: cut(root / LABELS), f"{Path(LABELS).name}:1: not valid JSON"),
     ("bones_seed", lambda root: text(root / LABELS, "end_time", "end"), "needs filename, and events with"),
     ("motion272", lambda root: wide(root / VECTORS, 263), f"{VECTORS}: expected [T, 272], found [90, 263]"),
-    ("motion272", lambda root: (root / "texts/000000.txt").write_bytes(b"\xff\xfe#"), "not UTF-8 text"),
-    ("motion272", lambda root: text(root / "split/test.txt", "000001", "000000"), "in two splits leaks"),
-    ("snapmogen", lambda root: wide(root / FEATS, 148), f"{FEATS}: expected [T, 296], found [90, 148]"),
     ("snapmogen", lambda root: text(root / SAID, "gone#0#90", "gone"), "a clip is named NAME#FIRST#LAST"),
     ("snapmogen", lambda root: text(root / SAID, '"gone#0#90": {', '"gone#0#90": [{}], "x#0#9": {'),
      "'gone#0#90': a JSON object is expected"),
     ("beat2", lambda root: nan_at(root / TALK, "expressions"), "expressions: nan at frame 5, column 1"),
     ("beat2", lambda root: text(root / GRID, '"words"', '"letters"'), f'{GRID}: no tier "words" in it'),
-    ("beat2", lambda root: text(root / LIST2, "id,type", "id,kind"), "no column 'type'"),
-    ("beat2", lambda root: cut(root / BEAT / "wave16k/2_scott_0_1_1.wav"), "2_scott_0_1_1.wav"),
-    ("style100", lambda root: cut(root / "Old/Old_FW.bvh"), "Old/Old_FW.bvh"),
-    ("style100", lambda root: text(root / CUTS, "STYLE_NAME", "STYLE"), "no column 'STYLE_NAME'"),
     ("style100", lambda root: text(root / CUTS, "Old,40", "Old,now"), "frames 'now' to '221'"),
     ("style100", lambda root: text(root / CUTS, "Old,40,221", "Old,999,1200"), "shorter than 1 s"),
     ("style100", lambda root: (root / CUTS).unlink(), "no Frame_Cuts.csv in it"),

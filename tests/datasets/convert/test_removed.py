@@ -68,9 +68,7 @@ def content(folder: Path) -> dict[str, bytes]:
     """Files of a set without the record, whose salt is random, and what converters remember."""
     files = (path for path in folder.rglob("*") if path.is_file())
     return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in files
-        if path.name not in (REMOVED_FILE, ".scan.json")
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in files if path.name != REMOVED_FILE
     }
 
 

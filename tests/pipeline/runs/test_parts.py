@@ -9,7 +9,6 @@ from preempted import write_recipe
 from rich.console import Console
 
 from motionloom.datasets.base.lock import file_lock
-from motionloom.datasets.convert.common.conversion import SCAN_FILE
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
@@ -22,9 +21,9 @@ def convert(recipe: Path, run: Path, part: str = "", until: str = "data") -> Non
 
 
 def files(run: Path) -> dict[Path, bytes]:
-    """All but times, and a scan's memory, which leaves out files that had just been written."""
-    data, left = run / "stages/data", ("timing.json", SCAN_FILE)
-    found = (path for path in data.rglob("*") if path.is_file() and path.name not in left)
+    """All but times."""
+    data = run / "stages/data"
+    found = (path for path in data.rglob("*") if path.is_file() and path.name != "timing.json")
     return {path.relative_to(data): path.read_bytes() for path in found}
 
 

@@ -22,17 +22,11 @@ from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.converter import PlanSettings
-from motionloom.datasets.convert.common.features import (
-    body_of,
-    canonical_smpl75,
-    features_of,
-    require_human,
-    upright,
-)
+from motionloom.datasets.convert.common.features import canonical_smpl75, features_of, require_human, upright
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
-from motionloom.datasets.motion.body.smpl import SkeletonName, smpl_joints
+from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.schema import UserError
@@ -89,7 +83,8 @@ class BodyRelease(Release[Cfg]):
 
     def __init__(self, config: Cfg) -> None:
         super().__init__(config)
-        self.body = body_of(config.body_model, cast("SkeletonName", self.layout.skeleton_name))
+        model, skeleton = config.body_model, cast("SkeletonName", self.layout.skeleton_name)
+        self.body = BodyModel.load(model, skeleton) if model else BodyModel.neutral(skeleton)
         found = self.body.statement["kind"]
         if config.body_model is not None and found != self.model:
             raise UserError(
@@ -139,10 +134,8 @@ class BodyRelease(Release[Cfg]):
         for sound in dict.fromkeys(entry.sound for entry in entries if self.config.sound != "none"):
             if sound is not None:
                 label = f"{folder}{sound}"
-                try:
+                with draft.reading(label):
                     lengths[sound] = sound_seconds(inside(self.sound_folder, sound, label), label)
-                except UserError as error:
-                    draft.fail(label, error)
         for entry in entries:
             sound = entry.sound if entry.sound in lengths else None
             silent += sound is None and self.config.sound != "none"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 from typing import NamedTuple
 
 from motionloom.datasets.convert.bvh.plan import BvhConfig
@@ -35,6 +35,7 @@ class BvhSetConfig(BvhConfig):
     up: Up = "y"
     """Upward axis of the files."""
 
+    @property
     @abstractmethod
     def rows(self) -> Mapping[str, Row]:
         """Return the rows of the tables by the names of files without folder and suffix; read once."""
@@ -44,16 +45,16 @@ class BvhSetConfig(BvhConfig):
         return True
 
     def about(self, path: str) -> Facts:
-        row = self.rows().get(stem(path))
+        row = self.rows.get(stem(path))
         return row.facts if row else {}
 
     def unfit(self, path: str) -> str:
-        return "" if stem(path) in self.rows() else "not in the tables of the set"
+        return "" if stem(path) in self.rows else "not in the tables of the set"
 
     def listing(self, paths: Sequence[str]) -> Listing:
         if self.captions:
             return super().listing(paths)
-        known, here = self.rows(), {stem(path): path for path in paths}
+        known, here = self.rows, {stem(path): path for path in paths}
         rows = [
             CaptionRow(name, row.texts, here[name], hash_split(row.group), name)
             for name, row in known.items()
@@ -62,11 +63,6 @@ class BvhSetConfig(BvhConfig):
         found = list_clips(paths, rows, read_split_files(self.splits)[0] if self.splits else None, [])
         found.missing.update({name: name for name in known if name not in here})
         return found
-
-
-def state(*paths: Path) -> tuple[int, ...]:
-    """Times at which tables were changed, by which what was read of them is kept."""
-    return tuple(path.stat().st_mtime_ns if path.exists() else 0 for path in paths)
 
 
 def stem(path: str) -> str:

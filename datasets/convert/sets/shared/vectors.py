@@ -29,19 +29,16 @@ _SHORTEST = 1e-6
 """A row, or what is left of the second beside the first, that is shorter than this has no direction."""
 
 
-def matrices_of_rows(rows: NDArray[np.float64], label: str) -> NDArray[np.float64]:
-    """[T, N, 6] -> rotation matrices [T, N, 3, 3] by Gram and Schmidt; `UserError` for rows of no length."""
+def rotvecs_of_rows(rows: NDArray[np.float64], label: str) -> NDArray[np.float64]:
+    """Six columns [T, N, 6], the first two rows of a rotation matrix, -> axis-angles [T, N, 3] in radians, by
+    Gram and Schmidt; `UserError` for rows of no length.
+    """
+    from scipy.spatial.transform import Rotation
+
     first, second = rows[..., :3], rows[..., 3:]
     x = _unit(first, label)
     y = _unit(second - (x * second).sum(axis=-1, keepdims=True) * x, label)
-    return np.stack([x, y, np.cross(x, y)], axis=-2)
-
-
-def rotvecs_of_rows(rows: NDArray[np.float64], label: str) -> NDArray[np.float64]:
-    """Six columns [T, N, 6], the first two rows of a rotation matrix, -> axis-angles [T, N, 3] in radians."""
-    from scipy.spatial.transform import Rotation
-
-    matrices = matrices_of_rows(rows, label)
+    matrices = np.stack([x, y, np.cross(x, y)], axis=-2)
     vectors = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec()
     return np.asarray(vectors.reshape(*matrices.shape[:2], 3), dtype=np.float64)
 
