@@ -25,6 +25,11 @@ MAX_BYTES = 2**30
 """Largest array read by default: an hour at 200 frames a second of 156 doubles is 0.9 GB."""
 
 
+_SPARE, _PACKED = 2**25, 5
+"""Bytes that any array may take in memory, and more for each of its bytes in the file: motion packs to a half
+and float32 doubles as float64. What is packed tighter says nothing, or is a bomb."""
+
+
 @dataclass(frozen=True)
 class ArrayHeader:
     """Shape and type that an array's header states."""
@@ -104,12 +109,15 @@ class NpzFile:
                 stream, f"{self.label}: array '{name}'", self._zip.getinfo(f"{name}.npy").file_size
             )
 
-    def array(self, name: str, *, limit: int = MAX_BYTES) -> NDArray[Any]:
+    def array(self, name: str, *, limit: int = MAX_BYTES, itemsize: int = 0) -> NDArray[Any]:
+        """An array; `itemsize` is what a value takes once it is converted, where that is more."""
         header = self.header(name)
-        if header.end > limit:
+        size = header.start + math.prod(header.shape) * max(header.dtype.itemsize, itemsize)
+        most = min(limit, _SPARE + _PACKED * self._zip.getinfo(f"{name}.npy").compress_size)
+        if size > most:
             raise UserError(
-                f"{self.label}: array '{name}' of shape {list(header.shape)} takes {header.end:,} bytes; "
-                f"more than {limit:,} are not read"
+                f"{self.label}: array '{name}' of shape {list(header.shape)} takes {size:,} bytes; more than "
+                f"{most:,} are not read"
             )
         # The stream is opened anew: the header has been read off the first one, and zips do not seek cheaply.
         with self._open(name) as stream:
@@ -120,7 +128,7 @@ class NpzFile:
         kind = self.header(name).dtype
         if kind.kind not in "fiu":
             raise UserError(f"{self.label}: array '{name}' has type {kind}, not numbers")
-        return self.array(name, limit=limit).astype(np.float64, copy=False)
+        return self.array(name, limit=limit, itemsize=8).astype(np.float64, copy=False)
 
     @contextmanager
     def _open(self, name: str) -> Iterator[IO[bytes]]:

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import tarfile
+import tracemalloc
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +23,17 @@ from shard_samples import write
 
 from motionloom.datasets.audio.sound import MAX_RATE, read_sound
 from motionloom.datasets.check.dataset import examine
+from motionloom.datasets.convert.amass.smpl_npz import read_motion
 from motionloom.datasets.convert.captions.collect import read_captions
+from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
+from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.schema import Manifest, ShardInfo, UserError
 from motionloom.datasets.shards.index import read_index
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.tar import MOST_CLIPS, scan_tar
+from motionloom.pipeline.inference.edits.clip_file import read_clip
 
 HEAD = "HIERARCHY\nROOT {name}\n{{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
 MOTION = "MOTION\nFrames: 1\nFrame Time: 0.05\n{}\n"
@@ -105,6 +112,49 @@ def test_endless_files_are_refused_in_one_sentence(read: Callable[[Path], object
     with pytest.raises(UserError) as caught:
         read(tmp_path)
     assert len(str(caught.value)) < 500 and "\n" not in str(caught.value)
+
+
+def packed(path: Path, **shapes: tuple[str, tuple[int, ...]]) -> Path:
+    """An npz of zeros of these types and shapes: a thousandth of their length."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, (kind, shape) in shapes.items():
+            with archive.open(f"{name}.npy", "w") as file:
+                header = {"descr": kind, "fortran_order": False, "shape": shape}
+                np.lib.format.write_array_header_1_0(file, header)
+                size = np.dtype(kind).itemsize * math.prod(shape)
+                for start in range(0, size, 2**20):
+                    file.write(bytes(min(2**20, size - start)))
+    return path
+
+
+WIDE: dict[str, Callable[[Path, str, int], object]] = {
+    "AMASS": lambda path, kind, n: read_motion(
+        packed(path, poses=(kind, (n, 165)), trans=(kind, (n, 3))), "x", hands=True
+    ),
+    "a clip": lambda path, kind, n: read_clip(packed(path, joints=(kind, (n, 22, 3)), face=(kind, (n, 50)))),
+    "a body": lambda path, kind, n: BodyModel.load(
+        packed(path, kintree_table=("<u4", (2, 24)), v_template=(kind, (n, 3))), "smpl22"
+    ),
+    "numbers": lambda path, kind, n: NpzFile(packed(path, a=(kind, (n, 99)))).numbers("a"),
+}
+
+
+@pytest.mark.parametrize("kind", ["|u1", "<f2", "<f4"])
+@pytest.mark.parametrize("read", WIDE.values(), ids=WIDE.keys())
+@pytest.mark.parametrize("frames", [20_000, 300_000])
+def test_arrays_take_no_more_than_their_file_allows(
+    read: Callable[[Path, str, int], object], kind: str, frames: int, tmp_path: Path
+) -> None:
+    """20 times the file and 200 MB, after the conversion to float64 too."""
+    path = tmp_path / "x.npz"
+    tracemalloc.start()
+    try:
+        with suppress(UserError):
+            read(path, kind, frames)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak <= 20 * path.stat().st_size + 200e6
 
 
 def test_sound_of_a_high_rate_is_brought_down_while_it_is_read(tmp_path: Path) -> None:
