@@ -33,6 +33,10 @@ FLOOR_METRES = 0.3
 """Largest distance of the lowest joint from the floor in the median frame: jumps are shorter than half a
 clip, and joints of feet lie up to 0.1 m above their soles."""
 
+LIMBS = 2.0
+"""Factor by which a limb's share of the height may differ from the adult's, and left from right: in any unit,
+1.62 was recorded at most. A collapsed skeleton has limbs of hardly any length."""
+
 MOST = 0.5
 """Share of the clips that must be people standing on a floor."""
 
@@ -72,6 +76,17 @@ def _length(joints: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 _HEIGHT_OF_LENGTH = _NEUTRAL_HEIGHT / float(_length(_NAMED.rest_joints))
+_BONES = [
+    [_NAMED.index(f"{side}_{joint}") for side in ("left", "right") for joint in joints]
+    for joints in (("hip", "knee", "shoulder", "elbow"), ("knee", "ankle", "elbow", "wrist"))
+]
+"""Beginnings and ends of thighs, shins, upper arms and forearms, the left ones first."""
+
+
+def _limbs(joints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Joints [..., 22, 3] -> length of eight limbs [..., 8]."""
+    first, last = _BONES
+    return np.asarray(np.linalg.norm(joints[..., last, :] - joints[..., first, :], axis=-1))
 
 
 @dataclass(frozen=True)
@@ -89,6 +104,8 @@ class FigureMeasure:
     toes: float
     """Cosine of the feet's direction and the figure's, -1 to 1: negative where left and right are
     swapped."""
+    limbs: float = 1.0
+    """Largest factor between a limb's share of the height and the adult's, or between left and right."""
 
 
 def measure(joints: NDArray[np.floating], fps: float) -> FigureMeasure:
@@ -103,16 +120,21 @@ def measure(joints: NDArray[np.floating], fps: float) -> FigureMeasure:
     floor = float(np.asarray(joints)[:, :BODY_JOINTS, 1].min())
     heading = np.exp(1j * facing(body))
     toes = ground(body[:, _FEET] - body[:, _ANKLES]) * heading.conj()[:, None]
+    height = float(np.median(_length(body))) * _HEIGHT_OF_LENGTH
+    limbs = np.maximum(np.median(_limbs(body), axis=0), 1e-9)
+    shares = limbs / max(height, 1e-9) * (_NEUTRAL_HEIGHT / _limbs(_NAMED.rest_joints))
+    factors = np.concatenate([shares, limbs[:4] / limbs[4:]])
     return FigureMeasure(
-        height=float(np.median(_length(body))) * _HEIGHT_OF_LENGTH,
+        height=height,
         up=(float(up[0]), float(up[1]), float(up[2])),
         floor=floor,
         above_floor=float(np.median(lowest)) - floor,
         toes=float(np.median(toes.real / np.maximum(np.abs(toes), 1e-9))),
+        limbs=float(np.maximum(factors, 1 / factors).max()),
     )
 
 
-Kind = Literal["size", "lying", "upside down", "floating", "below the floor", "left and right"]
+Kind = Literal["size", "limbs", "lying", "upside down", "floating", "below the floor", "left and right"]
 
 
 @dataclass(frozen=True)
@@ -138,20 +160,20 @@ class Oddity:
 
 
 class PlausibilityStats:
-    """Many clips together, in 20 bytes each."""
+    """Many clips together, in 24 bytes each."""
 
     def __init__(self) -> None:
         self._rows = array("f")
 
     def __len__(self) -> int:
-        return len(self._rows) // 5
+        return len(self._rows) // 6
 
     def add(self, clip: FigureMeasure) -> None:
-        self._rows.extend((clip.height, clip.up[1], clip.floor, clip.above_floor, clip.toes))
+        self._rows.extend((clip.height, clip.up[1], clip.floor, clip.above_floor, clip.toes, clip.limbs))
 
     def _columns(self) -> list[NDArray[np.float64]]:
-        """Height, upward part, floor, distance from it and toes of the clips, each [n]."""
-        return list(np.array(self._rows, dtype=np.float64).reshape(-1, 5).T)
+        """Height, upward part, floor, distance from it, toes and limbs of the clips, each [n]."""
+        return list(np.array(self._rows, dtype=np.float64).reshape(-1, 6).T)
 
     @property
     def height(self) -> float:
@@ -175,7 +197,7 @@ class PlausibilityStats:
         """
         if not len(self):
             return []
-        height, up, floor, above, toes = self._columns()
+        height, up, floor, above, toes, limbs = self._columns()
         small, tall = PERSON_METRES
         out: list[Oddity] = []
 
@@ -191,6 +213,12 @@ class PlausibilityStats:
             ~((height >= small) & (height <= tall)),
             f"show figures that are not {small:g} to {tall:g} m tall (median {self.height:.3g} m; "
             f"a wrong length unit?)",
+        )
+        count(
+            "limbs",
+            ~(limbs <= LIMBS),
+            f"show figures with a limb {LIMBS:g} times longer or shorter than a person's, or its other side "
+            f"(joints in wrong places, or a collapsed skeleton?)",
         )
         count(
             "upside down", up < -UPRIGHT, "show figures whose head is below the pelvis (a wrong upward axis?)"

@@ -145,6 +145,14 @@ def lying(joints: Floats) -> Floats:
     return np.stack([joints[..., 0], joints[..., 2], -joints[..., 1]], axis=-1)
 
 
+def collapsed(joints: Floats) -> Floats:
+    """Thighs of hardly any length, as of position channels that are half filled; no unit mends that."""
+    shift = 0.95 * (joints[:, [1, 2]] - joints[:, [4, 5]])
+    for first, move in zip((4, 5), shift.swapaxes(0, 1), strict=True):
+        joints[:, first::3][:, :3] += move[:, None]
+    return joints * 1.3
+
+
 def mirrored(joints: Floats) -> Floats:
     return joints[:, list(SKELETON.mirror)]
 
@@ -182,6 +190,7 @@ def test_a_few_who_lie_are_no_error_and_many_are() -> None:
         (lambda joints: joints / 2.54, "size"),
         (lying, "lying"),
         (lambda joints: joints * [1, -1, -1], "upside down"),
+        (lambda joints: collapsed(joints.copy()), "limbs"),
         (mirrored, "left and right"),
     ],
 )
