@@ -1,4 +1,4 @@
-"""Faults in the motion of one clip: feet off the floor, jumps, jitter, swapped sides, nobody at all.
+"""Faults in the motion of one clip: feet off the floor, jumps, flips, jitter, swapped sides, nobody at all.
 
 Every bound is far from what people do: each stands beside the most that was measured on recorded clips
 (docs/data.md has the shares of false alarms and of planted faults that are found). What is said of feet is
@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.canonical import facing, ground
+from motionloom.datasets.motion.canonical import facing, ground, runs
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import PERSON_METRES, UPRIGHT, measure
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -39,10 +40,21 @@ and what 3 g, a hard landing, do in a frame; of 0.095 at 20 frames a second 0.07
 TREMOR, TREMOR_SPEED = 0.003, 320.0
 """Metres of noise, as a standard deviation, of the median joint seen from the pelvis: so much at any frame
 rate, and what fast limbs add to its estimate at a low one (metres a second⁴)."""
+LIMB_SNAP, LIMB_FLIP, LONGEST_FLIP = 1.2, 0.5, 10
+"""Change of a bone's direction (2 is opposite) in one frame beyond those beside it: at most, and where it is
+taken back within ten frames. Quick kicks reach 0.47."""
+FROZEN, STILL = 0.5, 1e-4
+"""Seconds without a change, and metres a frame below which nothing changes: people move by 7e-4 at least."""
 FLIP = 2.0
 """Radians that a figure turns in one frame; dancers and kickers reach 0.6 at 20 frames a second."""
 OPPOSITE = -0.5
 """Cosine of hips and shoulders, seen from above: nobody is twisted by more than 120 degrees."""
+_BONES = [
+    (_NAMED.index(f"{side}_{first}"), _NAMED.index(f"{side}_{last}"))
+    for side in ("left", "right")
+    for chain in (("hip", "knee", "ankle", "foot"), ("shoulder", "elbow", "wrist"))
+    for first, last in pairwise(chain)
+]
 STRETCH = 0.3
 """Share by which a bone's length differs from its median; of recorded people at most 0.1."""
 
@@ -76,6 +88,8 @@ def motion_faults(joints: NDArray[np.floating], fps: float) -> Iterator[Fault]:
     yield from _feet(body, fps)
     yield from _sides(body)
     yield from _smoothness(body, fps)
+    yield from _limbs(body)
+    yield from _still(body, fps)
 
 
 def _bones(body: NDArray[np.float64]) -> Iterator[Fault]:
@@ -143,3 +157,36 @@ def _smoothness(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
     if noise > most:
         text = f"trembles by {1000 * noise:.1f} mm, not at most {1000 * most:.1f} mm"
         yield Fault("jitters", text, noise / most, int(rough.mean(axis=(1, 2)).argmax()))
+
+
+def _limbs(body: NDArray[np.float64]) -> Iterator[Fault]:
+    """A limb that turns at once, and most often back at once: what a solver does, and no muscle."""
+    first, last = zip(*_BONES, strict=True)
+    bones = body[:, last] - body[:, first]
+    ways = np.diff(bones / np.maximum(np.linalg.norm(bones, axis=-1, keepdims=True), 1e-6), axis=0)
+    turns = np.linalg.norm(ways, axis=-1)
+    around = np.pad(turns, ((1, 1), (0, 0)), mode="edge")
+    before, after = turns - around[:-2], turns - around[2:]
+    alone = np.minimum(before, after)
+    leaps = [alone * (LIMB_FLIP / LIMB_SNAP)]
+    for frames in range(1, min(LONGEST_FLIP, len(turns) - 1) + 1):
+        # Of a flip of one frame, there and back stand beside each other.
+        there, back = (before, after) if frames == 1 else (alone, alone)
+        opposite = (ways[:-frames] * ways[frames:]).sum(axis=-1) < 0
+        leaps.append(np.where(opposite, np.minimum(there[:-frames], back[frames:]), 0.0))
+    leap = max(leaps, key=np.max)
+    frame, bone = np.unravel_index(int(leap.argmax()), leap.shape)
+    if leap[frame, bone] > LIMB_FLIP:
+        name = _NAMED.joints[last[bone]].replace("_", " ")
+        angle = np.degrees(2 * np.arcsin(min(1.0, float(turns[frame, bone]) / 2)))
+        text = f"the bone to the {name} turns by {angle:.0f}° in one frame"
+        yield Fault("flips", text, float(leap[frame, bone]) / LIMB_FLIP, int(frame) + 1)
+
+
+def _still(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
+    moves = np.abs(np.diff(body, axis=0)).max(axis=(1, 2))
+    start, end = max(runs(moves < STILL), key=lambda run: run[1] - run[0], default=(0, 0))
+    if (end - start) / fps >= FROZEN and moves.max() >= STILL:
+        seconds = (end - start) / fps
+        text = f"nothing moves for {seconds:.1f} s, not under {FROZEN:g} s"
+        yield Fault("frozen", text, seconds / FROZEN + 1e-3, start)

@@ -71,6 +71,30 @@ def stretched(joints: Joints) -> Joints:
     return joints
 
 
+def flipped(limb: str, frames: int) -> Callable[[Joints], Joints]:
+    """What hangs at a limb's joint is on its other side for some frames."""
+
+    def go(joints: Joints) -> Joints:
+        skeleton = LAYOUT.skeleton
+        below = [skeleton.index(limb)]
+        for joint, parent in enumerate(skeleton.parents):
+            if parent in below and joint not in below:
+                below.append(joint)
+        part = slice(12, 12 + frames)
+        joints[part, below] = 2 * joints[part, below[:1]] - joints[part, below]
+        return joints
+
+    return go
+
+
+FLIPPED = ("left_hip", "right_knee", "left_shoulder", "right_elbow")
+
+
+def frozen(joints: Joints) -> Joints:
+    joints[-11:] = joints[-11]
+    return joints
+
+
 PLANTED: list[tuple[str, Callable[[Joints], Joints]]] = [
     ("floats", lifted(0.15)),
     ("sinks", lifted(-0.15)),
@@ -83,6 +107,12 @@ PLANTED: list[tuple[str, Callable[[Joints], Joints]]] = [
     ("no person", lambda joints: joints * 2.54),
     ("no person", lambda joints: canonicalize(joints * [1, -1, -1])),
     ("no person", stretched),
+    ("frozen", frozen),
+    *(
+        ("flips", flipped(limb, n))
+        for limb in ("left_hip", "right_knee", "left_shoulder", "right_elbow")
+        for n in (1, 2, 6, 10)
+    ),
 ]
 
 
