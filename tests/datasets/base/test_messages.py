@@ -18,7 +18,7 @@ from safetensors.numpy import save_file
 from motionloom.datasets.base.files import atomic_path, write_text
 from motionloom.datasets.base.os_errors import SHARED_MEMORY, full_place, of_the_machine, sentence_of
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.base.progress import Meter, Pace, duration
+from motionloom.datasets.base.progress import Meter, Pace
 
 FULL = Path("/dev/full")
 
@@ -27,25 +27,6 @@ def raised(work: object) -> BaseException:
     with pytest.raises(Exception) as caught:  # the test asks which
         work()  # type: ignore[operator]
     return caught.value
-
-
-@pytest.mark.parametrize(
-    ("number", "words"),
-    [
-        (errno.ENOSPC, "full"),
-        (errno.EROFS, "read-only"),
-        (errno.EACCES, "permission"),
-        (errno.EMFILE, "open files"),
-        (errno.ENOTDIR, "folder"),
-        (errno.ENOENT, "no such"),
-    ],
-)
-def test_each_refusal_has_words_and_names_the_file(number: int, words: str) -> None:
-    sentence = sentence_of(OSError(number, os.strerror(number), "runs/a/file"))
-    assert sentence is not None and sentence.startswith("runs/a/file: ") and words in sentence
-    assert "\n" not in sentence and "Errno" not in sentence
-    nameless = sentence_of(OSError(number, os.strerror(number)))
-    assert nameless is not None and words in nameless and not nameless.startswith("None")
 
 
 def test_full_shared_memory_is_called_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,30 +130,6 @@ def test_a_meter_prints_lines_where_there_is_no_terminal() -> None:
         ["generating:", "24/40", "20", "s", "left"],
         ["generating:", "40/40"],
     ]
-
-
-@pytest.mark.parametrize("hidden", [{"shown": False}, {"console": Console(quiet=True)}])
-def test_a_meter_that_is_not_shown(hidden: dict[str, object], capsys: pytest.CaptureFixture[str]) -> None:
-    clock = Clock()
-    with Meter("generating", 2, clock=clock, **hidden) as meter:  # type: ignore[arg-type]
-        clock.now += 100
-        meter.advance()
-    assert capsys.readouterr().out == ""
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"),
-    [
-        (0.04, "0.0 s"),
-        (9.96, "10 s"),
-        (59.4, "59 s"),
-        (200, "3 min 20 s"),
-        (7500, "2 h 05 min"),
-        (9e5, "10 d 10 h"),
-    ],
-)
-def test_durations(seconds: float, said: str) -> None:
-    assert duration(seconds) == said
 
 
 @pytest.mark.parametrize(

@@ -233,8 +233,8 @@ def test_columns_give_back_the_joints(name: str) -> None:
     for i in range(3):
         motion, joints = make_sample(i, config).motion, make_clip(i, config).joints
         found = joints_of(motion, layout)
-        # Single precision, added up over a clip by the velocities of the root.
-        np.testing.assert_allclose(found, joints, atol=2e-4)
+        # Single precision, added up over a clip by the velocities of the root; rotations pose each frame.
+        np.testing.assert_allclose(found, joints, atol=2e-6 if layout.family == "raw" else 2e-4)
         np.testing.assert_array_equal(joints_of(motion[:, layout.part("bodyhand")], layout), found)
 
 

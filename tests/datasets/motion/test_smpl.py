@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.npz import NpzFile
@@ -33,17 +34,9 @@ def tree_of(joints: int) -> list[int]:
     return parents
 
 
-def rodrigues(vector: list[float]) -> list[list[float]]:
-    angle = math.sqrt(sum(v * v for v in vector))
-    if angle == 0:
-        return [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
-    x, y, z = (v / angle for v in vector)
-    c, s = math.cos(angle), math.sin(angle)
-    return [
-        [c + x * x * (1 - c), x * y * (1 - c) - z * s, x * z * (1 - c) + y * s],
-        [y * x * (1 - c) + z * s, c + y * y * (1 - c), y * z * (1 - c) - x * s],
-        [z * x * (1 - c) - y * s, z * y * (1 - c) + x * s, c + z * z * (1 - c)],
-    ]
+def rodrigues(vector: list[float]) -> NDArray[np.float64]:
+    x, y, z = vector
+    return np.asarray(expm([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
 
 
 def made_up_model(joints: int, shapes: int = 10, *, rigid: bool = False, seed: int = 0) -> dict[str, Any]:
@@ -120,10 +113,10 @@ def test_golden_body_joints(shared: Path) -> None:
 
 def unposed(rotvecs: NDArray[Any], joints: NDArray[Any], parents: list[int]) -> NDArray[np.float64]:
     """Rest joints of a posed frame."""
-    world = [np.array(rodrigues(rotvecs[0].tolist()))]
+    world = [rodrigues(rotvecs[0].tolist())]
     rest = [np.zeros(3)]
     for joint, parent in enumerate(parents[1:], start=1):
-        world.append(world[parent] @ np.array(rodrigues(rotvecs[joint].tolist())))
+        world.append(world[parent] @ rodrigues(rotvecs[joint].tolist()))
         rest.append(rest[parent] + world[parent].T @ (joints[joint] - joints[parent]))
     return np.array(rest)
 

@@ -191,16 +191,7 @@ def rewrite(shard: Path, change: Callable[[str, bytes], bytes]) -> None:
             archive.addfile(info, io.BytesIO(content))
 
 
-def test_check_finds_leaks_between_splits(made: ModuleType, root: Path) -> None:
-    train = ShardDataset.open(root, "train").ids[0].encode()
-    leaks = dict(zip(ShardDataset.open(root, "val").ids, ("id", "mirror_of"), strict=False))
-
-    def change(name: str, raw: bytes) -> bytes:
-        meta = json.loads(raw) if name.endswith("meta.json") else {}
-        field = leaks.get(meta.get("id", ""))
-        return json.dumps({**meta, field: train.decode()}).encode() if field else raw
-
-    rewrite(root / "made-val-000000.tar", change)
-    messages = [str(problem) for problem in check(root)]
-    assert any(f"id '{train.decode()}'" in message for message in messages)
-    assert any(f"mirrors '{train.decode()}'" in m for m in messages)
+def test_check_finds_an_id_of_another_split(root: Path) -> None:
+    train, val = (ShardDataset.open(root, split).ids[0].encode() for split in ("train", "val"))
+    rewrite(root / "made-val-000000.tar", lambda name, raw: raw.replace(val, train))
+    assert any(f"id '{train.decode()}'" in str(problem) for problem in check(root))

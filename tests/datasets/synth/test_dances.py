@@ -7,11 +7,8 @@ from collections import Counter, defaultdict
 import numpy as np
 import pytest
 
-from motionloom.datasets.actions.dances import measure_dance
 from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.audio.features import audio_features, settings_at
-from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
-from motionloom.datasets.motion.canonical import canonicalize, facing
 from motionloom.datasets.synth.choreography import choreograph
 from motionloom.datasets.synth.dances import DanceConditions, DanceConfig
 from motionloom.datasets.synth.generate import Clip, SynthConfig, dance_of, make_clip, make_sample, split_of
@@ -100,27 +97,6 @@ def test_clips_come_with_what_the_shares_say() -> None:
         kinds[bool(sample.texts), sample.audio is not None] += 1
         assert ("genre" in (sample.meta.truth or {})) == (index % 2 == 1)
     assert set(kinds) == {(True, True), (True, False), (False, True), (False, False)}
-
-
-def test_smpl_columns_pose_the_joints_of_the_clip() -> None:
-    body = BodyModel.neutral("smpl22")
-    config = SynthConfig(
-        layout="smpl75", clips=28, seed=4, dances=DanceConfig(songs=2, song_seconds=8.0, share=0.25)
-    )
-    assert config.motion_layout.fps == 20
-    for index in range(28):
-        clip, sample = make_clip(index, config), make_sample(index, config)
-        values = sample.motion.astype(np.float64)
-        assert values.shape == (len(clip.joints), 75)
-        assert not sample.meta.has_hands
-        joints = smpl_joints(values[:, 3:].reshape(-1, 24, 3)[:, :22], values[:, :3], body)
-        # float32 columns: 2e-3 mm is rounding, nothing is fitted.
-        assert np.abs(joints - clip.joints).max() < 2e-6
-        assert np.abs(joints - canonicalize(joints)).max() < 2e-6
-        assert abs(float(facing(joints[:1])[0])) < 1e-5
-        assert np.linalg.norm(values[:, 3:].reshape(-1, 3), axis=-1).max() < np.pi + 1e-6
-        if clip.truth.get("genre"):
-            assert measure_dance(joints, 20.0).genre == clip.truth["genre"]
 
 
 # How dances follow a song's form: on its beats, as large as it is loud, still in breaks, feet that stand.
