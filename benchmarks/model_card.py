@@ -115,7 +115,7 @@ def synthetic_data(recipe: Recipe) -> list[SynthConfig]:
     for stage in recipe.stages:
         if stage.kind.name == "synth":
             given = stage.config.dump()
-            seed = recipe.seed_of(stage) if given["seed"] is None else given["seed"]
+            seed = recipe.seed if given["seed"] is None else given["seed"]
             out.append(SynthConfig.parse({**given, "seed": seed}, recipe.name))
     if not out:
         raise UserError(f"{recipe.name}: has no stage of synthetic clips to be measured on")

@@ -229,8 +229,7 @@ def row_of(run: Path, table: Table, title: str) -> Record:
             model = finished_records(run).get(found.about.get("made_by", {}).get("generator", ""))
             protocol |= {"steps": flatten(model.config if model else {}).get("train.steps", "not recorded")}
             variant = unlike_published(model.kind, model.config) if model else []
-    kept = [name for name in protocol if name in PROTOCOL or name.startswith("sampling")]
-    drawn = {name: protocol[name] for name in kept if protocol[name] is not None}
+    drawn = {k: v for k, v in protocol.items() if k in PROTOCOL or k.startswith("sampling")}
     facts = {"protocol": drawn, "candidates": candidates, "variant": variant}
     return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], **facts}
 
@@ -258,9 +257,12 @@ def page(text: str, records: Mapping[str, Record]) -> str:
     return TABLE.sub(lambda found: found[1] + table_of(records[found[2]]) + "\n", text)
 
 
+def read_records() -> dict[str, Record]:
+    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in RECORDS.glob("*.json")}
+
+
 def rendered() -> str:
-    records = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in RECORDS.glob("*.json")}
-    return page(PAGE.read_text(encoding="utf-8"), records)
+    return page(PAGE.read_text(encoding="utf-8"), read_records())
 
 
 def main() -> None:
