@@ -180,6 +180,21 @@ def test_python_example_compiles_and_imports(block: Block) -> None:
                 assert hasattr(module, alias.name), f"{node.module} has no {alias.name}"
 
 
+def test_the_blocks_of_the_librarys_page_run_in_order(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    page = ROOT / "docs" / "library.md"
+    text = page.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 150
+    names: dict[str, object] = {"__name__": "library"}
+    for block in re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S):
+        exec(compile(block, str(page), "exec"), names)
+    best = names["best"]
+    assert Path(best.best_model_path).is_file()  # type: ignore[attr-defined]
+    assert names["trainer"].callback_metrics["val/loss"].isfinite()  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("block", blocks("yaml"), ids=lambda b: f"{b.document.name}:{b.line}")
 def test_yaml_example_is_a_recipe_or_a_script(block: Block, tmp_path: Path) -> None:
     data = yaml.safe_load(block.text)

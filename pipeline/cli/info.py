@@ -67,12 +67,13 @@ def show_info(console: Console) -> None:
     for index, gpu in enumerate(facts["gpus"]):
         console.print(f"  GPU {index}: {gpu['name']}, {gpu['gib']:.0f} GiB, bf16 {gpu['bf16']}")
     console.print(f"text encoder: {encoder['name']}, from {encoder['package']} {encoder['version']}")
-    table = Table("model", "size", "what it is", title='models (motionloom generate NAME "a person waves")')
+    title = 'models (motionloom generate NAME "a person waves")'
+    table = Table("model", "size", "what it is", title=title, title_justify="left")
     for name, model in models.items():
         table.add_row(name, f"{model['bytes'] / 1e6:.1f} MB", model["description"])
     if models:
         console.print(table)
-    table = Table("recipe", "what it does", title="recipes (motionloom run NAME)")
+    table = Table("recipe", "what it does", title="recipes (motionloom run NAME)", title_justify="left")
     for name, description in recipes.items():
         table.add_row(name, description)
     console.print(table)
