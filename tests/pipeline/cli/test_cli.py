@@ -57,7 +57,7 @@ def test_every_option_and_setting_that_a_string_of_the_sources_names_exists() ->
     known |= {option for each in typer.main.get_command(app).params for option in each.opts}
     configs = [kind.config_class for kind in converters()] + [SynthConfig, ServeConfig]
     configs += [SamplingConfig, FigureOptions, EditTask]
-    settings = {"seed_motion", *(key for config in configs for key in config.model_fields)}
+    settings = {"seed_motion", "face", *(key for config in configs for key in config.model_fields)}
     for path in (path for top in ("pipeline", "datasets", "models") for path in (ROOT / top).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
@@ -108,7 +108,7 @@ MISTAKES: dict[str, tuple[list[str], str]] = {
     "unknown format": (["generate", "nowhere", "a person walks", "-f", "npz,bhv"], "'bvh'"),
     "edit what is not there": (["edit", "nowhere", "walk.bvh", "--keep", ":1"], "nowhere: no such folder"),
     "a stretch": (["edit", "nowhere", "walk.bvh", "--keep", "x"], "--keep x: write it as START:END=PARTS"),
-    "an unknown setting": (["edit", "nowhere", "walk.bvh", "--set", "strengt=0.5"], "'strength'"),
+    "an unknown setting": (["edit", "nowhere", "walk.bvh", "--set", "secnds=0.5"], "'seconds'"),
     "a setting of nothing": (["generate", "nowhere", "a person walks", "--set", "colour=1"], "temperature"),
     "a task of nothing": (["edit", "nowhere", "walk.bvh", "--task", "no.yaml"], "no.yaml: cannot be read"),
     "convert nothing": ([*CONVERT, "--set", "joint_map=map.json"], "map.json: "),
