@@ -211,7 +211,7 @@ def _places_of_window(places: Places, inside: slice) -> Places:
     angle, origin = heading[0, first], place[0, first]
     if not bool(both.any()) and bool(place_known.any()):
         # A path without headings faces where it goes.
-        angle = _tangent(place[0], place_known[0])
+        angle = tangent(place[0], place_known[0])
         heading_known = heading_known.clone()
         heading_known[0, first] = True
         heading = heading.clone()
@@ -220,8 +220,11 @@ def _places_of_window(places: Places, inside: slice) -> Places:
     return Places(first, heading - angle, relative, heading_known, place_known)
 
 
-def _tangent(place: Tensor, known: Tensor) -> Tensor:
-    """Return the heading [1] from the first known place to the next that is half a metre off, or the last."""
+def tangent(place: Tensor, known: Tensor) -> Tensor:
+    """Return the heading [1] from the first known place to the next that is half a metre off, or the last.
+
+    Nearer points say little of a direction: a step to the side is a few decimetres.
+    """
     points = place[known]
     away = points - points[0]
     far = away.norm(dim=-1) > 0.5

@@ -210,10 +210,16 @@ def edit_clip(
     for made in whole:
         features, figure, report = finish(frames, made[:, layout.part("bodyhand")])
         face = made[:, layout.part("face")] if has_face else None
+        # Words are looked for in each stretch that was made, as in motions that are generated.
+        stretches = [
+            GeneratedMotion(prompt, features[start:end], figure.joints[start:end], None, layout)
+            for start, end in frames.stretches
+        ]
+        notes = bundle.notes([prompt], stretches) if words else []
         out.append(
             EditedMotion(
                 prompt, features, figure.joints, face, layout, seed=seed, figure=figure, original=original,
-                report=report, remarks=frames.remarks,
+                report=report, remarks=(*frames.remarks, *map(str, notes)),
             )
         )  # fmt: skip
     return out

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
-from typing import Any, TypeVar
+from typing import TypeVar
 from urllib.parse import quote
 
 from starlette.applications import Starlette
@@ -21,14 +21,13 @@ from starlette.types import ASGIApp
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import MAX_SPEED
-from motionloom.pipeline.inference.edits.edit import require_editor, why_no_edits
+from motionloom.pipeline.inference.edits.edit import require_editor
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips
 from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds
 
-T = TypeVar("T")
 RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
 
 _BROKEN = "something broke here; the server's log says what"
@@ -40,48 +39,13 @@ _UPLOADS = 4
 """Sounds and clips that are received at a time; others wait unread."""
 
 
-class Busy(Exception):  # noqa: N818 - an answer, not a fault
-    """The largest allowed number of requests waits."""
-
-
-class Worker:
-    """Runs calls one after another in a thread of its own, that of the model, first come first served.
-
-    Each call has a future of its own, so answers cannot be mixed up. Asked by one thread alone.
-
-    Args:
-        waiting: Calls that may wait, besides the one that runs.
-    """
-
-    def __init__(self, waiting: int) -> None:
-        self.waiting = waiting
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="model")
-        self._calls: list[Future[Any]] = []
-
-    def submit(self, call: Callable[[], T]) -> Future[T]:
-        """The future of a call; `Busy` where too many wait."""
-        if self.length >= self.waiting:
-            raise Busy(f"{self.waiting} requests are waiting already; try again in a moment")
-        future = self._pool.submit(call)
-        self._calls.append(future)
-        return future
-
-    @property
-    def length(self) -> int:
-        """Calls that wait."""
-        self._calls = [future for future in self._calls if not future.done()]
-        return sum(not future.running() for future in self._calls)
-
-    def stop(self) -> None:
-        """Drop all that wait; what runs is let finish."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-
 class Site:
-    """A model, its worker and the answers."""
+    """A model and its answers, made one after another in a thread of its own, first come first served."""
 
-    def __init__(self, model: MotionModel, config: ServeConfig, worker: Worker, name: str) -> None:
-        self.model, self.config, self.worker, self.name = model, config, worker, name
+    def __init__(self, model: MotionModel, config: ServeConfig, name: str) -> None:
+        self.model, self.config, self.name = model, config, name
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="model")
+        self._asked = 0
         self.sounds, self.clips = Sounds(config), Clips(model, config)
         self._uploads = asyncio.Semaphore(_UPLOADS)
         self._assets = {
@@ -89,6 +53,10 @@ class Site:
             "viewer.js": viewer_script(),
             **{script: _web_file(script) for script in _SCRIPTS},
         }
+
+    def stop(self) -> None:
+        """Drop all requests that wait; what runs is let finish."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
 
     @property
     def app(self) -> ASGIApp:
@@ -126,7 +94,11 @@ class Site:
     async def info(self, http: Request) -> Response:
         bundle, limits = self.model.bundle, self.config
         longest = min(limits.max_seconds, self.model.max_seconds)
-        skeleton, why = bundle.layout.skeleton, why_no_edits(self.model.bundle.generator)
+        skeleton, why = bundle.layout.skeleton, ""
+        try:
+            require_editor(bundle.generator)
+        except UserError as error:
+            why = str(error)
         return JSONResponse(
             {
                 "model": self.name,
@@ -137,18 +109,14 @@ class Site:
                 "fps": self.model.fps,
                 "joint_names": list(skeleton.joints),
                 "parents": [int(parent) for parent in skeleton.parents],
-                "settings": sorted(bundle.generator.settings),
-                "edit": {"possible": why is None, "why": why or "", "max_speed": MAX_SPEED},
+                "edit": {"possible": not why, "why": why, "max_speed": MAX_SPEED},
                 "sampling": bundle.recommended.model_dump(mode="json", exclude_unset=True),
                 "limits": {
                     "seconds": longest,
                     "caption": limits.max_caption,
                     "sound_bytes": _bytes(limits.max_sound_mb),
                     "clip_bytes": _bytes(limits.max_clip_mb),
-                    "sound_seconds": limits.max_sound_seconds,
-                    "waiting": limits.waiting,
                 },
-                "waiting": self.worker.length,
             }
         )
 
@@ -163,8 +131,16 @@ class Site:
         return await self._respond(lambda: self.clips.change(request))
 
     async def _respond(self, call: Callable[[], Answer]) -> Response:
-        """Return the answer of the model's thread."""
-        answer, headers = await asyncio.wrap_future(self.worker.submit(call)), dict[str, str]()
+        """Return the answer of the model's thread; 429 where too many wait, besides the one that runs."""
+        if self._asked > self.config.waiting:
+            words = f"{self.config.waiting} requests are waiting already; try again in a moment"
+            raise HTTPException(429, words, {"retry-after": "2"})
+        self._asked += 1
+        try:
+            answer = await asyncio.get_running_loop().run_in_executor(self._thread, call)
+        finally:
+            self._asked -= 1
+        headers = dict[str, str]()
         if answer.file:
             headers["content-disposition"] = f"attachment; filename*=UTF-8''{quote(answer.file)}"
         return Response(answer.body, media_type=answer.kind, headers=headers)
@@ -208,7 +184,7 @@ class Site:
         return request
 
 
-_REFUSALS = (HTTPException, UserError, ClientDisconnect, Busy)
+_REFUSALS = (HTTPException, UserError, ClientDisconnect)
 
 
 async def refused(http: Request, error: Exception) -> Response:
@@ -217,8 +193,6 @@ async def refused(http: Request, error: Exception) -> Response:
     if isinstance(error, HTTPException):
         status, headers = error.status_code, dict(error.headers or {})
         words = {404: "no such page", 405: "no such method here"}.get(status, error.detail)
-    elif isinstance(error, Busy):
-        status, headers = 429, {"retry-after": "2"}
     return JSONResponse({"error": words}, status, headers)
 
 

@@ -112,14 +112,6 @@ class MotionRequest(Config):
             raise UserError("this model makes no face; leave face out")
 
     @property
-    def captions(self) -> list[str]:
-        return [self.caption] if self.caption.strip() else []
-
-    @property
-    def faces(self) -> list[str]:
-        return [self.face] if self.face else []
-
-    @property
     def sampling(self) -> SamplingConfig:
         """How to draw; only what was asked for counts as set."""
         names = {"cfg_scale", "temperature", "top_p"} & self.model_fields_set
@@ -162,8 +154,8 @@ def motion_of(
             raise UserError(f"{seconds:g} s were asked for and the sound lasts {sound.seconds:.1f} s")
         sound = sound.slice(0.0, min(seconds, sound.seconds))
     return model.bundle.generate(
-        asked.captions or None,
-        face=asked.faces or None,
+        [asked.caption] if asked.caption.strip() else None,
+        face=[asked.face] if asked.face else None,
         sounds=None if sound is None else [sound],
         seconds=seconds,
         seed=asked.seed,
@@ -231,28 +223,23 @@ class Recent(Generic[T]):
 
     def made(self, name: str, make: Callable[[], T]) -> T:
         """The value of a name, made where it is not here; what was used longest ago makes room."""
-        found = self.find(name)
-        if found is None:
+        try:
+            return self.get(name)
+        except UserError:
             found = make()
-            with self._lock:
-                self._kept[name] = found
-                while len(self._kept) > self._most:
-                    self._kept.popitem(last=False)
-        return found
-
-    def find(self, name: str) -> T | None:
-        """The value, used now; None where it is not here."""
         with self._lock:
-            if name in self._kept:
-                self._kept.move_to_end(name)
-            return self._kept.get(name)
+            self._kept[name] = found
+            while len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+        return found
 
     def get(self, name: str) -> T:
-        """As `find`; `UserError` where it is not here."""
-        found = self.find(name)
-        if found is None:
-            raise UserError(f"{self._what} is not here any more; send it again")
-        return found
+        """The value, used now; `UserError` where it is not here."""
+        with self._lock:
+            if name not in self._kept:
+                raise UserError(f"{self._what} is not here any more; send it again")
+            self._kept.move_to_end(name)
+            return self._kept[name]
 
 
 class Sounds:

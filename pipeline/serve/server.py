@@ -13,7 +13,7 @@ from rich.console import Console
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import find_model
-from motionloom.pipeline.serve.app import Site, Worker
+from motionloom.pipeline.serve.app import Site
 from motionloom.pipeline.serve.guard import HEADERS, is_loopback
 from motionloom.pipeline.serve.requests import ServeConfig
 
@@ -27,8 +27,9 @@ def serve(folder: Path | str, config: ServeConfig, *, device: str = "auto", cons
     # The address is taken before the model is loaded, so that a taken port is reported at once.
     with closing(listen(config)) as listener:
         model = MotionModel.from_pretrained(place, device=device)
-        worker, name = Worker(config.waiting), Path(folder).resolve().name
-        server = server_of(Site(model, config, worker, name))
+        name = Path(folder).resolve().name
+        site = Site(model, config, name)
+        server = server_of(site)
         host, port = listener.getsockname()[:2]
         address = f"[{host}]" if ":" in host else host
         if not is_loopback(config.host):
@@ -44,7 +45,7 @@ def serve(folder: Path | str, config: ServeConfig, *, device: str = "auto", cons
         except KeyboardInterrupt:  # uvicorn passes it on when all is closed
             pass
         finally:
-            worker.stop()
+            site.stop()
         console.print("stopped")
 
 

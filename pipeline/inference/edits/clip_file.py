@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,7 @@ from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import FACE, HANDS, UserError
+from motionloom.datasets.schema import FACE, HANDS, UserError, parse_json
 from motionloom.pipeline.contract.editing import RecordedClip
 
 ENDINGS = (".bvh", ".npz", ".glb")
@@ -100,24 +98,15 @@ def _read_npz(path: Path) -> RecordedClip:
     with NpzFile(path) as stored:
         joints = stored.numbers("joints")
         face = stored.numbers("face").astype(np.float32) if "face" in stored.names else None
-        facts = _facts(str(stored.array("metadata")), path) if "metadata" in stored.names else {}
+        text = str(stored.array("metadata")) if "metadata" in stored.names else "{}"
+    facts = parse_json(text, f"{path}: its metadata")
     if joints.ndim != 3 or joints.shape[1] not in (BODY_JOINTS, 52) or joints.shape[2] != 3:
         raise UserError(f"{path}: joints of shape {list(joints.shape)}, wanted [T, 22 or 52, 3]")
     if face is not None and face.shape != (len(joints), FACE_DIMS):
         raise UserError(f"{path}: a face of shape {list(face.shape)}, wanted [{len(joints)}, {FACE_DIMS}]")
-    fps = facts.get("fps")
+    fps = facts.get("fps") if isinstance(facts, dict) else None
     if not isinstance(fps, int | float) or not 0 < fps <= 1000:
         raise UserError(
             f"{path}: its metadata do not say the frames a second; save it with motionloom generate"
         )
     return RecordedClip(str(path), joints, float(fps), face, str(facts.get("caption", "")))
-
-
-def _facts(text: str, path: Path) -> Mapping[str, object]:
-    try:
-        facts = json.loads(text)
-    except (ValueError, RecursionError):
-        facts = None
-    if not isinstance(facts, dict):
-        raise UserError(f"{path}: its metadata are not JSON")
-    return facts

@@ -37,20 +37,13 @@ _TRUNK_AND_ARMS = (1, 2, 3)
 """Numbers of the `PIECES` that keep their direction where what carries them is made; fingers follow hands."""
 
 
-def why_no_edits(generator: MotionGenerator) -> str | None:
-    """Why a generator cannot fill in what a clip leaves free; None where it can."""
-    if generator.capabilities.edit is not None:
-        return None
-    return (
-        f"this model ({generator.method}) makes whole motions and edits none; take one whose body is made by "
-        f"diffusion, such as the package's `inbetween`"
-    )
-
-
 def require_editor(generator: MotionGenerator) -> Callable[..., list[Motion]]:
-    """The generator's `edit`, if it has one."""
+    """The generator's `edit`; `UserError` where it cannot fill in what a clip leaves free."""
     if generator.capabilities.edit is None:
-        raise UserError(why_no_edits(generator))
+        raise UserError(
+            f"this model ({generator.method}) makes whole motions and edits none; take an in-betweener, such "
+            f"as the package's `inbetween`"
+        )
     return generator.capabilities.edit
 
 

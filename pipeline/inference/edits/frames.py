@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
-from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget
+from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget, runs
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.layout import (
@@ -28,6 +28,7 @@ from motionloom.datasets.motion.layout import (
 )
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
+from motionloom.models.diffusion.editing import tangent
 from motionloom.models.diffusion.observed import Places
 from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask, RecordedClip
 
@@ -98,6 +99,12 @@ class EditFrames:
     def rooted(self) -> NDArray[np.bool_]:
         """Frames whose root is kept [T]."""
         return self.pieces[:, LOWER]
+
+    @property
+    def stretches(self) -> list[tuple[int, int]]:
+        """First frame and end of each stretch of which not all of the body is kept."""
+        body = self.pieces[:, np.unique(piece_joints(self.layout))]
+        return runs(np.any(~body, axis=1))
 
     @property
     def kept_joints(self) -> NDArray[np.bool_]:
@@ -320,12 +327,9 @@ def _known_places(
     if rooted.any():
         first = int(np.flatnonzero(rooted)[0])
     elif on_path.any():
-        points = np.flatnonzero(on_path)
-        first = int(points[0])
-        away = path[points] - path[first]
-        # Nearer points say little of a direction: a step to the side is a few decimetres.
-        far = np.flatnonzero(np.abs(away) > 0.5)
-        heading[first] = np.angle(away[far[0] if len(far) else -1]) if np.abs(away[-1]) > 0 else 0.0
+        first = int(np.flatnonzero(on_path)[0])
+        points = torch.from_numpy(np.stack([place.real, place.imag], axis=-1))
+        heading[first] = float(tangent(points, torch.from_numpy(on_path)))
         heading_known[first] = True
     else:
         first = lead

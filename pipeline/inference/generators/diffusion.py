@@ -13,6 +13,7 @@ from torch import Tensor
 
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.motion.canonical import runs
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import Filling, KnownMotion, Pins
 from motionloom.models.diffusion.network import InBetweener, TextDenoiser
@@ -96,6 +97,15 @@ class DiffusionMotion(DenoisedMotion):
         known = known_columns(torch.from_numpy(frames.pieces)[None], layout, columns)[0]
         if known.all():
             return [features.numpy().copy() for _ in seeds]
+        # Without anything to go by, what is made further than that stands still and glides.
+        most = self.window * 3 // 2
+        empty = ~known.any(dim=1).numpy() & np.isnan(frames.path)
+        if any(end - start > most for start, end in runs(empty)):
+            raise UserError(
+                f"this model knows motions of {self.window / layout.fps:g} s and fills at most "
+                f"{most / layout.fps:g} s at a time: give fewer seconds, keep more or draw a path, and go on "
+                f"from the result"
+            )
         places, pins = Places(*(values.to(device) for values in frames.places)), None
         if frames.pins:
             at, joints = torch.tensor(list(frames.pins), device=device).T

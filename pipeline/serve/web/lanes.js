@@ -40,8 +40,7 @@ export function buildLanes(root, rows, fps, act) {
   function watch(node, begin) {
     node.addEventListener("pointerdown", (event) => {
       if (event.button) return;
-      const from = frameAt(node, event), at = event.clientX, gesture = begin(from, event);
-      if (!gesture) return;
+      const from = frameAt(node, event), at = event.clientX, gesture = begin(from);
       let moved = false;
       node.setPointerCapture(event.pointerId);
       const over = (now, done) => { const to = frameAt(node, now); gesture.drag(Math.min(from, to), Math.max(from, to) + 1, done); };

@@ -22,7 +22,6 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
-from motionloom.pipeline.contract.generation import Capabilities
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
@@ -197,6 +196,7 @@ REFUSED: list[tuple[dict[str, object], str]] = [
     ({"keep": ENDS, "path": [{"at": 0.5, "x": 0, "z": 0}]}, "path: .*0.5 s"),
     ({"keep": ENDS, "path": [{"at": 1.1, "x": 90, "z": 0}]}, "path: .*m/s"),
     ({"keep": [{"parts": ["leg"]}]}, "keep.0.parts.0"),
+    ({"seconds": 6.1}, "knows motions of 2 s .* at most 3 s"),
     ({"keeps": []}, "'keep'"),
 ]  # fmt: skip
 
@@ -230,14 +230,6 @@ def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:
         with pytest.raises(UserError, match=name) as error:
             read_clip(tmp_path / name)
         assert words in str(error.value)
-
-
-def test_models_that_do_not_denoise_say_which_to_take(walk: Walk) -> None:
-    layout = MotionLayout.named("body133")
-    known: dict[str, Any] = {"modalities": {"text"}, "prepared": {}, "capabilities": Capabilities()}
-    other = SimpleNamespace(part="bodyhand", method="gpt", layout=layout, **known)
-    with pytest.raises(UserError, match=r"\(gpt\).*`inbetween`"):
-        edit(Bundle([stage(other)], StageCache()), clip(walk), keep=ENDS)
 
 
 @pytest.fixture

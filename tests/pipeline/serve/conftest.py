@@ -22,7 +22,7 @@ from motionloom.pipeline.contract.generation import Capabilities, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
-from motionloom.pipeline.serve.app import Site, Worker
+from motionloom.pipeline.serve.app import Site
 from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.server import listen, server_of
 from motionloom.pipeline.store.artifact import Terms
@@ -139,7 +139,6 @@ class Served:
 
     port: int
     server: Any
-    worker: Worker
     thread: threading.Thread
 
     def ask(self, method: str, path: str, body: bytes = b"", headers: dict[str, str] | None = None) -> Reply:
@@ -165,16 +164,16 @@ class Served:
 @contextmanager
 def _run_server(model: Any, **settings: Any) -> Iterator[Served]:
     config = ServeConfig(port=0, **settings)
-    place, worker = listen(config), Worker(config.waiting)
-    server = server_of(Site(model, config, worker, "quick"))
+    place, site = listen(config), Site(model, config, "quick")
+    server = server_of(site)
     thread = threading.Thread(target=server.run, args=([place],), daemon=True)
     thread.start()
-    made = Served(place.getsockname()[1], server, worker, thread)
+    made = Served(place.getsockname()[1], server, thread)
     made.wait_for(lambda: server.started)
     try:
         yield made
     finally:
-        worker.stop()
+        site.stop()
         server.should_exit = True
         thread.join(20)
         place.close()

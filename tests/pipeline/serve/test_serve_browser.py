@@ -50,18 +50,6 @@ def test_type_and_watch(visit: Any, until: Any, quick: Any, size: str, tmp_path:
     assert figure["height"] >= 250 and figure["y"] + figure["height"] <= SIZES[size][1]
 
 
-def test_one_motion_after_another_leaves_nothing(visit: Any, until: Any) -> None:
-    page = visit()
-    for number in range(3):
-        page.get_by_label("What the person does").fill(f"a person waves {number}")
-        page.get_by_role("button", name="Generate").click()
-        until(page, f"document.querySelector('figcaption')?.textContent === 'a person waves {number}'")
-        until(page, DRAWN)
-    assert page.evaluate("[__viewers.length, document.querySelectorAll('canvas').length]") == [1, 1]
-    page.get_by_label("What the person does").press("Space")  # goes into the text, not to the player
-    assert page.evaluate("__viewer.playing") and page.locator("#caption").input_value() == " a person waves 2"
-
-
 @pytest.mark.parametrize("size", SIZES)
 def test_what_the_model_does_not_know_stands_beside_the_motion(visit: Any, until: Any, size: str) -> None:
     page = visit(*SIZES[size])

@@ -73,7 +73,7 @@ def test_info_and_page(served: Any) -> None:
     assert info["model"] == "quick" and info["modalities"] == ["audio", "text"] and info["face"] is True
     assert info["sampling"] == {"cfg_scale": 1.25, "top_p": 0.9}
     assert info["credits"] == ["Motion of nobody."]
-    assert info["limits"]["seconds"] == 5.0 and info["limits"]["waiting"] == 32
+    assert info["limits"]["seconds"] == 5.0
     assert info["edit"] == {"possible": True, "why": "", "max_speed": 12.0}
     page = served.ask("GET", "/")
     assert page.status == 200 and page.headers["content-type"].startswith("text/html")
