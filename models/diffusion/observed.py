@@ -20,6 +20,7 @@ from torch import Tensor
 
 from motionloom.datasets.motion.features.torch_joints import torch_joints_of, torch_way
 from motionloom.datasets.motion.layout import LOWER, PIECES, ROOT, MotionLayout, piece_columns, step_columns
+from motionloom.datasets.schema import UserError
 
 PLACE_COLUMNS = 6
 """z, x, cosine and sine of the heading, whether the place is known, and whether the heading is."""
@@ -31,8 +32,8 @@ def observed_width(motion_dim: int) -> int:
 
 
 class Recovery:
-    """Recovers joints from the `columns` of a layout, where they hold the root (`possible`); `mean` and `std`
-    [D] of the layout's columns normalise them.
+    """Recovers joints from the `columns` of a layout, which must hold the root; `mean` and `std` [D] of the
+    layout's columns normalise them.
     """
 
     def __init__(
@@ -42,6 +43,9 @@ class Recovery:
         mean: NDArray[np.float32],
         std: NDArray[np.float32],
     ) -> None:
+        root = [column for field in ROOT if layout.has(field) for column in np.r_[layout.slice(field)]]
+        if layout.family == "raw" or not root or not np.isin(root, columns).all():
+            raise UserError(f"layout {layout.name}: an in-betweener is of columns that hold the root's way")
         self.layout, self.columns = layout, columns
         self._mean, self._std = torch.from_numpy(mean[columns]), torch.from_numpy(std[columns])
         self._body = self.layout.without_face()
@@ -49,13 +53,6 @@ class Recovery:
         known = np.isin(own, columns)
         self._into = torch.from_numpy(np.flatnonzero(known))
         self._from = torch.from_numpy(np.flatnonzero(np.isin(columns, own)))
-
-    @staticmethod
-    def possible(layout: MotionLayout, columns: NDArray[np.int64]) -> bool:
-        """Whether the columns of a layout hold the root."""
-        if layout.family == "raw" or not all(layout.has(field) for field in ROOT):
-            return False
-        return all(np.isin(np.arange(layout.dim)[layout.slice(field)], columns).all() for field in ROOT)
 
     def way(self, features: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
         """Heading in radians [B, T], and z and x of the root in metres [B, T, 2], of normalised features
@@ -117,12 +114,10 @@ class Places(NamedTuple):
         return torch.cat([self.place * stood, facing * turned, stood, turned], dim=-1)
 
 
-def observed_columns(motion: Tensor, known: Tensor, places: Places | None) -> Tensor:
+def observed_columns(motion: Tensor, known: Tensor, places: Places) -> Tensor:
     """Return the observed columns [B, T, 2 D + 6] of normalised motion [B, T, D], `known` bool [B, T, D]."""
     features = torch.cat([motion * known, known.to(motion.dtype)], dim=-1)
-    width = (*motion.shape[:-1], PLACE_COLUMNS)
-    root = motion.new_zeros(width) if places is None else places.columns().to(motion.dtype)
-    return torch.cat([features, root], dim=-1)
+    return torch.cat([features, places.columns().to(motion.dtype)], dim=-1)
 
 
 def known_columns(pieces: Tensor, layout: MotionLayout, columns: NDArray[np.int64]) -> Tensor:
@@ -148,8 +143,7 @@ class Observations:
     """Draws what training observes of each motion.
 
     Args:
-        layout: The layout of whole frames; the motions have these `columns` of it. Where they hold no root,
-            no places are observed.
+        layout: The layout of whole frames; the motions have these `columns` of it.
         mean, std: Statistics of the layout's columns, by which the motions are normalised.
         share: Share of the motions of which anything is observed.
     """
@@ -162,8 +156,7 @@ class Observations:
         std: NDArray[np.float32],
         share: float,
     ) -> None:
-        rooted = Recovery.possible(layout, columns)
-        self.recovery = Recovery(layout, columns, mean, std) if rooted else None
+        self.recovery = Recovery(layout, columns, mean, std)
         self.share = share
         # Found here, since torch.compile does not enter the locks of Python 3.11's cached properties.
         self._columns = _piece_and_step(layout, columns)
@@ -172,15 +165,13 @@ class Observations:
         """Return the observed columns [B, T, 2 D + 6] of motion [B, T, D] with `length` [B] real frames."""
         pieces, path = self._draw(length, motion.shape[1])
         known = _of_pieces(pieces, *self._columns)
-        places = None
-        if self.recovery is not None:
-            rooted = pieces[..., LOWER]
-            first = torch.where(rooted.any(1), rooted.byte().argmax(1), path.byte().argmax(1))
-            heading, place = self.recovery.way(motion, first)
-            turned = rooted.clone()
-            rows = torch.arange(len(motion), device=motion.device)
-            turned[rows, first] |= path.any(1)
-            places = Places(first, heading, place, turned, rooted | path)
+        rooted = pieces[..., LOWER]
+        first = torch.where(rooted.any(1), rooted.byte().argmax(1), path.byte().argmax(1))
+        heading, place = self.recovery.way(motion, first)
+        turned = rooted.clone()
+        rows = torch.arange(len(motion), device=motion.device)
+        turned[rows, first] |= path.any(1)
+        places = Places(first, heading, place, turned, rooted | path)
         return observed_columns(motion, known, places)
 
     def _draw(self, length: Tensor, frames: int) -> tuple[Tensor, Tensor]:

@@ -71,10 +71,7 @@ class DiffusionMotion(DenoisedMotion):
 
     @property
     def capabilities(self) -> Capabilities:  # type: ignore[override]
-        # Editing needs a network that observes what is known, and columns that hold the root.
-        able = isinstance(self.net, InBetweener) and Recovery.possible(
-            self.layout, self.layout.part(self.part)
-        )
+        able = isinstance(self.net, InBetweener)  # it observes what is known
         return Capabilities(denoising=self.denoising, edit=self.edit if able else None)
 
     def edit(

@@ -11,6 +11,7 @@ import torch
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import LOWER, PIECES, MotionLayout
+from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import Filling, KnownMotion, Pins
 from motionloom.models.diffusion.module import InBetweenModule
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
@@ -47,10 +48,10 @@ def test_joints_are_the_decoders_and_the_anchor_is_the_origin(name: str) -> None
     torch.testing.assert_close(*apart, atol=1e-4, rtol=1e-4)
 
 
-def test_columns_without_the_root_have_no_way() -> None:
-    layout = MotionLayout.named("wholebody363")
-    unit = np.ones(363, dtype=np.float32)
-    assert Observations(layout, layout.part("face"), unit, unit, 1.0).recovery is None
+def test_columns_without_the_root_are_refused() -> None:
+    with pytest.raises(UserError, match="wholebody363"):
+        layout = MotionLayout.named("wholebody363")
+        Recovery(layout, layout.part("face"), *statistics(layout))
 
 
 def test_a_step_is_known_where_both_its_frames_and_the_root_are() -> None:

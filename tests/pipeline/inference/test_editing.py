@@ -13,7 +13,6 @@ import torch
 from numpy.typing import NDArray
 from toy_stages import FixedEncoder, MadeStage
 
-from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.canonical import canonicalize, ground
 from motionloom.datasets.motion.features.codec import encode
@@ -32,7 +31,6 @@ from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.inference.model import edit_clip, original_of
 from motionloom.pipeline.inference.motion import EditedMotion
 from motionloom.pipeline.inference.shipped_models import shipped_models
-from motionloom.pipeline.store.artifact import Artifact
 
 Walk = Callable[..., NDArray[np.float64]]
 FEW = SamplingConfig(denoising_steps=3)
@@ -211,8 +209,6 @@ def test_what_cannot_be_done_is_refused_in_one_sentence(
 
 
 def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="2 frames"):
-        require_clip(RecordedClip("short.bvh", walk(frames=2), 20.0))
     with pytest.raises(UserError, match="walk: the figure measures"):
         require_clip(RecordedClip("walk", walk(frames=9) * 100, 20.0))
     dog = tmp_path / "dog.bvh"
@@ -220,10 +216,8 @@ def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:
         "HIERARCHY\nROOT body\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\nEnd Site\n{\n"
         "OFFSET 0 1 0\n}\n}\nMOTION\nFrames: 4\nFrame Time: 0.05\n" + "0 0 0\n" * 4
     )
-    (tmp_path / "bad.glb").write_bytes(b"glTF no")
     for name, words in (
         ("dog.bvh", "not a skeleton that is known"),
-        ("bad.glb", "not a GLB file that motionloom wrote"),
         ("none.npz", "no such file"),
         ("clip.fbx", "ends in .bvh, .npz, .glb"),
     ):
@@ -238,15 +232,6 @@ def inbetween() -> Path:
     if "inbetween" not in shipped_models():
         pytest.skip("this tree has no weights in models/pretrained/inbetween")
     return shipped_models()["inbetween"].folder
-
-
-def test_the_inbetweener_that_ships_is_small_and_whole(inbetween: Path) -> None:
-    assert shipped_models()["inbetween"].bytes <= 10e6
-    assert "synthetic" in shipped_models()["inbetween"].description
-    noted = Artifact.load_json(inbetween / "inbetween" / "artifact.json").outputs
-    assert noted and {name: one.sha256 for name, one in noted.items()} == {
-        name: sha256_of(inbetween / "inbetween" / name) for name in noted
-    }
 
 
 def test_the_command_fills_a_gap_beside_the_clip(

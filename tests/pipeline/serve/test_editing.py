@@ -56,6 +56,8 @@ def test_a_file_is_read_and_changed(served: Any, walk: Callable[..., Any]) -> No
     said = served.ask("POST", "/api/clips", npz(walk(61, 30.0)[:, :22], 30.0)).json
     assert said["frames"] == pytest.approx(40, abs=1) and said["viewer"]["motions"][0]["joints"] == 52
     assert said["caption"] == "a walk" and "30 frames/s" in said["notes"][0]
+    long = served.ask("POST", "/api/clips", npz(walk(110)[:, :22]))
+    assert long.status == 400 and "lasts 6 s" in long.json["error"]
     wave = served.post("/api/edit", {"clip": said["clip"], "task": ARM, "format": "bvh"}).body
     read = served.ask("POST", "/api/clips", wave).json
     assert read["frames"] == pytest.approx(said["frames"], abs=1) and read["clip"] != said["clip"]
@@ -65,14 +67,10 @@ def test_a_file_is_read_and_changed(served: Any, walk: Callable[..., Any]) -> No
     ("clip", "task", "words"),
     [
         ("gone", ARM, "the clip is not here any more; send it again"),
-        (WALK, {"keep": [{"parts": ["foot"]}]}, "'all', 'upper', 'lower'"),
         (WALK, {"kept": []}, "unknown key 'task.kept'; did you mean 'keep'?"),
-        (WALK, {}, "nothing of the clip is kept"),
         (WALK, {"seconds": 5.5}, "5.5 s were asked for; this server makes at most 5 s"),
         (WALK, {"caption": "w" * 41}, "a caption has 41 letters"),
-        (WALK, {"pins": [{"at": 1, "joint": "tail", "position": [0, 1, 0]}]}, "no joint 'tail'"),
         (WALK, {"pins": [{"at": 1, "joint": "head", "position": [0, 9, 0]}]}, "out of reach"),
-        (WALK, {"path": [{"at": 0, "x": 0, "z": 0}, {"at": 1, "x": 60, "z": 0}]}, "nobody runs faster"),
         (3, ARM, "clip"),
     ],
 )
@@ -100,11 +98,6 @@ def test_what_cannot_be_done_is_one_sentence(served: Any, clip: Any, task: Any, 
 def test_what_is_no_clip(served: Any, data: bytes, status: int, words: str) -> None:
     got = served.ask("POST", "/api/clips", data)
     assert got.status == status and words in got.json["error"] and "/tmp" not in got.json["error"]
-
-
-def test_a_clip_that_is_too_long(served: Any, walk: Callable[..., Any]) -> None:
-    got = served.ask("POST", "/api/clips", npz(walk(110)[:, :22]))
-    assert got.status == 400 and got.json["error"] == "the clip lasts 6 s; this server takes at most 5 s"
 
 
 def test_a_model_that_makes_whole_motions_says_so(run_server: Callable[..., Any], quick: Any) -> None:
