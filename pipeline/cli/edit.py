@@ -22,15 +22,6 @@ def edit(
         Path | None,
         typer.Option("--task", help="YAML: keep, caption, path, pins, seconds and more; see the docs."),
     ] = None,
-    keep: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--keep",
-            help="START:END=PARTS in seconds, each may be left out: 0:1.5, 2.5:, :=lower, :=all-right_hand. "
-            "Parts: all, upper, lower, left_arm, right_arm, left_hand, right_hand, hands, face; + adds, "
-            "- takes away. May be repeated.",
-        ),
-    ] = None,
     caption: Annotated[str | None, typer.Option(help="What the person does in what is made.")] = None,
     samples: Annotated[int, typer.Option(min=1, help="Results.")] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("edited"),
@@ -42,13 +33,13 @@ def edit(
     """A clip of which a part is kept and the rest made anew, on a page beside the clip.
 
     Says how far each thing that was asked for is from what came, and how smooth the seams are. `--set` also
-    takes the task's keys, such as seconds (length of the result) and lead.
+    takes the task's keys: keep, seconds (length of the result), lead, mirror, speed, repeat.
 
-    Example: `motionloom edit inbetween walk.bvh --keep 0:1.5 --keep 2.5:`  (fill a gap)
+    Example: `motionloom edit inbetween walk.bvh --set 'keep=[{end: 1.5}, {start: 2.5}]'`  (fill a gap)
 
     Example: `motionloom edit inbetween walk.bvh --set seconds=8`  (go on; `--set lead=2` begins before)
 
-    Example: `motionloom edit inbetween walk.bvh --keep :=lower --caption "a person waves"`
+    Example: `motionloom edit inbetween walk.bvh --set 'keep=[{parts: [lower]}]' --caption "a person waves"`
 
     Example: `motionloom edit inbetween walk.bvh --task task.yaml`  (paths, pinned joints)
     """
@@ -66,9 +57,6 @@ def edit(
     if not isinstance(written, dict):
         raise UserError(f"{task}: a task is a mapping, such as `keep: [{{end: 1.5}}]`")
     fields = {**written, **fields}
-    if keep:
-        before = fields.get("keep")
-        fields["keep"] = [*(before if isinstance(before, list) else ()), *map(_kept, keep)]
     if caption is not None:
         fields["caption"] = caption
     edits = EditTask.parse(fields, "task" if task is None else str(task))
@@ -94,18 +82,3 @@ def edit(
         labels=["the clip", *["edited" for _ in motions]],
         figure=posing,
     )
-
-
-def _kept(text: str) -> dict[str, object]:
-    """The `Kept` that `1:2=all-face` stands for."""
-    span, equals, parts = text.partition("=")
-    ends = span.split(":")
-    try:
-        start, end = (float(one) if one.strip() else None for one in ends)
-    except ValueError:
-        raise UserError(f"--keep {text}: write it as START:END=PARTS, such as 0:1.5 or :=lower") from None
-    out: dict[str, object] = {"start": start or 0.0, "end": end}
-    if equals:
-        kept, *without = parts.replace(" ", "").split("-")
-        out |= {"parts": kept.split("+"), "but": without}
-    return out

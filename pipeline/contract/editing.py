@@ -92,11 +92,22 @@ class EditTask(Config):
     """Seconds to make before the clip."""
     seconds: Seconds | None = Field(None, gt=0)
     """Length of the result from the clip's first frame on; None: the clip's. Longer: made after its end."""
+    mirror: bool = False
+    """Left and right of the clip change places."""
+    speed: float = Field(1.0, ge=0.1, le=10, allow_inf_nan=False)
+    """How many times as fast the clip goes."""
+    repeat: int = Field(1, ge=1, le=20)
+    """How often the clip comes, each time from where it ended."""
     keep: tuple[Kept, ...] | None = None
-    """Without it: all of the clip where the result is longer than it, else nothing."""
+    """Without it: all of the clip where the result is longer than it or the clip is changed, else nothing."""
     path: tuple[PathPoint, ...] = ()
     """Between its points the root takes a smooth way that does not overshoot."""
     pins: tuple[Pin, ...] = ()
+
+    @property
+    def changes_clip(self) -> bool:
+        """Whether the clip is mirrored, retimed or repeated, which needs no model, before all else."""
+        return self.mirror or self.speed != 1 or self.repeat > 1
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

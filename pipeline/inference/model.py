@@ -26,7 +26,7 @@ from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.clip_file import read_clip, read_seed_motion, require_clip
+from motionloom.pipeline.inference.edits.clip_file import changed, read_clip, read_seed_motion, require_clip
 from motionloom.pipeline.inference.edits.edit import finish, require_editor, require_work
 from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
@@ -196,10 +196,14 @@ def edit_clip(
     """Edit a clip as `MotionModel.edit`."""
     require_seed(seed)
     layout, sampling = bundle.layout, bundle.drawing(sampling)
-    frames = edit_frames(task, clip, layout)
-    require_work(frames)
+    if task.changes_clip:
+        before = edit_frames(EditTask(), clip, layout)
+        frames = edit_frames(task, changed(clip, task), layout)
+    else:
+        before = frames = edit_frames(task, clip, layout)
+        require_work(frames)
     editor, generator = require_editor(bundle.generator), bundle.generator
-    prompt, original = Prompt(task.caption), original_of(frames, clip.caption)
+    prompt, original = Prompt(task.caption), original_of(before, clip.caption)
     words = bundle.encode(bundle.main, [prompt], [prompt.text]) if prompt.text.strip() else {}
     columns = layout.part(generator.part)
     whole = np.repeat(frames.features[None], samples, axis=0)

@@ -109,15 +109,20 @@ class Clips:
     def change(self, asked: ChangeRequest) -> Answer:
         """The result that is asked for, made once too."""
         motion = self.kept.get(asked.clip)
+        self._config.require_small([""], motion.seconds * asked.task.repeat / asked.task.speed)
         name = _name_of({"clip": asked.clip, "task": asked.task.dump(), "seed": asked.seed})
         made = self.kept.made(name, lambda: self._model.edit(motion, asked.task, seed=asked.seed)[0])
         assert isinstance(made, EditedMotion)
         # JSON knows no NaN, which stands for what a task does not ask.
         report = {key: None if value != value else value for key, value in asdict(made.report).items()}
-        facts = {"clip": name, "seed": asked.seed, "notes": list(made.remarks)}
-        cells = {"before": made.original, "after": made}
-        lines = made.report.lines()
-        facts |= {"report": report, "lines": lines}
+        cells, lines = {"before": made.original, "after": made}, made.report.lines()
+        facts = {
+            "clip": name,
+            "seed": asked.seed,
+            "notes": list(made.remarks),
+            "report": report,
+            "lines": lines,
+        }
         return answer(made, asked.format, facts, "\n".join(lines), cells)
 
 

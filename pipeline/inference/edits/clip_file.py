@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,16 @@ from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.bvh.motion import read_bvh
+from motionloom.datasets.motion.canonical import facing, ground, mirror, resample
 from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import FACE, HANDS, UserError, parse_json
-from motionloom.pipeline.contract.editing import RecordedClip
+from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 
 ENDINGS = (".bvh", ".npz", ".glb")
+_BLEND = 0.5
+"""Seconds in which a clip that comes again passes into its beginning [ours]."""
 LEAST_FRAMES = 4
 """Fewer have no motion in them."""
 
@@ -51,6 +55,26 @@ def require_clip(clip: RecordedClip) -> RecordedClip:
     except UserError as error:
         raise UserError(f"{clip.name}: {error}") from None
     return clip
+
+
+def changed(clip: RecordedClip, task: EditTask) -> RecordedClip:
+    """The clip mirrored, at another speed and several times in a row, as a task says."""
+    joints, face, pace = clip.joints, clip.face, clip.fps * task.speed
+    if task.mirror:
+        joints = mirror(joints, Skeleton.named("smplx52" if clip.has_hands else "smpl22"))
+    joints = once = resample(joints, pace, clip.fps)
+    blend = np.clip(np.arange(len(once)) / (_BLEND * clip.fps), 0, 1)[:, None, None]
+    for _ in range(task.repeat - 1):
+        turn = facing(joints[-1:])[0] - facing(once[:1])[0]
+        plane = (ground(once) - ground(once[0, 0])) * np.exp(1j * turn) + ground(joints[-1, 0])
+        following = np.stack([plane.imag, once[..., 1], plane.real], axis=-1)
+        # The pose in which the clip ended gives way to the one in which it begins.
+        following += (joints[-1] - following[0]) * (1 - blend * blend * (3 - 2 * blend))
+        joints = np.concatenate([joints, following[1:]])
+    if face is not None:
+        face = resample(face, pace, clip.fps)
+        face = np.concatenate([face, *[face[1:]] * (task.repeat - 1)])
+    return replace(clip, joints=joints, face=face)
 
 
 def read_seed_motion(path: Path, layout: MotionLayout) -> NDArray[np.float32]:

@@ -26,14 +26,10 @@ from motionloom.datasets.motion.layout import (
     pieces_of,
     step_columns,
 )
-from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import tangent
 from motionloom.models.diffusion.observed import Places
 from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask, RecordedClip
-
-SAME_BONES = 0.05
-"""Mean difference of bone lengths up to which a clip's figure counts as the layout's [ours]."""
 
 
 @dataclass(frozen=True)
@@ -151,18 +147,11 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     origin, turn = complex(ground(joints[0, 0])), float(facing(joints[:1])[0])
     figure = fit_rigid(canonicalize(joints), layout.skeleton)
     own = figure.joints
-    difference = _bone_difference(own, layout.skeleton)
-    posed, scale, lift = own, 1.0, 0.0
-    if difference > SAME_BONES:
-        # The features must be of the figure that the model knows; `scale` and `lift` lead back to the clip's.
-        retargeted = retarget(own, layout.skeleton)
-        posed = canonicalize(retargeted)
-        scale = float(retargeted[0, 0, 1] / own[0, 0, 1])
-        lift = float(retargeted[0, 0, 1] - posed[0, 0, 1]) / scale
-        remarks.append(
-            f"its bones differ from the model's by {difference:.0%}: the model moves its own figure, and "
-            f"what it makes is put back on the clip's bones"
-        )
+    # The features must be of the figure that the model knows; `scale` and `lift` lead back to the clip's.
+    retargeted = retarget(own, layout.skeleton)
+    posed = canonicalize(retargeted)
+    scale = float(retargeted[0, 0, 1] / own[0, 0, 1])
+    lift = float(retargeted[0, 0, 1] - posed[0, 0, 1]) / scale
     features = encode(posed, layout, face if layout.has("face") else None)
     # Features of steps have one frame less than the joints.
     face = None if face is None else face[: len(features)]
@@ -236,7 +225,7 @@ class _TimedTask:
                 )
             end = clip_end if kept.end is None else min(clip_end, self.lead + round(kept.end * fps))
             out[start:end] |= pieces_of(kept.parts, kept.but)
-        if task.keep is None and self.frames > clip_frames:
+        if task.keep is None and (self.frames > clip_frames or task.changes_clip):
             out[self.lead : clip_end] = True
         return out
 
@@ -300,13 +289,6 @@ class _TimedTask:
             place = (complex(z, x) - origin) * np.exp(-1j * turn)
             out[frame, joint] = (float(place.imag), y, float(place.real))
         return out
-
-
-def _bone_difference(joints: NDArray[np.float64], skeleton: Skeleton) -> float:
-    """Mean difference of the body's bone lengths from a skeleton's, as a share of these."""
-    own = np.linalg.norm(skeleton.with_lengths_of(joints).offsets, axis=-1)[1:BODY_JOINTS]
-    usual = np.linalg.norm(skeleton.offsets, axis=-1)[1:BODY_JOINTS]
-    return float(np.abs(own - usual).sum() / usual.sum())
 
 
 def _known_places(

@@ -146,16 +146,17 @@ export function makeEditor(page) {
   }
   const sentence = (words) => `${words[0].toUpperCase()}${words.slice(1)}.`;
 
-  /* Forgets the request under way, which `busy` aborts; the server drops it too, if it has not begun. */
+  /* Forgets the request under way, which `busy` aborts. */
   function stop() {
     turn += 1;
     if (busy) busy.abort();
     busy = null;
   }
 
-  async function make() {
+  /* Asks for what is marked, or for an exact change of the clip. */
+  async function make(exact) {
     const mine = ++turn, now = history.now, before = results.get(now), seed = before ? before.answer.seed + 1 : 0;
-    const asked = { clip: clip.ref, task: taskOf(now, rows, fps), seed, format: "viewer" }, began = performance.now();
+    const asked = { clip: clip.ref, task: exact || taskOf(now, rows, fps), seed, format: "viewer" }, began = performance.now();
     busy = new AbortController();
     update();
     const clock = setInterval(() => tell(`Working… ${Math.round((performance.now() - began) / 1000)} s`), 1000);
@@ -187,6 +188,7 @@ export function makeEditor(page) {
     tell("Stopped.");
   });
   one("edit-nudge").addEventListener("click", () => nudge(joints.value, 0, 0));
+  for (const button of panel.querySelectorAll("[data-task]")) button.addEventListener("click", () => { if (!busy) make(JSON.parse(button.dataset.task)); });
   one("edit-close").addEventListener("click", close);
   one("edit-undo").addEventListener("click", () => { history.undo(); update(); });
   one("edit-redo").addEventListener("click", () => { history.redo(); update(); });

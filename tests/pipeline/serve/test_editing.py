@@ -69,6 +69,7 @@ def test_a_file_is_read_and_changed(served: Any, walk: Callable[..., Any]) -> No
         ("gone", ARM, "the clip is not here any more; send it again"),
         (WALK, {"kept": []}, "unknown key 'task.kept'; did you mean 'keep'?"),
         (WALK, {"seconds": 5.5}, "5.5 s were asked for; this server makes at most 5 s"),
+        (WALK, {"repeat": 3}, "6 s were asked for"),
         (WALK, {"caption": "w" * 41}, "a caption has 41 letters"),
         (WALK, {"pins": [{"at": 1, "joint": "head", "position": [0, 9, 0]}]}, "out of reach"),
         (3, ARM, "clip"),
