@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.motion.body.landing import eased, landed, reached
+from motionloom.datasets.motion.body.rigid import fit_rigid
 from motionloom.datasets.motion.layout import (
     PIECES,
     FigurePart,
@@ -88,16 +89,16 @@ def test_figures_land_where_they_must() -> None:
 
 def test_a_pinned_hand_takes_its_limb_along() -> None:
     skeleton = Skeleton.named("smplx52")
-    joints = np.repeat(skeleton.rest_joints[None] + [0, 1, 0], 30, axis=0)
-    wrist = skeleton.index("left_wrist")
+    figure = fit_rigid(np.repeat(skeleton.rest_joints[None] + [0, 1, 0], 30, axis=0), skeleton)
+    joints, wrist = figure.joints, skeleton.index("left_wrist")
     wanted = joints[15, wrist] + [-0.1, 0.25, 0.1]
     fixed = np.zeros((30, 52), dtype=bool)
     fixed[:, [skeleton.index(f"{side}_foot") for side in SIDES]] = True
     fixed[:10] = True
-    found = reached(joints, skeleton, {(15, wrist): wanted}, fixed, blend=10)
-    assert np.linalg.norm(found[15, wrist] - wanted) < 0.005
-    np.testing.assert_array_equal(found[fixed], joints[fixed])
-    np.testing.assert_allclose(found[25:], joints[25:], atol=1e-9)
+    found = reached(figure, {(15, wrist): wanted}, fixed, 10, lambda made: made).joints
+    assert np.linalg.norm(found[15, wrist] - wanted) < 0.001
+    np.testing.assert_allclose(found[fixed], joints[fixed], atol=0.01)
+    np.testing.assert_allclose(found[np.r_[:10, 25:30]], joints[np.r_[:10, 25:30]], atol=1e-9)
     bones = np.linalg.norm(skeleton.bones(found[15]), axis=-1)
-    np.testing.assert_allclose(bones, np.linalg.norm(skeleton.offsets, axis=-1) * (bones > 0), atol=0.01)
+    np.testing.assert_allclose(bones, np.linalg.norm(figure.skeleton.offsets, axis=-1), atol=1e-9)
     assert np.linalg.norm(np.diff(found[:, wrist], axis=0), axis=-1).max() < 0.1  # no jump
