@@ -119,9 +119,12 @@ def generate(
                 if begun is None and (seed_frames := bundle.generator.capabilities.seed_frames):
                     start = f"the first {seed_frames / bundle.layout.fps:.2g} s are of a training dance"
                     print_note(aside, f"{start}; --set seed_motion=FILE takes yours")
-            prompts = [one.prompt for one in (segments or motions)]
-            notes = bundle.notes(prompts, motions, sampling.face_model, seconds)
-            for note in notes:
+
+            def notes(some: Sequence[GeneratedMotion]) -> Sequence[object]:
+                prompts = [one.prompt for one in segments or some]
+                return bundle.notes(prompts, some, sampling.face_model, seconds)
+
+            for note in notes(motions):
                 print_note(aside, note)
             title = page_title([motion.caption for motion in motions], [path.name for path in songs], file)
             write_files(
@@ -129,7 +132,8 @@ def generate(
                 motions,
                 wanted,
                 title=title,
-                note=page_note(len(motions), Path(folder).resolve().name, seed, notes, bundle.terms),
+                note=page_note(len(motions), Path(folder).resolve().name, seed, terms=bundle.terms),
+                notes=[notes([motion]) for motion in motions],
                 names=None if texts else each([Excerpt.named(path).path.stem for path in songs]),
                 figure=posing,
                 say=partial(say, aside),

@@ -41,6 +41,7 @@ def write_motions(
     scores: Sequence[Score] | None = None,
     names: Sequence[str] | None = None,
     labels: Sequence[str] | None = None,
+    notes: Sequence[Sequence[object]] | None = None,
     figure: FigureOptions | None = None,
     say: Callable[[str], None] | None = None,
 ) -> list[Path]:
@@ -49,8 +50,8 @@ def write_motions(
     What was written there before is removed. `title` and `note` are the page's. `scores`, one for each
     motion, are sound, beats and segments for the page; without them each motion comes with what drove it.
     `names` are what files are called after, instead of the captions; `labels` are what the page says above
-    each. `figure` says how the shown figure follows the generated joints, and `say` is given a line on each
-    motion that it is far from.
+    each, `notes` the lines below. `figure` says how the shown figure follows the generated joints, and `say`
+    is given a line on each motion that it is far from.
     """
     require_folder(folder)
     options = figure or FigureOptions()
@@ -67,7 +68,8 @@ def write_motions(
     for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
         name = file_stem(number, names[number])
         label = "generated" if labels is None else labels[number]
-        clips.append(OutputClip(shown(motion, options), score, options, label, "arkit" in formats))
+        lines = () if notes is None else notes[number]
+        clips.append(OutputClip(shown(motion, options), score, options, label, "arkit" in formats, lines))
         if say is not None and (remark := clips[-1].shown.remark):
             say(f"{name}: {remark}")
         for _, writer in writers:

@@ -39,6 +39,8 @@ class OutputClip:
     """Heading of its figure on the page."""
     arkit: bool = False
     """Whether GLB files carry ARKit's 52 shapes of the face, instead of the synthetic source's own."""
+    notes: Sequence[object] = ()
+    """Lines under its figure on the page."""
 
     @cached_property
     def face(self) -> NDArray[np.float32] | None:
@@ -192,17 +194,19 @@ def cell_of(clip: OutputClip, label: str = "generated") -> ViewerMotion:
     from motionloom.pipeline.render.viewer import ViewerMotion
 
     motion = clip.shown.motion
+    remark = "" if motion.segments else motion.prompt.remark
     return ViewerMotion(
         joints=clip.shown.joints,
         fps=clip.shown.fps,
         parents=motion.layout.skeleton.parents,
         label=label,
-        caption=": ".join(filter(None, (motion.words, motion.prompt.remark if not motion.segments else ""))),
+        caption=motion.words,
         face_controls=clip.controls,
         sound=clip.score.sound,
         beats=clip.score.beats,
         segments=clip.score.segments,
         figure=clip.shown.figure,
+        note="\n".join(dict.fromkeys(filter(None, (remark, *map(str, clip.notes))))),
     )
 
 

@@ -46,8 +46,8 @@ def log_lines(
     return out
 
 
-def line_chart(lines: Sequence[Line], *, x_label: str = "step", y_label: str = "", title: str = "") -> str:
-    """SVG of curves over one pair of axes, with a legend and the data for the page's hover script."""
+def line_chart(lines: Sequence[Line], title: str) -> str:
+    """SVG of curves over a training's steps, with a legend and the data for the page's hover script."""
     curves = []
     for line in lines:
         x, y = np.asarray(line.x, np.float64).ravel(), np.asarray(line.y, np.float64).ravel()
@@ -61,7 +61,7 @@ def line_chart(lines: Sequence[Line], *, x_label: str = "step", y_label: str = "
     low_y = min(float(y.min()) for _, y in filled)
     high_y = max(float(y.max()) for _, y in filled)
     x_axis, y_axis = _Axis(low_x, high_x, LEFT, WIDTH - RIGHT), _Axis(low_y, high_y, HEIGHT - BOTTOM, TOP)
-    parts = _axes(x_axis, y_axis, x_label, y_label)
+    parts = _axes(x_axis, y_axis, "step", "")
     hover = []
     for index, (line, (x, y)) in enumerate(zip(lines, curves, strict=True)):
         colour = index % COLOURS
@@ -81,16 +81,11 @@ def line_chart(lines: Sequence[Line], *, x_label: str = "step", y_label: str = "
             parts += [f'<circle class="dot s{colour}" cx="{px:g}" cy="{py:g}" r="4"/>' for px, py in points]
         values = [[float(f"{a:.6g}"), float(f"{b:.4g}")] for a, b in zip(x.tolist(), y.tolist(), strict=True)]
         hover.append({"name": line.name, "at": points, "values": values})
-    return _svg(title, parts, {"x": x_label, "lines": hover}) + _legend(lines)
+    return _svg(title, parts, {"x": "step", "lines": hover}) + _legend(lines)
 
 
 def histogram(
-    counts: Mapping[str, ArrayLike],
-    edges: tuple[float, float],
-    *,
-    x_label: str = "",
-    y_label: str = "",
-    title: str = "",
+    counts: Mapping[str, ArrayLike], edges: tuple[float, float], title: str, x_label: str, y_label: str
 ) -> str:
     """SVG of stacked counts: for each name one count per equal bin [K] of the range `edges`, and a legend.
 
@@ -202,7 +197,7 @@ def _svg(title: str, parts: Sequence[str], hover: dict[str, object] | None) -> s
         if hover is None
         else f' data-hover="{escape(json.dumps(hover, separators=(",", ":")), quote=True)}"'
     )
-    label = escape(title or "chart", quote=True)
+    label = escape(title, quote=True)
     return (
         f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}"{data}>'
         + "".join(parts)

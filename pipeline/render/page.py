@@ -110,11 +110,6 @@ class Page:
         yield self
         self._blocks.append("</details>")
 
-    def add_folded(self, summary: str, columns: Sequence[str], rows: Sequence[Sequence[Value]]) -> Page:
-        """A table that is closed until the reader opens it."""
-        with self.folded(summary):
-            return self.add_table(columns, rows)
-
     def add_facts(self, facts: Mapping[str, Value]) -> Page:
         """A short list of names and values, shown as tiles."""
         tiles = "".join(
@@ -125,22 +120,20 @@ class Page:
         self._blocks.append(f'<dl class="facts">{tiles}</dl>')
         return self
 
-    def add_plot(self, lines: Sequence[Line], title: str, x_label: str = "step", y_label: str = "") -> Page:
-        """A line chart; neighbouring charts stand side by side where the window is wide enough."""
-        chart = line_chart(lines, x_label=x_label, y_label=y_label, title=title)
-        return self._add_chart(chart, title)
+    def add_plot(self, lines: Sequence[Line], title: str) -> Page:
+        """A chart of training curves; neighbouring charts stand side by side where there is room."""
+        return self._add_chart(line_chart(lines, title), title)
 
     def add_histogram(
         self,
         counts: Mapping[str, ArrayLike],
         edges: tuple[float, float],
         title: str,
-        x_label: str = "",
-        y_label: str = "clips",
+        x_label: str,
+        y_label: str,
     ) -> Page:
         """Stacked counts per bin of a range, one colour a name; of one name the empty bins are marked."""
-        chart = histogram(counts, edges, x_label=x_label, y_label=y_label, title=title)
-        return self._add_chart(chart, title)
+        return self._add_chart(histogram(counts, edges, title, x_label, y_label), title)
 
     def add_viewer(self, motions: Sequence[ViewerMotion], note: str = "") -> Page:
         """Motions that play in the page, with their own controls below."""

@@ -60,7 +60,8 @@ class ViewerMotion:
     'generated'); motions with one `group` share a row. `face_controls` [T, 5] are those of `body/face.py`.
     `sound` starts with frame 0; `beats` are seconds, ticks on the time line;
     `segments` are what drives the motion when: (start, end, label) in seconds, or `Segment`s. `figure` is the
-    rigid figure whose joints these are, where there is one: its rotations pose the body.
+    rigid figure whose joints these are, where there is one: its rotations pose the body. `note` stands under
+    the figure.
     """
 
     joints: NDArray[np.floating]
@@ -74,6 +75,7 @@ class ViewerMotion:
     beats: Sequence[float] = ()
     segments: Segments = ()
     figure: RigidMotion | None = None
+    note: str = ""
 
 
 def write_viewer(path: Path, motions: Sequence[ViewerMotion], title: str, note: str = "") -> None:
@@ -130,6 +132,8 @@ def viewer_data(motions: Sequence[ViewerMotion], title: str = "", note: str = ""
                 "pose": None if human is None else pose_data(posing_of(joints, human, motion.figure)),
             }
         )
+        if motion.note:
+            clips[-1]["note"] = motion.note
         score = score_data(motion.beats, motion.segments, len(joints) / motion.fps)
         if any(score.values()) and score not in scores:
             scores.append(score)

@@ -32,8 +32,8 @@ EXAMPLES = 8
 """Captions of each split that are shown."""
 REASONS = 40
 """Kinds of reasons for rejected clips that get a table of their own."""
-WATCH_FPS, WATCH_SECONDS = 20.0, 10.0
-"""Clips are thinned and cut to this for the page."""
+WATCH, WATCH_FPS, WATCH_SECONDS = 12, 20.0, 10.0
+"""Clips to watch; they are thinned and cut to this for the page."""
 
 Rows = list[list[Value]]
 
@@ -66,12 +66,10 @@ class Records:
         self.remarks["Clips that are mirror images of others"] += meta.mirror_of is not None
 
 
-def write_data_report(root: Path, out: Path, *, clips: int = 12, progress: bool = False) -> None:
-    """Write the page about the data set in `root` to the file `out`, with at most `clips` clips to watch."""
+def write_data_report(root: Path, out: Path, *, progress: bool = False) -> None:
+    """Write the page about the data set in `root` to the file `out`."""
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
-    if clips < 0:
-        raise UserError(f"clips to watch: {clips}; give 0 or more")
     manifest = load_manifest(root)
     layout = manifest_layout(manifest)
     filled = {shard.split for shard in manifest.shards}
@@ -89,14 +87,9 @@ def write_data_report(root: Path, out: Path, *, clips: int = 12, progress: bool 
         f"made by {manifest.converter} version {manifest.converter_version}",
     )
     _overview(page, manifest, splits, records)
-    if clips:
-        page.add_heading("Watch")
-        raw = (
-            " The bones are a neutral skeleton's: no body model is used here."
-            if layout.family == "raw"
-            else ""
-        )
-        page.add_viewer(to_watch(splits, clips), f"At most {WATCH_SECONDS:g} s of each clip.{raw}")
+    raw = " The bones are a neutral skeleton's: no body model is used here." if layout.family == "raw" else ""
+    page.add_heading("Watch")
+    page.add_viewer(to_watch(splits, WATCH), f"At most {WATCH_SECONDS:g} s of each clip.{raw}")
     total = sum(map(len, splits.values()))
     _captions(page, records, total)
     _rejected(page, manifest, total)
@@ -222,7 +215,8 @@ def _rejected(page: Page, manifest: Manifest, clips: int) -> None:
     more = "".join(f"; {count:,} {kind} files" for kind, count in sorted(other.items()))
     page.add_text(f"{rejected:,} clips of {rejected + clips:,} were left out{more}, for these reasons.")
     for kind, rows in [*ranked[:REASONS], *([("other reasons", rest)] if rest else [])]:
-        page.add_folded(f"{len(rows):,} × {kind}", ["source", "reason"], rows)
+        with page.folded(f"{len(rows):,} × {kind}"):
+            page.add_table(["source", "reason"], rows)
 
 
 def _source(page: Page, manifest: Manifest, records: Records) -> None:
@@ -246,4 +240,5 @@ def _source(page: Page, manifest: Manifest, records: Records) -> None:
     ):
         rows: Rows = [[key, setting_text(value)] for key, value in flatten(settings or {}).items()]
         if rows:
-            page.add_folded(title, ["option", "value"], rows)
+            with page.folded(title):
+                page.add_table(["option", "value"], rows)

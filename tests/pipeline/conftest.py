@@ -18,6 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.cli import main as cli
 
@@ -52,13 +53,8 @@ def _walk(
         local["left_elbow"] = about("z", 0.9 + 0.5 * np.sin(2 * np.pi * 1.6 * t))
     heading = turn * t
     local["pelvis"] = about("y", heading)
-    glob: list[Rotation] = []
-    joints = np.zeros((frames, len(skeleton), 3))
-    for j, parent in enumerate(skeleton.parents):
-        here = local[skeleton.joints[j]]
-        glob.append(here if parent < 0 else glob[parent] * here)
-        if parent >= 0:
-            joints[:, j] = joints[:, parent] + glob[parent].apply(skeleton.offsets[j])
+    turns = np.stack([local[name].as_matrix() for name in skeleton.joints], axis=1)
+    joints, _ = forward_kinematics(turns, np.zeros((frames, 3)), skeleton.offsets, skeleton.parents)
     joints[..., 1] -= joints[:, 10:12, 1].min(axis=1)[:, None]
     speed = np.stack([np.sin(heading), 0 * t, np.cos(heading)], -1) * 1.1 / fps
     path = np.cumsum(speed, axis=0)

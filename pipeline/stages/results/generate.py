@@ -63,7 +63,7 @@ class GenerateStage(StageKind):
         from motionloom.pipeline.inference.outputs import page_note, write_motions
 
         config: GenerateConfig = context.config
-        (said, mismatches), danced = _performed(context), _danced(context)
+        (said, notes), danced = _performed(context), _danced(context)
         if not said and not danced:
             raise UserError(
                 f"stage '{context.name}': nothing to generate from: no held-out clip has a caption or music "
@@ -76,20 +76,21 @@ class GenerateStage(StageKind):
             motions,
             config.formats,
             title=f"Generated motions of {context.recipe}",
-            note=page_note(len(motions), context.recipe, context.seed, mismatches, terms),
+            note=page_note(len(motions), context.recipe, context.seed, terms=terms),
             scores=[Score()] * len(said) + [clip.score() for _, clip in danced],
+            notes=[*notes, *([] for _ in danced)],
             figure=config.figure,
         )
         titles = [motion.caption for motion in said] + [f"dance to {clip.title}" for _, clip in danced]
         for motion, title in zip(motions, titles, strict=True):
             line = f"    {len(motion.joints) / motion.layout.fps:4.1f} s  {printable(title)}"
             context.console.print(line, markup=False)
-        for mismatch in mismatches:
-            context.console.print(f"    {printable(mismatch)}", markup=False)
+        for note in dict.fromkeys(note for own in notes for note in own):
+            context.console.print(f"    {printable(note)}", markup=False)
 
 
-def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[str]]:
-    """Motions for the captions of the config, or of held-out clips, and what they do not show of these."""
+def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[list[str]]]:
+    """Motions for the captions of the config, or of held-out clips, and what each does not show."""
     config: GenerateConfig = context.config
     bundle = bundle_driven_by("text", context.every("generators"), context.stage_cache)
     seconds, seed, sampling = config.seconds, context.seed, config.sampling
@@ -105,7 +106,7 @@ def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[str]]
     else:
         truths = spread_truths(context.given["data"].held_out(prefer="test"), config.count)
         made = perform(bundle, truths, seconds=seconds, seed=seed, sampling=sampling) if truths else []
-    return made, bundle.find_mismatches(made)
+    return made, [bundle.find_mismatches([motion]) for motion in made]
 
 
 def _danced(context: StageContext) -> list[tuple[GeneratedMotion, DanceClip]]:

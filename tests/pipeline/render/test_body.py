@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
@@ -24,7 +23,6 @@ from motionloom.pipeline.render.body.face import (
     ARKIT,
     EXPRESSIONS,
     ArkitBases,
-    bounded_least_squares,
     expression_weights,
     synthetic_face_controls,
 )
@@ -176,31 +174,7 @@ def _skin(joints: NDArray[np.generic], shares: NDArray[np.generic]) -> NDArray[n
     return out
 
 
-# ARKit weights against scipy's bounded least squares, and bases that are refused.
-
-
-def test_bounded_least_squares_is_scipys() -> None:
-    rng = np.random.default_rng(0)
-    matrix = rng.normal(size=(60, 12))
-    targets = rng.normal(size=(5, 60)) * 2
-    found = bounded_least_squares(matrix.T @ matrix, targets @ matrix)
-    for row, target in zip(found, targets, strict=True):
-        reference = lsq_linear(matrix, target, bounds=(0, 1), tol=1e-14).x
-        np.testing.assert_allclose(row, reference, atol=1e-4)
-
-
-def test_weights_come_back_where_the_source_is_a_mixture_of_arkits_shapes() -> None:
-    rng = np.random.default_rng(1)
-    arkit = rng.normal(size=(52, 80, 3))
-    mixture = rng.normal(size=(6, 52)) ** 2
-    bases = ArkitBases(np.einsum("km,mvc->kvc", mixture, arkit), arkit)
-    values = 0.04 * rng.uniform(size=(7, 6))
-    weights = bases.weights(values)
-    expected = values @ mixture
-    inside = expected.max(axis=1) < 1
-    assert inside.sum() >= 3
-    np.testing.assert_allclose(weights[inside], expected[inside], atol=2e-3)
-    assert (weights >= 0).all() and (weights <= 1).all()
+# ARKit weights, and bases that are refused.
 
 
 def test_shapes_that_move_nothing_stay_at_rest() -> None:

@@ -98,7 +98,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, walk: Any) -> Path:
     page.add_table(["name", "value"], [["x" * 90, 1.0]], "narrow").add_text("y" * 300).add_list(
         [LONG, "z" * 200]
     )
-    page.add_folded("listed", ["where", "what"], [[f"clip {k}", LONG] for k in range(60)])
+    with page.folded("listed"):
+        page.add_table(["where", "what"], [[f"clip {k}", LONG] for k in range(60)])
     page.add_facts({"a fact": "w" * 60, "clips": 12}).write(root / "report.html")
     return root
 

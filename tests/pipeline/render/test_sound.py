@@ -19,7 +19,7 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import score_of, write_motions
+from motionloom.pipeline.inference.outputs import score_of
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.sound import RATE, Score, Segment, embed_sounds, playable, score_data
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
@@ -117,20 +117,6 @@ def test_only_pages_with_sound_allow_media_and_only_their_own(
 
 
 # ---- from a generated motion to its files
-
-
-def test_generated_motions_pass_their_scores_to_the_page(
-    tmp_path: Path, data_of: Make, song: Make, walk: Make
-) -> None:
-    layout = MotionLayout.named("tomato623")
-    motions = [
-        GeneratedMotion(Prompt(name), np.zeros((8, 623), np.float32), walk(8), None, layout) for name in "ab"
-    ]
-    scores = [Score(song(1.0), [0.1], [(0, 0.2, "walks")]), Score()]
-    write_motions(tmp_path / "out", motions, ["html"], title="t", scores=scores)
-    data = data_of(tmp_path / "out" / "index.html")
-    assert [m.get("sound") for m in data["motions"]] == [0, None]
-    assert data["scores"][0]["segments"] == [[0, 0.2, "walks", "text"]]
 
 
 @pytest.mark.slow

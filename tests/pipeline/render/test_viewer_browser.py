@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ def rows(tmp_path_factory: pytest.TempPathFactory, walk: Any) -> Path:
             motions.append(
                 ViewerMotion(walk(frames, **options), 20, PARENTS, label, f"{group} ({label})", group)
             )
+    motions[3] = replace(motions[3], note=NASTY)
     write_viewer(path, motions, NASTY, NASTY)
     return path
 
@@ -156,6 +158,8 @@ def test_untrusted_captions_stay_text(visit: Any, rows: Path) -> None:
     assert page.locator("h1").text_content() == NASTY
     assert page.title() == NASTY
     assert page.locator("figcaption").nth(3).text_content() == f"{NASTY} (truth)"
+    assert page.locator("figure:has(.mlv-note) figcaption").all_text_contents() == [f"{NASTY} (truth)"]
+    assert page.locator(".mlv-note").text_content() == NASTY
     assert page.locator("img, b").count() == 0
     assert page.evaluate("window.hacked") is None
 
@@ -176,9 +180,8 @@ def test_report_page_with_two_viewers_and_charts(visit: Any, until: Any, tmp_pat
     ]
     page = Page("Report", "of a run").add_heading("Curves").add_text("text")
     page.add_plot([Line("train", range(100), np.linspace(2, 1, 100)), Line("val", [0, 99], [2, 1.2])], "Loss")
-    page.add_histogram({"uses": np.arange(64) % 7}, (0, 64), "Codes").add_heading("Motions").add_viewer(
-        motions, "two"
-    ).add_viewer(motions[:1])
+    page.add_histogram({"uses": np.arange(64) % 7}, (0, 64), "Codes", "code", "uses")
+    page.add_heading("Motions").add_viewer(motions, "two").add_viewer(motions[:1])
     page.add_table(["a", "b"], [["x", 1.0]]).write(tmp_path / "page.html")
     sheet = visit(tmp_path / "page.html", width=1100, height=900, plays=True)
     assert sheet.evaluate("__viewers.length") == 2

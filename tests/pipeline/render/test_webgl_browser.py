@@ -171,20 +171,18 @@ def test_a_context_that_goes_leaves_sticks_and_comes_back(
     assert (np.abs(again - skinned).max(axis=-1) > 24).mean() < 0.002
 
 
-def test_without_webgl2_or_when_asked_there_are_sticks(
+def test_without_webgl2_there_are_sticks(
     browser: Any, until: Callable[..., None], page_file: Path, pixels: Any
 ) -> None:
     refuse = """const get = HTMLCanvasElement.prototype.getContext;
         HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
             return kind === "webgl2" ? null : get.call(this, kind, ...rest);
         };"""
-    for address, script in ((page_file.as_uri() + "?view=2d", ""), (page_file.as_uri(), refuse)):
-        page = browser.new_page(viewport=SIZE)
-        if script:
-            page.add_init_script(script)
-        page.goto(address)
-        until(page, "window.__viewer && __viewer.draws > 0")
-        assert page.evaluate("__viewer.view") == "2d"
-        still(page, 5)
-        assert all(mask.sum() > 300 for mask in limbs(pixels(page)))
-        page.close()
+    page = browser.new_page(viewport=SIZE)
+    page.add_init_script(refuse)
+    page.goto(page_file.as_uri())
+    until(page, "window.__viewer && __viewer.draws > 0")
+    assert page.evaluate("__viewer.view") == "2d"
+    still(page, 5)
+    assert all(mask.sum() > 300 for mask in limbs(pixels(page)))
+    page.close()

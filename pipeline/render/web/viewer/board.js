@@ -33,6 +33,7 @@ function buildCells(clips) {
       stage.append(now.node, hear);
       const figure = element("figure", { className: "mlv-cell" }, stage);
       if (clip.caption) figure.append(element("figcaption", { textContent: clip.caption, title: clip.caption }));
+      if (clip.note) figure.append(element("p", { className: "mlv-note", textContent: clip.note }));
       row.append(figure);
       cells.push({ clip, canvas, count, now, hear, room, ctx: canvas.getContext("2d"), visible: true });
     }

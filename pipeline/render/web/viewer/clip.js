@@ -18,7 +18,7 @@ function openClip(raw, skeleton, faceStep) {
   }
   const lowest = raw.low[1];
   const clip = {
-    label: raw.label, caption: raw.caption, group: raw.group, fps: raw.fps, frames: raw.frames,
+    label: raw.label, caption: raw.caption, note: raw.note, group: raw.group, fps: raw.fps, frames: raw.frames,
     joints: raw.joints, positions, face, skeleton,
     duration: (raw.frames - 1) / raw.fps,
     floor: Math.abs(lowest) < 0.5 ? 0 : lowest, // canonical clips stand on 0; others on their lowest point

@@ -10,11 +10,11 @@ const BODY_REACH = 0.15, HEAD_REACH = 0.27; // how far the body goes beyond its 
 const NEAR_DETAIL = 400; // a figure of so many pixels is drawn with all vertices
 const FEW = 2; // without a GPU, more moving figures than that have the far detail
 
-/* The page's stage, or null: no WebGL2, no body, or `?view=2d` in the address. */
+/* The page's stage, or null: no WebGL2, or no body. */
 const openStage = (() => {
   let stage;
   return () => {
-    if (stage === undefined) stage = BODY && new URLSearchParams(location.search).get("view") !== "2d" ? makeStage() : null;
+    if (stage === undefined) stage = BODY && makeStage();
     return stage;
   };
 })();
