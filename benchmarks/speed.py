@@ -155,7 +155,7 @@ def loader(args: Namespace) -> Record:
         dataset, stats = noise(folder, layout, 2048, WINDOW)
         names = [str(Path(folder) / shard.name) for shard in dataset.manifest.shards]
 
-        batches = WindowBatches(dataset, stats, window=WINDOW, batch_size=BATCH, windows_per_clip=4)
+        batches = WindowBatches(dataset, stats, window=WINDOW, batch_size=BATCH)
 
         def ours() -> None:
             for step in range(40):

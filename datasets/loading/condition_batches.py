@@ -44,8 +44,6 @@ class ConditionBatch(MotionBatch):
     """Clip numbers in the dataset, int64 [B]."""
     closed: Tensor
     """bool [B]: whether the row ends where its clip, or its caption's stretch, does."""
-    valid: Tensor
-    """bool [B]; false for the repeats that fill an evaluation batch up to the number of ranks."""
     caption: list[str]
     """Empty where a row has no text."""
     conditions: dict[str, Condition]
@@ -152,7 +150,6 @@ class ConditionedClips:
             "present": torch.from_numpy(cut.present),
             "index": torch.from_numpy(clips.copy()),
             "closed": torch.from_numpy(cut.closed),
-            "valid": torch.ones(len(clips), dtype=torch.bool),
             "caption": captions,
             "conditions": {},
         }
@@ -214,11 +211,7 @@ class ConditionBatches(Dataset[ConditionBatch]):
 
 
 class EvalBatches(Dataset[ConditionBatch]):
-    """Every qualifying clip of a split once, in order: first caption, first `max_frames` frames.
-
-    Each rank gets the same number of rows; where the clips do not divide, the last batch repeats its last
-    clip with `valid` false.
-    """
+    """Every qualifying clip of a split once, in order: first caption, first `max_frames` frames."""
 
     def __init__(
         self,
@@ -230,18 +223,13 @@ class EvalBatches(Dataset[ConditionBatch]):
         max_frames: int,
         min_frames: int = 1,
         captioned: Captioned | None = None,
-        rank: int = 0,
-        world: int = 1,
         columns: NDArray[np.int64] | None = None,
     ) -> None:
-        if batch_size < 1 or batch_size % world:
-            raise UserError(f"an evaluation batch of {batch_size} clips does not divide over {world} ranks")
         self.source = ConditionedClips(
             dataset, stats, readers or {}, max_frames=max_frames, min_frames=min_frames, columns=columns,
             captioned=captioned,
         )  # fmt: skip
-        self.clips = self.source.clips
-        self.batch_size, self.rank, self.world = batch_size, rank, world
+        self.clips, self.batch_size = self.source.clips, batch_size
 
     def __len__(self) -> int:
         return -(-len(self.clips) // self.batch_size)
@@ -249,13 +237,6 @@ class EvalBatches(Dataset[ConditionBatch]):
     def __getitem__(self, k: int) -> ConditionBatch:
         if not 0 <= k < len(self):
             raise IndexError(f"evaluation batch {k} of {len(self)}")
-        rows = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.clips)))
-        # Ranks must make as many calls as each other: the last batch is filled up with its last clip.
-        missing = -len(rows) % self.world
-        valid = np.concatenate([np.ones(len(rows), bool), np.zeros(missing, bool)])[self.rank :: self.world]
-        rows = np.concatenate([rows, np.repeat(rows[-1:], missing)])[self.rank :: self.world]
-        clips, source = self.clips[rows], self.source
+        clips, source = self.clips[k * self.batch_size : (k + 1) * self.batch_size], self.source
         present, first = source.present[clips], np.zeros(len(clips))
-        batch = source.make(clips, present, source.spans(clips, present, first), first)
-        batch["valid"] = torch.from_numpy(valid)
-        return batch
+        return source.make(clips, present, source.spans(clips, present, first), first)

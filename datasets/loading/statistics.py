@@ -12,14 +12,12 @@ decides that by the dataset it passes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import cast
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
 from motionloom.datasets.motion.layout import ROOT, Family, MotionLayout
@@ -30,7 +28,7 @@ STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
 
 
-Values = TypeVar("Values", NDArray[np.float32], Tensor)
+Values = NDArray[np.float32]
 Columns = NDArray[np.int64] | slice
 """Columns of a layout: by number, or a field's slice."""
 
@@ -44,19 +42,16 @@ class FeatureStats:
     layout: MotionLayout
     frames: int = 0
     """Frames they were computed from."""
-    _tensors: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = field(
-        default_factory=dict, repr=False, compare=False
-    )
 
     def normalize(self, values: Values, columns: Columns | None = None) -> Values:
-        """(values - mean) / std over the last axis; numpy or torch. `columns`: which ones `values` holds."""
-        mean, std = self._like(values, columns)
-        return (values - mean) / std
+        """(values - mean) / std over the last axis. `columns`: which ones `values` holds."""
+        chosen = slice(None) if columns is None else columns
+        return (values - self.mean[chosen]) / self.std[chosen]
 
     def denormalize(self, values: Values, columns: Columns | None = None) -> Values:
-        """values * std + mean over the last axis; numpy or torch, differentiable."""
-        mean, std = self._like(values, columns)
-        return values * std + mean
+        """values * std + mean over the last axis, likewise."""
+        chosen = slice(None) if columns is None else columns
+        return values * self.std[chosen] + self.mean[chosen]
 
     def with_root(self, gain: float) -> FeatureStats:
         """Return statistics by which the columns of the root come out `gain` times as large."""
@@ -64,7 +59,7 @@ class FeatureStats:
         for name in ROOT:
             if self.layout.has(name):
                 std[self.layout.slice(name)] /= gain
-        return replace(self, std=std, _tensors={})
+        return replace(self, std=std)
 
     @staticmethod
     def unit(layout: MotionLayout) -> FeatureStats:
@@ -111,23 +106,6 @@ class FeatureStats:
                 f"{std}: holds deviations that are not above 0; exchange `mean` and `std`, perhaps"
             )
         return FeatureStats(arrays[0], arrays[1], layout)
-
-    def _like(self, values: Values, columns: Columns | None) -> tuple[Values, Values]:
-        """Mean and std of the columns, as numpy or torch."""
-        mean: Any = self.mean
-        std: Any = self.std
-        chosen: Any = columns
-        if isinstance(values, Tensor):
-            key = (values.device, values.dtype)
-            if key not in self._tensors:
-                self._tensors[key] = (torch.from_numpy(mean).to(values), torch.from_numpy(std).to(values))
-            mean, std = self._tensors[key]
-            if isinstance(columns, np.ndarray):
-                chosen = torch.as_tensor(columns, device=values.device)
-        return (mean, std) if columns is None else (mean[chosen], std[chosen])
-
-    def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_tensors": {}}
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ FILE_NAME = "artifact.json"
 
 # What no result depends on: a stage's own notes, and settings that a later run may change.
 _PRIVATE = {
-    *("checkpoints", "logs", "flight", "samples", "crash", "started.json", "timing.json", "reader.json"),
+    *("checkpoints", "logs", "flight", "samples", "started.json", "timing.json", "reader.json"),
     FILE_NAME,
 }
 

@@ -1,4 +1,4 @@
-"""Logs of a training beside its network: `metrics.jsonl`, `flight/rank_N.jsonl`, `crash/`.
+"""Logs of a training beside its network: `metrics.jsonl`, `flight/rank_N.jsonl`.
 
 The flight logs hold times and are no output.
 """
@@ -20,8 +20,6 @@ FLIGHT = "flight"
 """Folder of the flight logs, in a stage's."""
 SAMPLES, SAMPLE_FIGURES = "samples", "figures.jsonl"
 """Folder of the motions that are drawn meanwhile, in a stage's, and the file of their figures in it."""
-CRASHES = "crash"
-"""Folder of what failed steps have read, in a stage's."""
 
 
 @contextmanager

@@ -67,7 +67,7 @@ class Checkpoint(_Lightning):
     """Whether a signal cut the validation of this step short: the resumed training begins with it."""
 
 
-def weights_of(module: StageModule) -> dict[str, Tensor]:
+def weights_of(module: nn.Module) -> dict[str, Tensor]:
     """Weights and buffers; of FSDP gathered on rank 0, a collective."""
     if _is_sharded(module):
         return cast(dict[str, Tensor], get_model_state_dict(module, options=_WHOLE))

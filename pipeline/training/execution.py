@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any, cast
@@ -16,8 +17,7 @@ from lightning.fabric.strategies.strategy import Strategy
 from torch import Tensor, nn
 from torch.distributed.device_mesh import DeviceMesh
 
-from motionloom.models.layers.transformer import Transformer
-from motionloom.models.training.sharding import sharded
+from motionloom.models.layers.transformer import Block, Transformer
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.team import environment
@@ -124,8 +124,19 @@ def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
 
 
 def _shard(module: nn.Module, mesh: DeviceMesh) -> nn.Module:
+    """Put a copy of the network in its place that is cut over the ranks (FSDP2); the network stays whole.
+
+    Every transformer block is one unit, gathered when it runs and cut again behind it; what is left
+    (embeddings, heads) is the last unit. Gradients are averaged over ranks as DDP averages them, and nothing
+    is gathered in fewer bits than it is kept in, so training equals DDP up to the order of sums.
+    """
+    from torch.distributed.fsdp import fully_shard  # imported where it is used: it takes a second
+
     assert isinstance(module, StageModule)
-    module.net = sharded(module.net, mesh["data_parallel"])
+    cut = copy.deepcopy(module.net)
+    for part in [*(part for part in cut.modules() if isinstance(part, Block)), cut]:
+        fully_shard(part, mesh=mesh["data_parallel"])
+    module.net = cut
     return module
 
 

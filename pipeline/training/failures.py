@@ -1,7 +1,6 @@
 """Trainings that go wrong: a loss or gradient that is not finite, an error in a step, a process that hangs.
 
-`crash/step_XXXXXXXX/` of the stage's folder then holds the batch of that step and the traceback; resuming
-from the checkpoint before it repeats the step bit for bit. A process that makes no progress for
+A process that makes no progress for
 `hardware.stall_seconds` writes the tracebacks of all its threads and ends; the others end with it, by
 torchrun or the time-out of their process group.
 """
@@ -11,20 +10,14 @@ from __future__ import annotations
 import faulthandler
 import math
 import time
-import traceback
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 import torch.distributed as dist
-from rich.console import Console
-from rich.markup import escape
-from safetensors.torch import save
-from torch import Tensor
 
-from motionloom.datasets.base.files import write_bytes, write_text
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.checksums import state_of
 from motionloom.models.training.distributed import rank, world_size
@@ -33,8 +26,6 @@ from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.launch.process import JointError, TeamError
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.files import open_own
-from motionloom.pipeline.store.training_log import CRASHES
-from motionloom.pipeline.training.loaders import TrainingData
 from motionloom.pipeline.training.telemetry import all_ranks
 
 
@@ -92,13 +83,10 @@ def _is_loss(name: str) -> bool:
 
 
 class FailureGuard:
-    """Finds what is not finite, on all ranks at the same steps, and saves what a failed step has read."""
+    """Finds what is not finite in the training of a stage, on all ranks at the same steps."""
 
-    def __init__(
-        self, name: str, folder: Path, module: StageModule, data: TrainingData, console: Console
-    ) -> None:
-        self.name, self.folder, self.module, self.data = name, folder, module, data
-        self.console = console
+    def __init__(self, name: str, module: StageModule) -> None:
+        self.name, self.module = name, module
 
     def check(self) -> None:
         """All ranks call this at the same steps.
@@ -117,8 +105,11 @@ class FailureGuard:
         first, text = orders.index(min(orders)), [""]
         if first == rank():
             assert failure is not None
-            sentence = f"stage {self.name}: {failure.describe()}" + (f" (rank {first})" * (world_size() > 1))
-            text = [f"{sentence}; {self._save(failure.step, sentence)}"]
+            where = f" (rank {first})" * (world_size() > 1)
+            text = [
+                f"stage {self.name}: {failure.describe()}{where}; no checkpoint holds it: go on from the one "
+                f"before with a lower learning rate or optim.grad_clip"
+            ]
         if world_size() > 1:
             dist.broadcast_object_list(text, src=first)
         if rank() == 0:
@@ -129,44 +120,6 @@ class FailureGuard:
         """Whether to check after a step: reading a figure waits for a GPU, and ranks for each other."""
         alone = world_size() == 1 and self.module.device.type == "cpu"
         return alone or step % LOG_EVERY == 0
-
-    def save_error(self, error: Exception) -> None:
-        """Save the step in which an unexpected error came. Mistakes of users and lost processes need none."""
-        if isinstance(error, UserError | TeamError) or "by peer" in str(error):
-            return
-        trace = "".join(traceback.format_exception(error))
-        where = self._save(self.module.step + 1, trace)
-        self.console.print(f"[yellow]    {escape(f'stage {self.name}: {where}')}[/]", soft_wrap=True)
-
-    def _save(self, step: int, text: str) -> str:
-        """Write the batch of a step and `text`; where they are, in words."""
-        ranks = f"_rank_{rank()}" if world_size() > 1 else ""
-        folder = self.folder / CRASHES / f"step_{step:08d}{ranks}"
-        try:
-            write_text(folder / "error.txt", text + "\n")
-            parts = self.module.accumulate
-            for part in range(parts):
-                batch = self.data.train[(step - 1) * parts + part]  # item k is a pure function of k
-                write_bytes(
-                    folder / f"batch{part if parts > 1 else ''}.safetensors", save(flat_tensors(batch))
-                )
-        except Exception as error:  # the failure itself says more than that its batch is missing
-            return f"its batch could not be saved in {folder} ({type(error).__name__}: {error})"
-        return f"its batch and the traceback are in {folder}"
-
-
-def flat_tensors(value: object, name: str = "") -> dict[str, Tensor]:
-    """The tensors of a batch by their paths in it; what is no tensor (captions) is left out."""
-    if isinstance(value, Tensor):
-        return {name or "batch": value.detach().cpu().contiguous().clone()}
-    if hasattr(value, "_asdict"):
-        value = value._asdict()
-    elif isinstance(value, list | tuple):
-        value = {str(place): inner for place, inner in enumerate(value)}
-    out: dict[str, Tensor] = {}
-    for key, inner in value.items() if isinstance(value, Mapping) else ():
-        out |= flat_tensors(inner, f"{name}.{key}" if name else str(key))
-    return out
 
 
 class ShardWatch:
@@ -229,9 +182,7 @@ class StallTimer:
                 yield
             finally:
                 faulthandler.cancel_dump_traceback_later()
-        with suppress(OSError):
-            self.path.unlink()
-            self.path.parent.rmdir()  # fails, as it should, where it holds something else
+        self.path.unlink(missing_ok=True)
 
     def progress(self) -> None:
         """A step, a validation batch or a checkpoint is done."""

@@ -9,12 +9,10 @@ training.
 from __future__ import annotations
 
 import signal
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext, suppress
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import lightning as L
 import torch
@@ -27,12 +25,11 @@ from motionloom.datasets.base.os_errors import full_place
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.distributed import rank, world_size
-from motionloom.models.training.sharding import make_whole
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.process import Interrupted, TeamError
 from motionloom.pipeline.launch.team import lead_finds
-from motionloom.pipeline.store.training_log import CRASHES, optional, rise_of_loss
+from motionloom.pipeline.store.training_log import FLIGHT, optional, rise_of_loss
 from motionloom.pipeline.training.checkpointing import (
     BackgroundWriter,
     Checkpoint,
@@ -71,7 +68,7 @@ def fit(
     if hardware.resolved_accelerator() == "gpu":
         hardware.device()  # refuses in one sentence where there is no GPU
     fabric = launch(hardware, config)
-    resume = lead_finds(partial(_find_resume_point, context, config))
+    resume = lead_finds(partial(_find_resume_point, context))
     net = module.net
     training = Training(
         context, module, config, fabric, TrainingData(train, validation, config, hardware), resume
@@ -91,20 +88,13 @@ def fit(
             raise UserError(f"stage {context.name}: {what}; set hardware.deterministic: false") from error
         raise
     if module.net is not net:  # a sharded copy was trained
-        make_whole(module.net, net)
+        whole = weights_of(module.net)
+        if rank() == 0:
+            net.load_state_dict(whole)
         module.net = net
     if training.average is not None:
         training.average.fill(net)
     module.to("cpu")
-
-
-class ResumePoint(NamedTuple):
-    """The checkpoint that a training resumes from."""
-
-    checkpoint: Path | None
-    """None for the beginning."""
-    longer: bool = False
-    """Whether the checkpoint is of a training of fewer steps."""
 
 
 class Training:
@@ -117,8 +107,9 @@ class Training:
         config: TrainConfig,
         fabric: Fabric,
         data: TrainingData,
-        resume: ResumePoint,
+        resume: Path | None,
     ) -> None:
+        """`resume` is the checkpoint to go on from; None for the beginning."""
         self.context, self.module, self.config, self.fabric, self.data = context, module, config, fabric, data
         self.folder = context.folder / "checkpoints"
         console, name, hardware = context.console, context.name, context.hardware
@@ -136,18 +127,17 @@ class Training:
         self.log = MetricLog(context.folder, hardware.loggers, context.recipe, title, console)
         self.validation_is_due = False
         # Loaded before telemetry and writer begin: both go on from the module's step.
-        if resume.checkpoint is not None:
-            self._load(read_checkpoint(resume.checkpoint), longer=resume.longer)
+        if resume is not None:
+            self._load(read_checkpoint(resume))
         self.writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)
         sample_every = -(-config.sample_every // self.every) * self.every
         self.samples = SampleProcess(context, str(module.hparams.get("kind")), sample_every)
-        self._saved, self._writing = module.step if resume.checkpoint else -1, False
+        self._saved, self._writing = module.step if resume else -1, False
         self.telemetry = Telemetry(context.folder, module, config.batch_size, console, at_peak)
-        self.failures = FailureGuard(name, context.folder, module, data, console)
+        self.failures = FailureGuard(name, module)
         self.shards = ShardWatch(context.inputs.values())
-        self.stall = StallTimer(
-            context.folder / CRASHES / f"stalled_rank_{rank()}.txt", hardware.stall_seconds
-        )
+        stalled = context.folder / FLIGHT / f"stalled_rank_{rank()}.txt"
+        self.stall = StallTimer(stalled, hardware.stall_seconds)
 
     def run(self) -> None:
         self.log.open()
@@ -160,8 +150,6 @@ class Training:
             try:
                 self._run()
             except BaseException as error:
-                if isinstance(error, Exception):
-                    self.failures.save_error(error)
                 with suppress(UserError, OSError):  # the error says more than one of the writing
                     self._finish_writing()
                 self.log.fail()
@@ -326,7 +314,7 @@ class Training:
             "epoch": 0,
         }
 
-    def _load(self, state: Checkpoint, *, longer: bool) -> None:
+    def _load(self, state: Checkpoint) -> None:
         module, name = self.module, self.context.name
         # Data and random draws need no state: both are functions of the seed and the step.
         module.step = state["global_step"]
@@ -345,10 +333,10 @@ class Training:
         self.log.load_state_dict(state["log"])
         load_row(module, state["row"])
         self.validation_is_due = state["validate"]
-        if rank() == 0 and longer:
-            self.context.console.print(f"    {name} continues from step {module.step} to {self.config.steps}")
-        elif rank() == 0:
-            self.context.console.print(f"    resuming {name} at step {module.step} of {self.config.steps}")
+        if rank() == 0:
+            longer = state["steps"] < self.config.steps
+            begins = f"{name} continues from" if longer else f"resuming {name} at"
+            self.context.console.print(f"    {begins} step {module.step} of {self.config.steps}")
 
 
 def _numbers(values: dict[str, Tensor] | dict[str, float | Tensor]) -> dict[str, float]:
@@ -359,25 +347,14 @@ def _at_least_float32(value: Tensor) -> Tensor:
     return value if value.dtype in (torch.float32, torch.float64) else value.float()
 
 
-def _find_resume_point(context: StageContext, config: TrainConfig) -> ResumePoint:
-    """Return where to begin, called in the lead alone; temporary and damaged files are deleted."""
+def _find_resume_point(context: StageContext) -> Path | None:
+    """Return the newest checkpoint that can be read, in the lead; temporary and damaged files are deleted."""
     folder = context.folder / "checkpoints"
     if folder.is_dir():
         remove_temporaries(folder)
-    point = resume_point(
-        folder, config, partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
-    )
-    newest = point.checkpoint
+    say = partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
+    newest = next((path for path, _ in readable(folder, say)), None)
     for path in folder.glob("*.ckpt"):
         if newest is not None and (step_of(path) or 0) > (step_of(newest) or 0):
             path.unlink()  # damaged: the training writes this step again
-    return point
-
-
-def resume_point(
-    folder: Path, config: TrainConfig, log: Callable[[str], None] = warnings.warn
-) -> ResumePoint:
-    """The newest checkpoint that can be read; `log` receives why others were passed over."""
-    for path, checkpoint in readable(folder, log):
-        return ResumePoint(path, checkpoint["steps"] < config.steps)
-    return ResumePoint(None)
+    return newest

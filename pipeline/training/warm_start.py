@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
-
-from pydantic import BaseModel
 
 from motionloom.datasets.motion.layout import MotionLayout, require_layout
 from motionloom.datasets.schema import UserError
@@ -30,32 +28,48 @@ def starts_from(name: str, first: str, others: Mapping[str, Stage]) -> bool:
     return False
 
 
-def sizes_that_differ(ours: BaseModel, theirs: object, free: Set[str]) -> list[str]:
-    """Settings of two networks that are not the same, without those that only training reads (`free`)."""
-    return [
-        f"net.{name}"
-        for name in type(ours).model_fields
-        if name not in free and getattr(ours, name) != getattr(theirs, name, None)
-    ]
+def require_same_start(
+    stage: Stage,
+    others: Mapping[str, Stage],
+    free: Set[str],
+    roles: Sequence[str],
+    settings: Sequence[str] = (),
+) -> None:
+    """Refuse a start that is another network than that of `stage`, or reads and writes something else.
 
-
-def require_same_start(stage: Stage, others: Mapping[str, Stage], free: Set[str]) -> None:
-    """Refuse a start whose network, or the statistics of whose input, are not those of `stage`."""
+    Args:
+        free: Settings of the network that only training reads.
+        roles: Inputs that both must have alike.
+        settings: Keys of the config that both must have alike.
+    """
     start = others.get(stage.inputs.get(START, ""))
     if start is None:
         return
-    wrong = sizes_that_differ(stage.config.net, start.config.net, free)
+    ours, theirs = stage.config, start.config
+    sizes = [name for name in type(ours.net).model_fields if name not in free]
+    wrong = [f"net.{name}" for name in sizes if getattr(ours.net, name) != getattr(theirs.net, name, None)]
     if stage.kind.name != start.kind.name:
         wrong = [f"kind ({start.kind.name})"]
-    stats = start.inputs.get("stats", "")
-    if stats and stage.inputs.get("stats") != stats:
-        wrong.append("inputs.stats")
+    wrong += [name for name in settings if getattr(ours, name) != getattr(theirs, name, None)]
+    wrong += [f"inputs.{role}" for role in roles if not _alike(role, stage, start, others)]
     if wrong:
-        like = f", like inputs: {{stats: {stats}}}" if "inputs.stats" in wrong else ""
+        known = {role: start.inputs.get(role, "") for role in roles if f"inputs.{role}" in wrong}
+        there = [f"{role}: {place}" for role, place in known.items() if is_place(place)]
+        like = f", like inputs: {{{', '.join(there)}}}" if there else ""
         raise UserError(
             f"stage '{stage.name}' starts from '{start.name}', which differs in {', '.join(wrong)}; give "
             f"both the same{like}"
         )
+
+
+def _alike(role: str, stage: Stage, start: Stage, others: Mapping[str, Stage]) -> bool:
+    """Whether both get the same in a role: a tokenizer or TMA that was itself trained on from the start's
+    speaks nearly the same language.
+    """
+    own, first = stage.inputs.get(role, ""), start.inputs.get(role, "")
+    if role == "text":
+        return same_encoder(first, own, others)
+    return (not first or own == first) if role == "stats" else starts_from(own, first, others)
 
 
 def require_start_layout(data: MotionLayout, start: MotionLayout) -> None:

@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
@@ -17,6 +19,8 @@ from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
 from motionloom.models.training.stage_module import OptimConfig
+from motionloom.pipeline.stages.networks.tokens import EncodedSplit
+from motionloom.pipeline.store.tokens import TokenStore
 
 PATTERN = ("body", "body", "hand")
 STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
@@ -51,6 +55,14 @@ def aligned_gpt(
         tokenizer=tokenizer, tma=tma,
     )  # fmt: skip
     return module, tokenizer, tma
+
+
+def encode_split(
+    tokenizer: Tokenizer, dataset: ClipDataset, stats: FeatureStats, batch_frames: int
+) -> TokenStore:
+    """Codes of all clips in order, in this process."""
+    encoded = EncodedSplit(tokenizer, dataset, stats, batch_frames)
+    return encoded.store(map(encoded.codes, range(len(encoded.batches))))
 
 
 def random_codes(groups: Sequence[int], streams: Sequence[Stream] = STREAMS) -> Codes:

@@ -109,9 +109,10 @@ class DiffusionMotion(DenoisedMotion):
             pins = Pins(at, joints, torch.tensor(frames.model_pins, device=device))
         text = words.get("text")
         pooled = None if text is None or text.pooled is None else text.pooled[0].float().to(device)
+        normal = torch.from_numpy(stats.normalize(features.numpy(), columns))
         filling = Filling(
             self.net,
-            KnownMotion(stats.normalize(features, columns).to(device), known.to(device), places, pins),
+            KnownMotion(normal.to(device), known.to(device), places, pins),
             pooled,
             Recovery(layout, columns, stats.mean, stats.std),
             window=self.window,
@@ -120,5 +121,5 @@ class DiffusionMotion(DenoisedMotion):
         )
         made = filling(seeds, *self.denoising(sampling)).cpu()
         # What is kept is taken from where it came from: normalising there and back rounds.
-        own = torch.where(known, features, stats.denormalize(made, columns))
-        return [np.asarray(one, dtype=np.float32) for one in own.numpy()]
+        own = np.where(known, features, stats.denormalize(made.numpy(), columns))
+        return [np.asarray(one, dtype=np.float32) for one in own]

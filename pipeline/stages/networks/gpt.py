@@ -27,18 +27,20 @@ from motionloom.pipeline.store.networks import (
     require_streams,
     stream_facts,
 )
-from motionloom.pipeline.store.run_folder import is_place
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.tokens import GptClips, gpt_clips
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
-from motionloom.pipeline.training.warm_start import START, require_start_layout, same_encoder, starts_from
+from motionloom.pipeline.training.warm_start import require_same_start, require_start_layout, same_encoder
 
 if TYPE_CHECKING:
     from motionloom.models.training.stage_module import StageModule
 
 Prior = Literal["tma", "sentence"]
+
+_FREE = frozenset({"dropout", "attention_dropout", "condition_dropout", "pkeep"})
+"""Settings that are of the training and not of the network: another one may go on with others."""
 
 
 class GptStageConfig(TrainedStageConfig):
@@ -99,7 +101,8 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Its TMA must read captions as it does, and a GPT that it starts from must be the same network."""
         require_own_text(stage, others)
-        require_start(stage, others)
+        roles = ("text", "tokenizer", *(("tma",) if stage.config.prior == "tma" else ()))
+        require_same_start(stage, others, _FREE, roles, settings=("prior",))
 
     def facts(self, config: GptStageConfig, inputs: GptInputs) -> ModelFacts:
         if (config.prior == "tma" or config.aligned) and inputs.tma is None:
@@ -199,10 +202,6 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         return ("tokenizer", "text", "tma") if config.prior == "tma" else ("tokenizer", "text")
 
 
-_SIZES = ("layers", "dim", "heads", "ff", "block_size")
-"""Settings of the network; a GPT goes on from another only where these are equal."""
-
-
 def require_own_text(stage: Stage, others: Mapping[str, Stage]) -> None:
     """A TMA must be given captions by the encoder that it was trained on."""
     tma, own = others.get(stage.inputs.get("tma", "")), stage.inputs.get("text", "")
@@ -212,35 +211,6 @@ def require_own_text(stage: Stage, others: Mapping[str, Stage]) -> None:
             f"stage '{stage.name}' reads captions as '{own}' encodes them, but its TMA "
             f"'{stage.inputs['tma']}' was trained on those of '{other}'; name one text stage for both, "
             f"or leave the TMA out (inputs: {{tma: null}})"
-        )
-
-
-def _its_own(start: Stage, wrong: list[str]) -> str:
-    """Where the inputs of a GPT outside the run lie, for the message."""
-    roles = [name.removeprefix("inputs.") for name in wrong if name.startswith("inputs.")]
-    there = [f"{role}: {start.inputs[role]}" for role in roles if is_place(start.inputs.get(role, ""))]
-    return f", like inputs: {{{', '.join(there)}}}" if there else ""
-
-
-def require_start(stage: Stage, others: Mapping[str, Stage]) -> None:
-    """A GPT can go on from another's weights where both are one network that reads and writes the same."""
-    start = others.get(stage.inputs.get(START, ""))
-    if start is None:
-        return
-    ours, theirs = stage.config, start.config
-    wrong = [f"net.{size}" for size in _SIZES if getattr(ours.net, size) != getattr(theirs.net, size)]
-    wrong += ["prior"] if ours.prior != theirs.prior else []
-    roles = ("tokenizer",) + (("tma",) if ours.prior == "tma" else ())
-    if not same_encoder(start.inputs.get("text", ""), stage.inputs.get("text", ""), others):
-        wrong.append("inputs.text")
-    for role in roles:
-        # A tokenizer or TMA that was itself trained on from the start's speaks nearly the same language.
-        own, theirs_is = stage.inputs.get(role, ""), start.inputs.get(role, "")
-        wrong += [] if starts_from(own, theirs_is, others) else [f"inputs.{role}"]
-    if wrong:
-        raise UserError(
-            f"stage '{stage.name}' starts from '{start.name}', which differs in {', '.join(wrong)}; give "
-            f"both the same{_its_own(start, wrong)}"
         )
 
 

@@ -39,12 +39,7 @@ from motionloom.pipeline.stages.networks.captions import (
 from motionloom.pipeline.store.networks import LoadedTma
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.warm_start import (
-    START,
-    require_same_start,
-    require_start_layout,
-    same_encoder,
-)
+from motionloom.pipeline.training.warm_start import require_same_start, require_start_layout
 
 _FREE = frozenset({"dropout", "attention_dropout", "text_dropout", "text_noise"})
 """Settings that are of the training and not of the network: another one may go on with others."""
@@ -96,13 +91,7 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """A TMA that it starts from must be the same network, over the same text and statistics."""
-        require_same_start(stage, others, _FREE)
-        start = others.get(stage.inputs.get(START, ""))
-        if start is not None and not same_encoder(start.inputs.get("text", ""), stage.inputs["text"], others):
-            raise UserError(
-                f"stage '{stage.name}' starts from '{start.name}', which reads captions of another text "
-                f"encoder; give '{stage.inputs['text']}' the encoder of '{start.inputs['text']}'"
-            )
+        require_same_start(stage, others, _FREE, ("stats", "text"))
 
     def facts(self, config: TmaStageConfig, inputs: TmaInputs) -> ModelFacts:
         layout = inputs.data.layout

@@ -42,8 +42,6 @@ class WindowStageConfig(TrainedStageConfig):
 
     window: int = Field(64, ge=4, multiple_of=4)
     """Frames of a training window."""
-    windows_per_clip: int = Field(1, ge=1)
-    """Windows cut from one read of a clip."""
 
 
 class TokenizerStageConfig(WindowStageConfig):
@@ -103,7 +101,7 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """A tokenizer that it starts from must be the same network over equally normalised motion."""
-        require_same_start(stage, others, _FREE)
+        require_same_start(stage, others, _FREE, ("stats",))
 
     def facts(self, config: TokenizerStageConfig, inputs: TokenizerInputs) -> ModelFacts:
         if inputs.start is not None:
@@ -146,12 +144,11 @@ def window_batches(
 ) -> Batches:
     """Windows of the training split; validation on held-out clips, as `EvalBatches` takes it."""
     data, stats = inputs.data, inputs.stats
-    dataset = data.split("train")
-
-    cut = {"window": config.window, "windows_per_clip": config.windows_per_clip, "seed": seed}
+    dataset, window = data.split("train"), config.window
 
     def train(batch: int, rank: int, world: int) -> Dataset[object]:
-        return WindowBatches(dataset, stats, batch_size=batch, rank=rank, world=world, columns=columns, **cut)
+        at = {"batch_size": batch, "rank": rank, "world": world}
+        return WindowBatches(dataset, stats, window=window, seed=seed, columns=columns, **at)
 
     return Batches(train, lambda: EvalBatches(data.held_out(), stats, columns=columns, **validation))
 

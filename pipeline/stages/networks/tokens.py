@@ -159,14 +159,6 @@ class EncodedSplit:
         return TokenStore(flat, starts, per_group, whole[self.dataset.present])
 
 
-def encode_split(
-    tokenizer: Tokenizer, dataset: ClipDataset, stats: FeatureStats, batch_frames: int
-) -> TokenStore:
-    """Codes of all clips in order, in this process."""
-    encoded = EncodedSplit(tokenizer, dataset, stats, batch_frames)
-    return encoded.store(encoded.codes(batch) for batch in range(len(encoded.batches)))
-
-
 class OverTokens(Protocol):
     """A network over interleaved codes."""
 

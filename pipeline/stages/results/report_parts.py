@@ -22,7 +22,6 @@ from motionloom.pipeline.store.artifact import Terms
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.run_state import RunState
 from motionloom.pipeline.store.training_log import (
-    CRASHES,
     SAMPLE_FIGURES,
     SAMPLES,
     read_flight,
@@ -105,14 +104,6 @@ def draw_flights(page: Page, state: RunState) -> None:
     columns += ["for other ranks, %"]
     table = [[name, *_waits(ranks)] for name, ranks in flights.items()]
     page.add_table(columns, table, "Speed and waits, means of the rows and ranks", digits=2, pinned=True)
-    crashed = [
-        f"{stage.name}: {bundle}"
-        for stage in state.stages
-        for bundle in sorted((stage.folder / CRASHES).glob("*"))
-    ]
-    if crashed:
-        page.add_text("Batches and tracebacks of what went wrong:")
-        page.add_list(crashed)
 
 
 def _waits(ranks: Mapping[int, Rows]) -> list[float | str | None]:

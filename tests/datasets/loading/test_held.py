@@ -141,7 +141,7 @@ def test_moments_with_gaps_merge_in_any_grouping() -> None:
 def batches_of(dataset: ClipDataset, stats: FeatureStats, text: TextCache, **kind: Any) -> list[Any]:
     spans: dict[str, Any] = {"max_frames": 20, "min_frames": 4}
     return [
-        WindowBatches(dataset, stats, window=16, batch_size=6, windows_per_clip=2, seed=1, **kind),
+        WindowBatches(dataset, stats, window=16, batch_size=6, seed=1, **kind),
         caption_batches(dataset, stats, text, batch_size=4, seed=1, **spans, **kind),
         EvalBatches(dataset, stats, {"text": text}, captioned="body", batch_size=4, **spans, **kind),
         EvalBatches(dataset, stats, batch_size=4, max_frames=16, **kind),

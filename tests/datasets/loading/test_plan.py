@@ -264,9 +264,7 @@ def test_batches_are_the_same_for_any_number_of_ranks(order: str, roots: tuple[P
     stats = compute(data)
 
     def windows(rank: int, world: int) -> WindowBatches:
-        return WindowBatches(
-            data, stats, window=16, batch_size=24, windows_per_clip=2, seed=1, rank=rank, world=world
-        )
+        return WindowBatches(data, stats, window=16, batch_size=24, seed=1, rank=rank, world=world)
 
     require_shares(windows)
     evaluated = EvalBatches(data, stats, batch_size=16, max_frames=40)

@@ -125,7 +125,7 @@ def test_what_is_left_out_is_the_models_own(mine: Mine, tmp_path: Path) -> None:
         (["tma.net.layers=3"], "'tma' starts from .* which differs in net.layers;"),
         (["tokenizer.kind=vq"], "'gpt' starts from .* which differs in inputs.tokenizer;"),
         (["stages.tokenizer={kind: vq, inputs: {start: MODEL/tokenizer}}"], r"differs in kind \(h2vq\);"),
-        (["text.encoder=another"], "'tma' starts from .* captions of another text encoder"),
+        (["text.encoder=another"], "'tma' starts from .* differs in inputs.text; give"),
         (["stages.face_gpt={}"], "stages.face_gpt has no kind, and start .* has no 'face_gpt' to go on from"),
         (["stages.stats={kind: stats}"], "'tokenizer' starts .* differs in inputs.stats; .*model/stats}"),
         (["start=UDE"], r"kind gpt; .* ude"),

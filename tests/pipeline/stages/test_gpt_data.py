@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import torch.multiprocessing as mp
+from toy_gpt import encode_split
 
 from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.motion.layout import MotionLayout
@@ -24,7 +25,6 @@ from motionloom.models.tokenizer.base import Tokenizer, TokenizerConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.single import VqConfig
 from motionloom.pipeline.evaluation.truth import has_caption, spread, truth_of
-from motionloom.pipeline.stages.networks.tokens import encode_split
 from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore, gpt_clips
 
 LAYOUT = MotionLayout.named("wholebody363")  # 30 fps

@@ -61,7 +61,7 @@ def test_a_stage_starts_from_anothers_weights(run: Callable[..., tuple[Any, Path
     [
         ({"net": {**MORE["net"], "heads": 2}}, "in net.heads;"),
         ({"prior": "sentence"}, "in prior;"),
-        ({"inputs": {"start": "face_gpt"}}, "in net.dim, net.ff, prior, inputs.tokenizer, inputs.tma;"),
+        ({"inputs": {"start": "face_gpt"}}, "in net.ff, net.dim, prior, inputs.tokenizer, inputs.tma;"),
         ({"inputs": {"start": "tma"}}, "gpt or face_gpt"),
         # Motions are sampled token by token.
         ({"train": {**MORE["train"], "compile": True}}, "token by token"),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from toy_gpt import encode_split
 
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import Part
@@ -22,7 +23,6 @@ from motionloom.models.tokenizer.single import RvqConfig
 from motionloom.pipeline.evaluation.estimate import row_estimates
 from motionloom.pipeline.evaluation.reconstruction import face_errors, reconstruction_errors
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
-from motionloom.pipeline.stages.networks.tokens import encode_split
 from motionloom.pipeline.store.networks import TrainedTokenizer
 from motionloom.pipeline.store.tokens import TokenBatches, TokenStore, gpt_clips
 

@@ -1,8 +1,8 @@
-"""Trainings that go wrong leave the batch and the traceback."""
+"""Trainings that go wrong end before a checkpoint of a lost network, or of other data, is written."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,8 +10,7 @@ from typing import Any, cast
 import pytest
 import torch
 from rich.console import Console
-from safetensors.torch import load_file
-from toy_training import ToyBatches, ToyConfig, toy_recipe
+from toy_training import ToyBatches, toy_recipe
 
 from motionloom.datasets.schema import ShardInfo, UserError
 from motionloom.datasets.shards.checksums import LocalShard
@@ -38,23 +37,10 @@ def test_a_loss_that_is_not_finite_stops_the_training(recipe: Path) -> None:
     with pytest.raises(NotFiniteError) as error:
         run_recipe(recipe, run, overrides=[f"toy.fails_at={FAILS}"], console=Console(quiet=True))
     stage = run / "stages/toy"
-    folder = stage / "crash/step_00000014"
-    for part in ("toy", "step 14", "recon = nan, loss = nan", str(folder)):
+    for part in ("toy", "step 14", "recon = nan, loss = nan"):
         assert part in str(error.value)
-    assert "recon = nan" in (folder / "error.txt").read_text()
-    batch, whole = load_file(folder / "batch.safetensors"), ToyBatches(ToyConfig(fails_at=FAILS), 4, 8, 0, 1)
-    assert batch.keys() == whole[FAILS].keys()
-    assert torch.equal(batch["motion"].nan_to_num(7), whole[FAILS]["motion"].nan_to_num(7))
     kept = sorted(path.name for path in (stage / "checkpoints").glob("*.ckpt"))
     assert kept == ["step=00000005.ckpt", "step=00000010.ckpt"], "no checkpoint of a lost network"
-
-
-def test_an_error_in_a_step_leaves_its_traceback(call: Callable[..., Any], recipe: Path) -> None:
-    run = recipe.parent / "error"
-    done = call("run", recipe, "-o", run, "--set", "toy.fails_at=2", "--set", "toy.failure=error")
-    folder = run / "stages/toy/crash/step_00000003"
-    assert done.code == 1 and "ArithmeticError" in done.err and str(folder) in done.out
-    assert "in losses" in (folder / "error.txt").read_text() and (folder / "batch.safetensors").is_file()
 
 
 def test_a_shard_that_changes_ends_the_training_before_its_next_checkpoint(
