@@ -329,3 +329,16 @@ def drawing_mdm() -> tuple[StageModule, Batches]:
     return TextDenoiserModule(
         net, OPTIM, seed=0, max_steps=STEPS
     ), lambda step: motion(step, 20) | captions(step)
+
+
+def rows_of(batch: dict[str, Any], rows: slice) -> dict[str, Any]:
+    """The same batch with those rows alone."""
+    return {name: _rows(value, rows) for name, value in batch.items()}
+
+
+def _rows(value: Any, rows: slice) -> Any:
+    if isinstance(value, dict):
+        return rows_of(value, rows)
+    if isinstance(value, Condition):
+        return Condition(*(None if part is None else part[rows] for part in value))
+    return value[rows]

@@ -120,13 +120,12 @@ def test_fingers_alone_are_refused(part: Part) -> None:
         basis_of(part)
 
 
-@pytest.mark.parametrize("half", [torch.bfloat16, torch.float16])
-def test_autocast_leaves_the_coordinates_in_float32(half: torch.dtype) -> None:
+def test_autocast_leaves_the_coordinates_in_float32() -> None:
     basis = basis_of()
     x = torch.randn(2, 8, 313, generator=torch.Generator().manual_seed(0))
     seen = basis.encode(x)
     back = basis.decode(seen)
-    with torch.autocast("cpu", dtype=half):
+    with torch.autocast("cpu", dtype=torch.bfloat16):
         assert torch.equal(basis.encode(x), seen)
         assert torch.equal(basis.decode(seen), back)
-        assert basis.decode(seen.to(half)).dtype == torch.float32
+        assert basis.decode(seen.bfloat16()).dtype == torch.float32

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import get_args
 
 import pytest
@@ -120,3 +121,20 @@ def test_a_u_of_blocks_merges_what_the_first_half_made_last_one_first() -> None:
     torch.testing.assert_close(net(x, mask, memory=memory), net.norm(fifth))
     with pytest.raises(ValueError, match="odd"):
         SkipTransformer(TextDenoiserConfig(dim=8, heads=2, ff=16), 4)
+
+
+def test_gradients_of_normalisation_are_added_up_in_float32() -> None:
+    """Under autocast they are those of float64 up to the rounding of bfloat16."""
+
+    def gradients(net: nn.Module, x: torch.Tensor) -> dict[str, torch.Tensor]:
+        with torch.autocast("cpu", torch.bfloat16, enabled=x.dtype != torch.double, cache_enabled=False):
+            out = net(x, mask)
+        (out.double() * mask[..., None]).square().mean().backward()
+        return {name: param.grad.double() for name, param in net.named_parameters() if param.grad is not None}
+
+    torch.manual_seed(0)
+    net = Transformer(TextDenoiserConfig(dim=32, heads=4, ff=64, dropout=0), 2, norm="post")
+    x, mask = torch.randn(64, 48, 32), torch.arange(48) < torch.randint(8, 49, (64, 1))
+    true = gradients(copy.deepcopy(net).double(), x.double())
+    for name, found in gradients(net, x.bfloat16()).items():  # as a linear layer before gives it
+        assert (found - true[name]).norm() < 0.05 * true[name].norm(), name

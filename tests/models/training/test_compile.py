@@ -9,8 +9,7 @@ from typing import Any
 
 import pytest
 import torch
-from batch_rows import rows_of
-from rank_cases import CASES, Undrawn, drawing_mdm
+from rank_cases import CASES, Undrawn, drawing_mdm, rows_of
 from torch import nn
 from ude_training import train
 

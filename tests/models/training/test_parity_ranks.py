@@ -25,8 +25,7 @@ from typing import Any
 import pytest
 import torch
 import torch.distributed as dist
-from batch_rows import rows_of
-from rank_cases import BATCH, CASES, STEPS
+from rank_cases import BATCH, CASES, STEPS, rows_of
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from two_ranks import run_two_ranks

@@ -243,13 +243,6 @@ def test_what_is_kept(
     assert {step_of(path) for path in tmp_path.iterdir()} == {*expected, None}
 
 
-def test_a_training_keeps_what_it_is_told_to(tmp_path: Path) -> None:
-    settings: dict[str, Any] = {"checkpoint_every": 2, "validate_every": 0, "keep_checkpoints": 3}
-    train(tmp_path, steps=24, keep_every=8, **settings)
-    kept = sorted(step_of(path) or 0 for path in (tmp_path / "checkpoints").iterdir())
-    assert kept == [8, 16, 20, 22, 24]
-
-
 def test_a_full_disk_ends_a_training_with_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The log on disk is that of the checkpoint before, and the same command goes on from it."""
     settings: dict[str, Any] = {"checkpoint_every": 5, "validate_every": 0}
