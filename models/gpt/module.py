@@ -46,6 +46,7 @@ class GptModule(StageModule):
             )
         _check(net, tokenizer, tma)
         self.tokenizer, self.tma = Frozen(tokenizer), Frozen(tma)
+        self.compilable = self.loss_config.align_on != "samples"
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of one batch.

@@ -126,13 +126,6 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         if inputs.start is not None:
             net.load_state_dict(inputs.start.net.state_dict())
 
-    def module(
-        self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int
-    ) -> StageModule:
-        module = super().module(config, net, inputs, seed)
-        module.compilable = not config.aligned_on_samples
-        return module
-
     def module_settings(
         self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs
     ) -> dict[str, object]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import re
 from typing import get_args
 
 import pytest
@@ -10,32 +11,23 @@ import torch
 from torch import nn
 
 from motionloom.models.diffusion.network import TextDenoiserConfig
-from motionloom.models.layers.transformer import Norm, SkipTransformer, Transformer, length_mask
+from motionloom.models.layers.transformer import (
+    Norm,
+    SkipTransformer,
+    Transformer,
+    length_mask,
+    name_in_torch,
+)
 
 
-def theirs(ours: Transformer, norm: Norm, heads: int, ff: int) -> nn.TransformerEncoder:
-    """torch's encoder with the same weights."""
-    dim = ours.blocks[0].ff_in.in_features
-    layer = nn.TransformerEncoderLayer(
-        dim, heads, ff, dropout=0.0, activation="gelu", batch_first=True, norm_first=norm == "pre"
-    )
-    last = nn.LayerNorm(dim) if norm == "pre" else None
-    encoder = nn.TransformerEncoder(layer, len(ours.blocks), norm=last, enable_nested_tensor=False)
-    with torch.no_grad():
-        for block, own in zip(ours.blocks, encoder.layers, strict=True):
-            own.self_attn.in_proj_weight.copy_(block.attention.qkv.weight)
-            own.self_attn.in_proj_bias.copy_(block.attention.qkv.bias)
-            own.self_attn.out_proj.load_state_dict(block.attention.out.state_dict())
-            for mine, name in (
-                (block.norm_attention, "norm1"),
-                (block.norm_ff, "norm2"),
-                (block.ff_in, "linear1"),
-                (block.ff_out, "linear2"),
-            ):
-                getattr(own, name).load_state_dict(mine.state_dict())
-        if last is not None:
-            last.load_state_dict(ours.norm.state_dict())
-    return encoder.double().eval()
+def in_torch(net: Transformer, *, memory: bool = False) -> dict[str, torch.Tensor]:
+    """Its weights by the names of torch's encoder, or decoder."""
+    state = {}
+    for name, value in net.state_dict().items():
+        found = re.fullmatch(r"blocks\.(\d+)\.(.+)", name)
+        own = found and f"layers.{found[1]}.{name_in_torch(found[2], memory=memory)}"
+        state[own or name] = value
+    return state
 
 
 @pytest.mark.parametrize("norm", get_args(Norm))
@@ -49,7 +41,13 @@ def test_equals_torchs(norm: Norm) -> None:
     x, length = torch.randn(3, 9, 16).double(), torch.tensor([9, 5, 1])
     mask = length_mask(length, 9)
     found = net(x, mask)
-    want = theirs(net, norm, 4, 40)(x, src_key_padding_mask=~mask)
+    layer = nn.TransformerEncoderLayer(
+        16, 4, 40, dropout=0.0, activation="gelu", batch_first=True, norm_first=norm == "pre"
+    )
+    last = nn.LayerNorm(16) if norm == "pre" else None
+    own = nn.TransformerEncoder(layer, 3, norm=last, enable_nested_tensor=False).double().eval()
+    own.load_state_dict(in_torch(net))
+    want = own(x, src_key_padding_mask=~mask)
     torch.testing.assert_close(found[mask], want[mask], rtol=1e-10, atol=1e-10)
 
 
@@ -87,18 +85,7 @@ def test_attention_to_a_memory_equals_torchs(norm: Norm) -> None:
         16, 4, 40, dropout=0.0, activation="gelu", batch_first=True, norm_first=norm == "pre"
     )
     own = nn.TransformerDecoder(layer, 2, norm=nn.LayerNorm(16) if norm == "pre" else None).eval()
-    names = {
-        "attention.qkv": "self_attn.in_proj", "attention.out": "self_attn.out_proj",
-        "memory.qkv": "multihead_attn.in_proj", "memory.out": "multihead_attn.out_proj",
-        "norm_attention": "norm1", "norm_memory": "norm2", "norm_ff": "norm3",
-        "ff_in": "linear1", "ff_out": "linear2", "blocks": "layers",
-    }  # fmt: skip
-    state = {}
-    for name, value in net.state_dict().items():
-        for here, there in names.items():
-            name = name.replace(here, there)
-        state[name.replace("in_proj.", "in_proj_")] = value
-    own.load_state_dict(state)
+    own.load_state_dict(in_torch(net, memory=True))
     x, memory, length = torch.randn(3, 9, 16), torch.randn(3, 5, 16), torch.tensor([9, 5, 1])
     mask, seen = length_mask(length, 9), length_mask(torch.tensor([2, 5, 1]), 5)
     found = net(x, mask, memory=memory, memory_mask=seen)

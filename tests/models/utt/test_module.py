@@ -187,16 +187,6 @@ def test_without_the_term_there_is_no_critic() -> None:
     assert set(values) == {"loss", "tokens_loss", "tokens_ce", "tokens_accuracy_code"}
 
 
-def test_dropped_conditions_are_the_unconditional_input() -> None:
-    module = toy_module(condition_dropout=0.99, z_dim=0)
-    batch = toy_batch(module)
-    torch.manual_seed(0)
-    dropped = module.losses_of("tokens", batch, {})["ce"]
-    none = {name: Condition(c.features, torch.zeros_like(c.mask)) for name, c in batch["conditions"].items()}
-    bare = module.losses_of("tokens", {**batch, "conditions": none}, {})["ce"]
-    torch.testing.assert_close(dropped, bare)
-
-
 def test_corrupted_inputs_keep_their_targets() -> None:
     module = toy_module(pkeep=0.01, z_dim=0, loss={"adversarial": {"weight": 0.0}})
     seen = {}

@@ -183,10 +183,7 @@ def rewrite(folder: Path, name: str, **changes: Any) -> None:
 BIAS = "movement_encoder.out_net.bias"
 FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no folder": (shutil.rmtree, "no such folder"),
-    "no facts": (lambda f: (f / "evaluator.json").unlink(), r"evaluator\.json: no such file"),
-    "no file": (lambda f: (f / "stats.safetensors").unlink(), r"stats\.safetensors: no such file"),
     "other layout": (lambda f: rewrite(f, "evaluator.json", layout="body133"), "key 'layout' = 'body133'"),
-    "no checksum": (lambda f: rewrite(f, "evaluator.json", sha256={}), r"'sha256\.model\.safetensors'"),
     "other bytes": (lambda f: (f / "words.json").write_text("{}"), r"words\.json: .* sha256"),
     "torn": (
         lambda f: ((f / "stats.safetensors").write_bytes(b"torn"), sign(f, "stats.safetensors")),
@@ -196,10 +193,6 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda f: spoil(f, "model.safetensors", lambda t: t.pop(BIAS)),  # type: ignore[arg-type, return-value]
         f"tensor '{BIAS}' is no tensor",
     ),
-    "unknown": (
-        lambda f: spoil(f, "model.safetensors", lambda t: t.update(more=torch.ones(1))),
-        r"tensor 'more' is \[1\]",
-    ),
     "shape": (
         lambda f: spoil(f, "model.safetensors", lambda t: t.update({BIAS: torch.ones(511)})),
         rf"tensor '{BIAS}' is \[511\]",
@@ -208,11 +201,6 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda f: spoil(f, "stats.safetensors", lambda t: t["mean"].fill_(torch.nan)),  # type: ignore[arg-type, return-value]
         "tensor 'mean' holds numbers that are not finite",
     ),
-    "no width": (
-        lambda f: spoil(f, "stats.safetensors", lambda t: t["std"].zero_()),  # type: ignore[arg-type, return-value]
-        "std has columns that are not above 0",
-    ),
-    "no unknown word": (lambda f: rewrite(f, "words.json", words=WORDS[:1] + WORDS[2:]), "'words' .*'unk'"),
     "other class": (lambda f: rewrite(f, "words.json", lists={"Nowhere": ["left"]}), "'classes' .*'Nowhere'"),
 }
 

