@@ -26,7 +26,7 @@ from motionloom.pipeline.store.files import open_own, read_record, write_json
 from motionloom.pipeline.store.training_log import FILE_NAME, optional
 
 FOLDER = "logs"
-"""Folder of the loggers in a stage's folder; no result depends on it."""
+"""Folder of the loggers in a stage's folder, and of a process that stalled; no result depends on it."""
 
 _SENT = "sent.json"
 """In that folder: how many rows each logger has. A kill may come between a checkpoint and the sending."""

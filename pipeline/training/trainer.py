@@ -29,7 +29,7 @@ from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModul
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.process import Interrupted, TeamError
 from motionloom.pipeline.launch.team import lead_finds
-from motionloom.pipeline.store.training_log import FLIGHT, optional, rise_of_loss
+from motionloom.pipeline.store.training_log import optional, rise_of_loss
 from motionloom.pipeline.training.checkpointing import (
     BackgroundWriter,
     Checkpoint,
@@ -136,7 +136,7 @@ class Training:
         self.telemetry = Telemetry(context.folder, module, config.batch_size, console, at_peak)
         self.failures = FailureGuard(name, module)
         self.shards = ShardWatch(context.inputs.values())
-        stalled = context.folder / FLIGHT / f"stalled_rank_{rank()}.txt"
+        stalled = self.log.folder / f"stalled_rank_{rank()}.txt"
         self.stall = StallTimer(stalled, hardware.stall_seconds)
 
     def run(self) -> None:

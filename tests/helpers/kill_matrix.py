@@ -53,7 +53,6 @@ class Cell:
     ranks: int = 1
     workers: int = 0
     kills: int = 20
-    seed: int = 0
     settings: tuple[str, ...] = ()
 
     def words(self, run: Path, *, workers: int | None = None) -> list[str]:
@@ -75,8 +74,6 @@ class Seen:
     kills: int = 0
     in_a_write: int = 0
     """Kills while a checkpoint was half written, by the file that they left."""
-    before_a_step: int = 0
-    """Kills before the try had trained a step."""
     repeated: int = 0
     """Steps of rank 0 that were trained more than once."""
     wrong_samples: int = 0
@@ -87,7 +84,6 @@ class Seen:
     """Steps that no try has trained to the end."""
     unequal: tuple[str, ...] = ()
     """Files of the finished stage with other bytes."""
-    seconds: float = 0.0
 
     @property
     def exact(self) -> bool:
@@ -126,12 +122,8 @@ class Try:
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             port = free.getsockname()[1]
-        job = {
-            "WORLD_SIZE": ranks,
-            "LOCAL_WORLD_SIZE": ranks,
-            "MASTER_ADDR": "127.0.0.1",
-            "MASTER_PORT": port,
-        }
+        job = {"WORLD_SIZE": ranks, "LOCAL_WORLD_SIZE": ranks}
+        job |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
         self.pids: list[int] = []
         for rank in range(ranks):
             place = {RECORDS: records}
@@ -238,11 +230,10 @@ def into_a_write(attempt: Try, folder: Path) -> bool:
 
 def kill_and_compare(cell: Cell, work: Path) -> Seen:
     """Train the stage of `cell` through its kills to the end, and compare."""
-    started = time.monotonic()
     calm, files = undisturbed(cell, work)
     steps = 1 + max(step for _, step in calm)
     seen = Seen(cell.name, cell.stage, cell.ranks, cell.workers, steps)
-    chance = random.Random(f"{cell.name} {cell.seed}")
+    chance = random.Random(cell.name)
     place = work / cell.name
     shutil.rmtree(place, ignore_errors=True)
     run = place / Path(cell.base).name
@@ -267,7 +258,6 @@ def kill_and_compare(cell: Cell, work: Path) -> Seen:
         if not attempt.kill() or (stage / "artifact.json").exists():
             raise RuntimeError(f"{log}: try {number} ended before it was killed")
         seen.kills += 1
-        seen.before_a_step += attempt.last_step() < 0
         seen.in_a_write += any(stage.glob("checkpoints/.*.tmp"))
     last = Try(cell.words(run), cell.ranks, place / "last", log)
     attempts.append(last.records)
@@ -275,7 +265,6 @@ def kill_and_compare(cell: Cell, work: Path) -> Seen:
     if any(codes):
         raise RuntimeError(f"{log}: the last try ended with {codes}")
     compare(seen, attempts, calm, files, finished_files(stage))
-    seen.seconds = round(time.monotonic() - started, 1)
     if seen.exact:
         shutil.rmtree(run)
     return seen

@@ -60,7 +60,7 @@ from motionloom.pipeline.baselines.tm2t.network import (
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig
 from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig
 
-STEPS = 20
+STEPS = 12
 BATCH, FRAMES, TEXT = 6, 24, 6
 LAYOUT = MotionLayout.named("wholebody313")
 OPTIM = OptimConfig(lr=1e-3)
@@ -306,7 +306,6 @@ CASES: dict[str, Callable[[], tuple[StageModule, Batches]]] = {
     "mq": lambda: tokenizer(MqConfig(**SMALL, num_codes=12, start="data")),
     "tm2t": lambda: tokenizer(Tm2tConfig(**SMALL, num_codes=12, start="data")),
     "tma": tma,
-    "tma, compiled": tma,
     "gpt": gpt,
     "gpt, compiled": gpt,
     "gpt, samples": gpt_samples,

@@ -11,6 +11,7 @@ from torch import Tensor
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.models.condition.mate import Encoded
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
@@ -73,6 +74,16 @@ def random_codes(groups: Sequence[int], streams: Sequence[Stream] = STREAMS) -> 
         values = torch.randint(count, (len(groups), most * per), generator=draws)
         codes[name] = values * (torch.arange(most * per) < number[:, None] * per)
     return Codes(codes, number)
+
+
+def encoded(batch: int, lengths: list[int] | None = None, *, timed: bool = False) -> Encoded:
+    """Conditions of a UTT, at most five positions long."""
+    draws = torch.Generator().manual_seed(1)
+    glob, seq, music = (
+        torch.randn(batch, *size, generator=draws, dtype=torch.float64) for size in ((6,), (5, 6), (15, 6))
+    )
+    mask = torch.arange(5) < torch.tensor(lengths or [5] * batch)[:, None]
+    return Encoded(glob, seq, mask, music if timed else None)
 
 
 def closed(groups: Sequence[int]) -> TokenSequence:

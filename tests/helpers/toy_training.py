@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from tiny_adversaries import DIM, Steps
 from torch import Tensor, nn
-from torch.utils.data import Dataset
 from toy_stages import register_toys
 
 from motionloom.models.training.stage_module import StageModule
@@ -15,8 +15,6 @@ from motionloom.pipeline.contract.stage import Inputs
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
-
-DIM = 6
 
 
 class ToyConfig(TrainedStageConfig):
@@ -58,20 +56,17 @@ class ToyModule(StageModule):
         return {"loss": recon, "recon": recon, "weight": self.net.decoder.weight.square().mean()}
 
 
-class ToyBatches(Dataset[dict[str, Tensor]]):
+class ToyBatches(Steps):
     """Item k is this rank's rows of batch k."""
 
     def __init__(self, config: ToyConfig, seed: int, batch: int, rank: int, world: int) -> None:
+        super().__init__(batch, rank, world)
         self.config, self.seed, self.rank = config, seed, rank
-        self.batch, self.rows = batch, range(rank * batch // world, (rank + 1) * batch // world)
 
-    def __len__(self) -> int:
-        return 10**6
-
-    def __getitem__(self, k: int) -> dict[str, Tensor]:
-        generator = torch.Generator().manual_seed(self.seed * 10**6 + k)
-        rows = torch.randn(self.batch, DIM, generator=generator)[self.rows.start : self.rows.stop]
-        fails = k == self.config.fails_at and self.rank == self.config.fails_on_rank
+    def made(self, step: int, part: int) -> dict[str, Tensor]:
+        generator = torch.Generator().manual_seed(self.seed * 10**6 + step)
+        rows = torch.randn(self.batch, DIM, generator=generator)[self.rows]
+        fails = step == self.config.fails_at and self.rank == self.config.fails_on_rank
         if fails and self.config.failure == "nan":
             rows[1, 2] = torch.nan
         broken = torch.full((len(rows),), fails and self.config.failure == "error")

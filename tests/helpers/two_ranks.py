@@ -6,16 +6,39 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 HELPERS = str(Path(__file__).parent)
 
 
-def run_two_ranks(script: str, *arguments: object, numbered: bool = False, timeout: float = 200) -> None:
-    """`python script arguments` twice, as torchrun starts them; both must end well.
+def pair_of(script: str) -> Any:
+    """A fixture: the folder in which both ranks of `script` have worked."""
 
-    `numbered` puts the rank in front of the arguments, for workers that meet in another way.
-    """
+    @pytest.fixture(scope="module")
+    def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+        folder = tmp_path_factory.mktemp("pair")
+        run_two_ranks(script, folder)
+        return folder
+
+    return pair
+
+
+def work(worker: Callable[[Path], None]) -> None:
+    """One rank: `worker` in the folder that the command names."""
+    import torch
+
+    torch.set_num_threads(1)
+    worker(Path(sys.argv[1]))
+    torch.distributed.barrier()
+    os._exit(0)  # without destructors, as the program does: those of DDP and gloo can wait for each other
+
+
+def run_two_ranks(script: str, folder: Path, timeout: float = 200) -> None:
+    """`python script folder` twice, as torchrun starts them; both must end well."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -25,9 +48,8 @@ def run_two_ranks(script: str, *arguments: object, numbered: bool = False, timeo
     ranks = []
     for rank in range(2):
         place = {"RANK": rank, "LOCAL_RANK": rank, "OMP_NUM_THREADS": 1, "PYTHONPATH": path, **job}
-        words = [str(rank)] * numbered + [str(argument) for argument in arguments]
         env = {**os.environ, **{key: str(value) for key, value in place.items()}}
-        ranks.append(subprocess.Popen([sys.executable, "-P", script, *words], env=env))
+        ranks.append(subprocess.Popen([sys.executable, "-P", script, str(folder)], env=env))
     try:
         assert [process.wait(timeout=timeout) for process in ranks] == [0, 0]
     finally:

@@ -62,7 +62,7 @@ class ShardsStage(DataStage):
 
     def settle(self, config: ShardsStageConfig, folder: Path) -> None:
         """How to read changes no result, so it is written anew whenever the recipe runs."""
-        settle_shards(config, folder)
+        write_json(folder / READER, Reader(cache=config.cache).dump())
 
 
 class SynthStage(DataStage):
@@ -151,12 +151,7 @@ def run_shards(context: StageContext) -> None:
         )
     reference = Reference(path=place, order=config.order, shards_per_group=config.shards_per_group)
     write_json(context.folder / REFERENCE, reference.dump())
-    settle_shards(config, context.folder)
-
-
-def settle_shards(config: ShardsStageConfig, folder: Path) -> None:
-    """Write down how the recipe wants the shards read now; done again whenever the recipe runs."""
-    write_json(folder / READER, Reader(cache=config.cache).dump())
+    write_json(context.folder / READER, Reader(cache=config.cache).dump())
 
 
 def say_shards(context: StageContext, manifest: Manifest) -> None:

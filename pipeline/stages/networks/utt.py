@@ -138,8 +138,7 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
         frames: dict[str, Any] = {"max_frames": config.max_frames, "min_frames": config.min_frames}
         return clip_batches(
             inputs.data, inputs.stats, readers, seed, clips={"columns": inputs.tokenizer.columns, **frames},
-            dataset=inputs.data.split("train"), balance=config.balance, drop=config.drop,
-            homogeneous=config.homogeneous,
+            balance=config.balance, drop=config.drop, homogeneous=config.homogeneous,
         )  # fmt: skip
 
     def example(self, config: UttStageConfig, net: ConditionedUtt, inputs: UttInputs, batch: int) -> Example:

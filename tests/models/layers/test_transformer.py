@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 import torch
@@ -20,7 +20,7 @@ from motionloom.models.layers.transformer import (
 )
 
 
-def in_torch(net: Transformer, *, memory: bool = False) -> dict[str, torch.Tensor]:
+def in_torch(net: Transformer, *, memory: bool) -> dict[str, torch.Tensor]:
     """Its weights by the names of torch's encoder, or decoder."""
     state = {}
     for name, value in net.state_dict().items():
@@ -30,24 +30,29 @@ def in_torch(net: Transformer, *, memory: bool = False) -> dict[str, torch.Tenso
     return state
 
 
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("memory", [False, True])
 @pytest.mark.parametrize("norm", get_args(Norm))
-def test_equals_torchs(norm: Norm) -> None:
+def test_equals_torchs(norm: Norm, memory: bool) -> None:
     torch.manual_seed(0)
-    net = Transformer(TextDenoiserConfig(dim=16, heads=4, ff=40, dropout=0), 3, norm=norm)
-    for name, parameter in net.named_parameters():
-        if "norm" in name or name.endswith("bias"):
-            nn.init.normal_(parameter, mean=1.0 if name.endswith("weight") else 0.0, std=0.3)
-    net = net.double().eval()
-    x, length = torch.randn(3, 9, 16).double(), torch.tensor([9, 5, 1])
-    mask = length_mask(length, 9)
-    found = net(x, mask)
-    layer = nn.TransformerEncoderLayer(
-        16, 4, 40, dropout=0.0, activation="gelu", batch_first=True, norm_first=norm == "pre"
+    config = TextDenoiserConfig(dim=16, heads=4, ff=40, dropout=0)
+    net = Transformer(config, 2, norm=norm, memory=memory).eval()
+    for parameter in net.parameters():
+        nn.init.normal_(parameter, std=0.3)
+    x, mask = torch.randn(3, 9, 16), length_mask(torch.tensor([9, 5, 1]), 9)
+    read, seen = torch.randn(3, 5, 16), length_mask(torch.tensor([2, 5, 1]), 5)
+    sizes: dict[str, Any] = {"dropout": 0.0, "activation": "gelu", "batch_first": True}
+    layer = (nn.TransformerDecoderLayer if memory else nn.TransformerEncoderLayer)(
+        16, 4, 40, norm_first=norm == "pre", **sizes
     )
     last = nn.LayerNorm(16) if norm == "pre" else None
-    own = nn.TransformerEncoder(layer, 3, norm=last, enable_nested_tensor=False).double().eval()
-    own.load_state_dict(in_torch(net))
-    want = own(x, src_key_padding_mask=~mask)
+    own: nn.Module = (nn.TransformerDecoder if memory else nn.TransformerEncoder)(layer, 2, norm=last)  # type: ignore[operator]
+    own.eval().load_state_dict(in_torch(net, memory=memory))
+    if memory:
+        found = net(x, mask, memory=read, memory_mask=seen)
+        want = own(x, read, tgt_key_padding_mask=~mask, memory_key_padding_mask=~seen)
+    else:
+        found, want = net(x, mask), own(x, src_key_padding_mask=~mask)
     torch.testing.assert_close(found[mask], want[mask], rtol=1e-10, atol=1e-10)
 
 
@@ -73,24 +78,6 @@ def test_checkpointed_activations_draw_again_what_they_drew() -> None:
         grads.append([p.grad.clone() for p in stack.parameters() if p.grad is not None])
     for one, two in zip(*grads, strict=True):
         assert torch.equal(one, two)
-
-
-@pytest.mark.usefixtures("float64")
-@pytest.mark.parametrize("norm", get_args(Norm))
-def test_attention_to_a_memory_equals_torchs(norm: Norm) -> None:
-    net = Transformer(TextDenoiserConfig(dim=16, heads=4, ff=40, dropout=0), 2, norm=norm, memory=True).eval()
-    for parameter in net.parameters():
-        nn.init.normal_(parameter, std=0.3)
-    layer = nn.TransformerDecoderLayer(
-        16, 4, 40, dropout=0.0, activation="gelu", batch_first=True, norm_first=norm == "pre"
-    )
-    own = nn.TransformerDecoder(layer, 2, norm=nn.LayerNorm(16) if norm == "pre" else None).eval()
-    own.load_state_dict(in_torch(net, memory=True))
-    x, memory, length = torch.randn(3, 9, 16), torch.randn(3, 5, 16), torch.tensor([9, 5, 1])
-    mask, seen = length_mask(length, 9), length_mask(torch.tensor([2, 5, 1]), 5)
-    found = net(x, mask, memory=memory, memory_mask=seen)
-    want = own(x, memory, tgt_key_padding_mask=~mask, memory_key_padding_mask=~seen)
-    torch.testing.assert_close(found[mask], want[mask], rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.usefixtures("float64")

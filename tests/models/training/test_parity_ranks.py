@@ -1,4 +1,4 @@
-"""Training on two ranks equals training in one process, for every kind of stage, over 20 optimizer steps.
+"""Training on two ranks equals training in one process, for every kind of stage, over 12 optimizer steps.
 
 Two gloo processes with half of each batch each, under DDP as the pipeline sets it up, against one process
 with the whole batch: the loss of every step, the last gradients and the weights and codebooks agree to 1e-5.
@@ -17,8 +17,6 @@ The processes run this file as a script.
 
 from __future__ import annotations
 
-import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +26,7 @@ import torch.distributed as dist
 from rank_cases import BATCH, CASES, STEPS, rows_of
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
-from two_ranks import run_two_ranks
+from two_ranks import pair_of, work
 
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import StageModule
@@ -48,7 +46,7 @@ class Wrapped(nn.Module):
 
 
 def train(case: str) -> dict[str, Any]:
-    """20 steps on this rank's part of the batches; figures are averaged over ranks."""
+    """12 steps on this rank's part of the batches; figures are averaged over ranks."""
     torch.manual_seed(0)
     module, batches = CASES[case]()
     module.net.double()
@@ -80,22 +78,18 @@ def train(case: str) -> dict[str, Any]:
     return {"figures": figures, "grads": grads, "state": module.net.state_dict()}
 
 
-def worker(number: int, folder: Path) -> None:
-    torch.set_num_threads(1)
-    init = f"file://{folder}/rendezvous"
-    dist.init_process_group("gloo", init_method=init, rank=number, world_size=2)
-    torch.save({case: train(case) for case in CASES}, folder / f"{number}.pt")
-    dist.barrier()
-    # Without destructors: those of DDP and gloo can wait for each other.
-    os._exit(0)
+def worker(folder: Path) -> None:
+    dist.init_process_group("gloo")
+    torch.save({case: train(case) for case in CASES}, folder / f"{rank()}.pt")
+
+
+pair = pair_of(__file__)
 
 
 @pytest.fixture(scope="module")
-def two(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+def two(pair: Path) -> list[dict[str, Any]]:
     """What each of two ranks found, per case."""
-    folder = tmp_path_factory.mktemp("ranks")
-    run_two_ranks(__file__, folder, numbered=True)
-    return [torch.load(folder / f"{number}.pt", weights_only=True) for number in range(2)]
+    return [torch.load(pair / f"{number}.pt", weights_only=True) for number in range(2)]
 
 
 @pytest.mark.timeout(240)
@@ -116,4 +110,4 @@ def test_two_ranks_equal_one_process(case: str, two: list[dict[str, Any]]) -> No
 
 
 if __name__ == "__main__":
-    worker(int(sys.argv[1]), Path(sys.argv[2]))
+    work(worker)

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 import torch
+from plain_training import take_steps
 from rank_cases import CASES as CASES_OF_RANKS
-from torch import Tensor
 
 from motionloom.models.quantize.base import QuantizerConfig
 from motionloom.models.quantize.ema import EmaQuantizer
@@ -39,37 +39,21 @@ def in_float32(batch: Any) -> Any:
     return batch.float() if batch is not None and batch.is_floating_point() else batch
 
 
-def train(case: str, *, half: bool) -> tuple[StageModule, list[dict[str, Tensor]]]:
-    """A few steps on one batch, as Lightning makes them: forward and losses under autocast alone."""
-    module, batch = build(case)
-    optimizer = module.configure_optimizers()[0]["optimizer"]
-    found = []
-    for step in range(STEPS):
-        torch.manual_seed(step)
-        with torch.autocast("cpu", HALF, enabled=half):
-            values = module.losses(batch)
-        optimizer.zero_grad()
-        values["loss"].backward()
-        optimizer.step()
-        found.append({name: value.detach() for name, value in values.items()})
-    return module, found
-
-
 @pytest.mark.parametrize("case", CASES)
 def test_a_few_steps_are_near_those_in_float32(case: str) -> None:
-    before = {name: (v.dtype, v.is_floating_point()) for name, v in build(case)[0].net.state_dict().items()}
-    module, found = train(case, half=True)
-    _, expected = train(case, half=False)
-    for step in range(STEPS):
-        for name, value in found[step].items():
-            assert torch.isfinite(value).all(), (name, step)
-            assert value.dtype == torch.float32, name
-    for step, (mixed, full) in enumerate(zip(found, expected, strict=True)):
-        assert mixed["loss"].item() == pytest.approx(full["loss"].item(), rel=0.03), step
-    state = module.net.state_dict()
-    for name, (dtype, floating) in before.items():
-        assert state[name].dtype == dtype
-        assert not floating or (dtype == torch.float32 and torch.isfinite(state[name]).all()), name
+    (module, batch), (full, _) = build(case), build(case)
+    before = {name: value.dtype for name, value in module.net.state_dict().items()}
+    take_steps(module, [batch] * STEPS, "bf16-mixed")
+    take_steps(full, [batch] * STEPS)
+    for found, expected in zip(module.figures, full.figures, strict=True):
+        assert torch.isfinite(found.values).all(), found.names
+        loss = found.names.index("loss")
+        assert found.values[loss].item() == pytest.approx(expected.values[loss].item(), rel=0.03)
+    with torch.autocast("cpu", HALF):
+        assert all(value.dtype == torch.float32 for value in module.losses(batch).values())
+    for name, value in module.net.state_dict().items():
+        assert value.dtype == before[name] and torch.isfinite(value).all(), name
+        assert not value.is_floating_point() or value.dtype == torch.float32, name
     assert all(p.grad is None or p.grad.dtype == torch.float32 for p in module.net.parameters())
 
 

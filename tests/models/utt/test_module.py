@@ -39,8 +39,8 @@ SMALL = DiscriminatorConfig(dim=8, ff=8, heads=2, layers=1, dropout=0.0)
 LAYOUT = {"mq": "smpl75", "h2vq": "wholebody313"}
 
 
-def toy_tokenizer(kind: str = "mq", num_codes: int = 9) -> Tokenizer:
-    small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": num_codes}
+def toy_tokenizer(kind: str) -> Tokenizer:
+    small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 9}
     config = MqConfig(**small) if kind == "mq" else H2VQConfig(**small)
     made = config.build(MotionLayout.named(LAYOUT[kind]))
     for book in made.codebooks().values():
@@ -48,31 +48,18 @@ def toy_tokenizer(kind: str = "mq", num_codes: int = 9) -> Tokenizer:
     return made
 
 
-def toy_module(
-    kind: str = "mq", *, loss: dict[str, Any] | None = None, max_steps: int = 100, **net: Any
-) -> UttModule:
+def toy_module(kind: str = "mq", *, loss: dict[str, Any] | None = None, **net: Any) -> UttModule:
     torch.manual_seed(0)
     tokenizer = toy_tokenizer(kind)
     given = {"layers": 1, "dim": 16, "heads": 2, "ff": 16, "block_size": 24, "dropout": 0.0,
              "attention_dropout": 0.0, "z_dim": 2, "condition_dropout": 0.0, **net}  # fmt: skip
-    conditioned = ConditionedUtt(
-        MateConfig(dim=8, layers=1, heads=2, ff=8, dropout=0.0, attention_dropout=0.0),
-        UttConfig(**given),
-        {"text": 4, "audio": 3},
-        tokenizer.streams,
-        tokenizer.pattern,
-        timed=["audio"],
-    )
+    mate = MateConfig(dim=8, layers=1, heads=2, ff=8, dropout=0.0, attention_dropout=0.0)
+    streams, pattern = tokenizer.streams, tokenizer.pattern
+    widths = {"text": 4, "audio": 3}
+    conditioned = ConditionedUtt(mate, UttConfig(**given), widths, streams, pattern, timed=["audio"])
     config = UttLossConfig.parse({"discriminator": SMALL.dump(), **(loss or {})}, "loss")
-    module = UttModule(
-        conditioned,
-        OptimConfig(optimizer="adam"),
-        seed=0,
-        max_steps=max_steps,
-        tokenizer=tokenizer,
-        loss=config,
-    )
-    return module
+    optim = OptimConfig(optimizer="adam")
+    return UttModule(conditioned, optim, seed=0, max_steps=100, tokenizer=tokenizer, loss=config)
 
 
 def toy_batch(module: UttModule, frames: int = 20) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from toy_gpt import PATTERN, STREAMS, closed
+from toy_gpt import PATTERN, STREAMS, closed, encoded
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
@@ -23,14 +23,6 @@ def utt(request: pytest.FixtureRequest) -> Utt:
     return net.double().eval()
 
 
-def conditions(batch: int, size: int = 5, lengths: list[int] | None = None) -> Encoded:
-    generator = torch.Generator().manual_seed(1)
-    glob = torch.randn(batch, 6, generator=generator, dtype=torch.float64)
-    seq = torch.randn(batch, size, 6, generator=generator, dtype=torch.float64)
-    mask = torch.arange(size) < torch.tensor(lengths or [size] * batch)[:, None]
-    return Encoded(glob, seq, mask)
-
-
 def hidden(utt: Utt, tokens: Tensor, kinds: Tensor, condition: Encoded, z: Tensor | None = None) -> Tensor:
     """States in float64, of which `forward` gives float32 logits."""
     prefix, mask = utt.prefix(condition, z)
@@ -40,7 +32,7 @@ def hidden(utt: Utt, tokens: Tensor, kinds: Tensor, condition: Encoded, z: Tenso
 
 def test_a_row_depends_on_nothing_but_itself(utt: Utt) -> None:
     tokens, kinds, _ = closed([5, 2, 3])
-    condition, z = conditions(3, 5, [5, 0, 2]), torch.randn(3, 3).double()
+    condition, z = encoded(3, [5, 0, 2]), torch.randn(3, 3).double()
     condition = condition._replace(seq=condition.seq.masked_fill(~condition.mask[..., None], 1e3))
     together = hidden(utt, tokens, kinds, condition, z)
     for row, groups in enumerate([5, 2, 3]):
@@ -53,7 +45,7 @@ def test_a_row_depends_on_nothing_but_itself(utt: Utt) -> None:
 
 def test_motion_is_causal_and_sees_the_whole_prefix(utt: Utt) -> None:
     tokens, kinds, _ = closed([4])
-    condition = conditions(1)
+    condition = encoded(1)
     condition.seq.requires_grad_()
     embedded = utt.embed(tokens[:, :-1], kinds[:, :-1]).detach().requires_grad_()
     prefix, mask = utt.prefix(condition)
@@ -67,7 +59,7 @@ def test_motion_is_causal_and_sees_the_whole_prefix(utt: Utt) -> None:
 
 
 def test_z_is_added_to_the_global_embedding(utt: Utt) -> None:
-    condition, z = conditions(2), torch.randn(2, 3).double()
+    condition, z = encoded(2), torch.randn(2, 3).double()
     assert utt.z_in is not None
     moved = condition._replace(glob=condition.glob + utt.z_in(z))
     for a, b in zip(utt.prefix(condition, z), utt.prefix(moved), strict=True):
@@ -78,7 +70,7 @@ def test_z_is_added_to_the_global_embedding(utt: Utt) -> None:
     still = Utt(TINY.model_copy(update={"z_dim": 0}), STREAMS, PATTERN, glob_dim=6)
     assert still.z_in is None
     with pytest.raises(UserError, match="z_dim 0"):
-        still.prefix(conditions(2), z)
+        still.prefix(encoded(2), z)
 
 
 def test_music_beside_a_token_is_that_of_its_own_frames() -> None:
@@ -87,7 +79,7 @@ def test_music_beside_a_token_is_that_of_its_own_frames() -> None:
     utt = Utt(config, STREAMS, PATTERN, glob_dim=6, stride=2).double().eval()
     tokens, kinds, _ = closed([4, 4])
     timed = torch.randn(2, 7, 6, dtype=torch.float64)  # three groups and a half: the last is padded
-    condition = conditions(2)._replace(timed=timed)
+    condition = encoded(2)._replace(timed=timed)
     plain = hidden(utt, tokens, kinds, condition)
     for group in range(4):
         changed = timed.clone()
@@ -98,23 +90,23 @@ def test_music_beside_a_token_is_that_of_its_own_frames() -> None:
         assert same[:, : 3 * group].all()
         assert not same[:, 3 * group :].any()
     # Without music nothing is added, and the layer is in the graph nevertheless.
-    none = hidden(utt, tokens, kinds, conditions(2))
+    none = hidden(utt, tokens, kinds, encoded(2))
     torch.testing.assert_close(
         none, hidden(utt, tokens, kinds, condition._replace(timed=torch.zeros_like(timed)))
     )
-    utt(tokens, kinds, conditions(2)).masked_fill(~utt.legal(tokens, kinds), 0.0).sum().backward()
+    utt(tokens, kinds, encoded(2)).masked_fill(~utt.legal(tokens, kinds), 0.0).sum().backward()
     assert utt.frame_condition_in is not None
     assert utt.frame_condition_in.weight.grad is not None
 
 
 def test_logits_keep_the_grammar_and_codes_that_a_clip_lacks_are_read_as_zero(utt: Utt) -> None:
     tokens, kinds, _ = closed([4, 2])
-    logits = utt(tokens, kinds, conditions(2))
+    logits = utt(tokens, kinds, encoded(2))
     assert torch.equal(torch.isfinite(logits), utt.legal(tokens, kinds))
     tokens, kinds, _ = closed([4])
     known = kinds == 0
     other = torch.where(known, tokens, (tokens + 1) % 5)
-    condition = conditions(1)
+    condition = encoded(1)
     a = utt(tokens, kinds, condition, inputs=tokens, known=known)
     b = utt(tokens, kinds, condition, inputs=other, known=known)
     assert torch.equal(a, b)
@@ -124,7 +116,7 @@ def test_logits_keep_the_grammar_and_codes_that_a_clip_lacks_are_read_as_zero(ut
 def test_mistakes_are_named(utt: Utt) -> None:
     tokens, kinds, _ = closed([10])
     with pytest.raises(UserError, match=r"32 tokens.*net\.block_size 30"):
-        utt(tokens, kinds, conditions(1))
+        utt(tokens, kinds, encoded(1))
     with pytest.raises(UserError, match="holds no motion"):
         Utt(TINY.model_copy(update={"block_size": 4}), STREAMS, PATTERN, 6)
     with pytest.raises(ValueError, match="built for width 6"):

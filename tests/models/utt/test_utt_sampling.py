@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
-from toy_gpt import PATTERN, STREAMS, random_codes
+from toy_gpt import PATTERN, STREAMS, encoded, random_codes
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
@@ -33,13 +34,7 @@ def utt(request: pytest.FixtureRequest) -> Utt:
     return net.double()
 
 
-def conditions(batch: int, lengths: list[int] | None = None) -> Encoded:
-    generator = torch.Generator().manual_seed(1)
-    glob = torch.randn(batch, 6, generator=generator, dtype=torch.float64)
-    seq = torch.randn(batch, 5, 6, generator=generator, dtype=torch.float64)
-    mask = torch.arange(5) < torch.tensor(lengths or [5] * batch)[:, None]
-    timed = torch.randn(batch, 15, 6, generator=generator, dtype=torch.float64)
-    return Encoded(glob, seq, mask, timed)
+conditions = partial(encoded, timed=True)
 
 
 def null(batch: int) -> Encoded:

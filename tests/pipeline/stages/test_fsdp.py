@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,9 +17,9 @@ import torch
 from pydantic import ValidationError
 from rich.console import Console
 from safetensors.torch import load_file, save_file
-from tiny_adversaries import Steps
+from tiny_adversaries import Steps, context
 from torch import Tensor
-from two_ranks import run_two_ranks
+from two_ranks import pair_of, work
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
@@ -31,7 +30,7 @@ from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.training.stage_module import OptimConfig
-from motionloom.pipeline.contract.stage import StageCache, StageContext, fingerprint_fields
+from motionloom.pipeline.contract.stage import fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.gpt import GptStageConfig
 from motionloom.pipeline.stages.networks.tma import TmaStageConfig
@@ -78,21 +77,16 @@ def train(folder: Path, **settings: Any) -> None:
         loss=GptLossConfig(), tokenizer=book, tma=tma,
     )  # fmt: skip
     given = {"steps": STEPS, "batch_size": BATCH, "checkpoint_every": 4, "validate_every": 4, **settings}
-    train_config = TrainConfig.model_validate(given)
-    context = StageContext(
-        name="gpt", recipe="test", config=None, folder=folder, inputs={}, seed=0,
-        hardware=Hardware(accelerator="cpu", devices=2, threads=1), console=Console(quiet=True),
-        stage_cache=StageCache(),
-    )  # fmt: skip
+    stage = context(folder, Console(quiet=True), devices=2)
     fit(
-        context,
+        stage,
         module,
-        train_config,
+        TrainConfig.model_validate(given),
         lambda batch, rank, world: Tokens(net, batch, rank, world),
         lambda: Tokens(net, 4, 0, 1, size=2),
     )
     assert module.net is net
-    if context.hardware.world() == 1 or torch.distributed.get_rank() == 0:
+    if torch.distributed.get_rank() == 0:
         save_file(net.state_dict(), folder / "weights.safetensors")
 
 
@@ -107,7 +101,6 @@ def resume(source: Path, folder: Path, **settings: Any) -> None:
 
 
 def worker(out: Path) -> None:
-    torch.set_num_threads(1)
     train(out / "ddp")
     train(out / "fsdp", strategy="fsdp")
     resume(out / "fsdp", out / "resumed", strategy="fsdp")
@@ -116,16 +109,9 @@ def worker(out: Path) -> None:
     train(out / "parts-fsdp", accumulate=2, strategy="fsdp")
     train(out / "half-ddp", precision="bf16-mixed")
     train(out / "half-fsdp", precision="bf16-mixed", strategy="fsdp")
-    torch.distributed.barrier()
-    os._exit(0)  # without destructors, as the program does
 
 
-@pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folders of all trainings."""
-    folder = tmp_path_factory.mktemp("fsdp")
-    run_two_ranks(__file__, folder)
-    return folder
+out = pair_of(__file__)
 
 
 def weights(folder: Path) -> dict[str, Tensor]:
@@ -201,4 +187,4 @@ def test_what_cannot_be_cut_is_refused(
 
 
 if __name__ == "__main__":
-    worker(Path(sys.argv[1]))
+    work(worker)

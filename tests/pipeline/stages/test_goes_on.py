@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from same_stage import (
     newest,
 )
 from tiny_adversaries import Duel, train
-from two_ranks import run_two_ranks
+from two_ranks import pair_of, work
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
@@ -147,7 +146,6 @@ def interrupt(out: Path, rank: int, hardware: dict[str, Any]) -> None:
 
 
 def worker(out: Path) -> None:
-    torch.set_num_threads(1)
     pair = {"hardware": {"devices": 2}, "module": {"dropout": 0.0}}
     for name, settings in PAIRS.items():
         duel = train(out / name, **pair, **settings)
@@ -155,8 +153,6 @@ def worker(out: Path) -> None:
     interrupt(out, int(os.environ["RANK"]), pair["hardware"])
     # Which checkpoint a training goes on from is found once, also where the ranks see different files.
     assert lead_finds(lambda: out / os.environ["RANK"]) == out / "0"
-    torch.distributed.barrier()
-    os._exit(0)  # without destructors, as the program does
 
 
 PAIRS: dict[str, dict[str, Any]] = {
@@ -166,12 +162,7 @@ PAIRS: dict[str, dict[str, Any]] = {
 BOUNDS = {"float32": 1e-5, "float64": 1e-12}
 
 
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folders of the trainings on two ranks."""
-    folder = tmp_path_factory.mktemp("pair")
-    run_two_ranks(__file__, folder)
-    return folder
+pair = pair_of(__file__)
 
 
 @pytest.mark.timeout(240)
@@ -192,4 +183,4 @@ def test_two_ranks_agree_on_the_step_of_a_signal(pair: Path) -> None:
 
 
 if __name__ == "__main__":
-    worker(Path(sys.argv[1]))
+    work(worker)

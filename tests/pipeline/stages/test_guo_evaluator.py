@@ -20,7 +20,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from shard_samples import facts
-from slow_evaluator import SHAPES, slow_motion, slow_text
+from torch import Tensor, nn
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.features.h3d import encode_h3d
@@ -51,16 +51,61 @@ raise RuntimeError("this is never run")
 """
 
 
+class Reader(nn.Module):
+    """The published encoder of one sequence."""
+
+    def __init__(self, inputs: int, width: int, inside: int) -> None:
+        super().__init__()
+        self.hidden = nn.Parameter(torch.zeros(2, 1, width))
+        self.input_emb = nn.Linear(inputs, width)
+        self.gru = nn.GRU(width, width, batch_first=True, bidirectional=True)
+        end = [nn.LayerNorm(inside), nn.LeakyReLU(0.2), nn.Linear(inside, 512)]
+        self.output_net = nn.Sequential(nn.Linear(2 * width, inside), *end)
+
+    def forward(self, x: Tensor) -> Tensor:
+        out: Tensor = self.output_net(self.gru(self.input_emb(x)[None], self.hidden)[1].flatten())
+        return out
+
+
+def encoders() -> nn.ModuleDict:
+    """The published networks, with the names of their weights."""
+    layers = [nn.Dropout(), nn.LeakyReLU(0.2)]
+    main = nn.Sequential(nn.Conv1d(259, 512, 4, 2, 1), *layers, nn.Conv1d(512, 512, 4, 2, 1), *layers)
+    movement = nn.ModuleDict({"main": main, "out_net": nn.Linear(512, 512)})
+    text = Reader(300, 512, 512)
+    text.pos_emb = nn.Linear(15, 300)
+    motion = Reader(512, 1024, 1024)
+    return nn.ModuleDict({"movement_encoder": movement, "motion_encoder": motion, "text_encoder": text})
+
+
+def slow_motion(net: Any, motion: Tensor) -> Tensor:
+    """Latent [512] of normalised features [T, 263]."""
+    units = len(motion) // 4
+    x = torch.zeros(259, 196, dtype=motion.dtype)
+    x[:, : units * 4] = motion[: units * 4, :-4].T
+    movement = net["movement_encoder"]
+    latent: Tensor = net["motion_encoder"](movement["out_net"](movement["main"](x).T)[:units])
+    return latent
+
+
+def slow_text(net: Any, words: list[tuple[Tensor, int]]) -> Tensor:
+    """Latent [512] of words: each a vector [300] and the number of its class."""
+    encoder, classes = net["text_encoder"], torch.eye(15, dtype=torch.float64)
+    latent: Tensor = encoder(torch.stack([x + encoder.pos_emb(classes[kind]) for x, kind in words]))
+    return latent
+
+
 @pytest.fixture(scope="module")
 def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the authors' repository, with weights."""
     root = tmp_path_factory.mktemp("release")
     generator = torch.Generator().manual_seed(0)
     checkpoint: dict[str, Any] = {"epoch": 3, "iter": 4, "opt_text_encoder": {"state": {}}}
-    for name, shape in SHAPES.items():
-        encoder, _, rest = name.partition(".")
-        spread = shape[-1] ** -0.5 if len(shape) > 1 else 0.3
-        checkpoint.setdefault(encoder, {})[rest] = torch.randn(shape, generator=generator) * spread
+    for encoder, net in encoders().items():
+        checkpoint[encoder] = {
+            name: torch.randn(x.shape, generator=generator) * (x.shape[-1] ** -0.5 if x.dim() > 1 else 0.3)
+            for name, x in net.state_dict().items()
+        }
     path = root / "checkpoints/t2m/text_mot_match/model/finest.tar"
     path.parent.mkdir(parents=True)
     torch.save(checkpoint, path)
@@ -93,18 +138,18 @@ def folder(release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def published(release: Path) -> dict[str, torch.Tensor]:
-    """Weights by their published names, float64."""
+def published(release: Path) -> Any:
+    """The networks with the release's weights, float64."""
     path = release / "checkpoints/t2m/text_mot_match/model/finest.tar"
-    checkpoint = torch.load(path, weights_only=True)
-    encoders = ("movement_encoder", "motion_encoder", "text_encoder")
-    return {f"{e}.{name}": value.double() for e in encoders for name, value in checkpoint[e].items()}
+    checkpoint, nets = torch.load(path, weights_only=True), encoders()
+    for name, net in nets.items():
+        net.load_state_dict(checkpoint[name])
+    return nets.double().eval().requires_grad_(False)
 
 
 def test_latents_are_those_of_the_published_definition(release: Path, folder: Path) -> None:
     """Float64 to 1e-5: motions of many lengths in one batch, the longest without a frame behind it."""
-    weights = published(release)
-    assert {name: tuple(value.shape) for name, value in weights.items()} == SHAPES
+    nets = published(release)
     judge = load_published(folder)
     judge.net.double()
     lengths = [196, 41, 64, 7, 195]
@@ -117,7 +162,7 @@ def test_latents_are_those_of_the_published_definition(release: Path, folder: Pa
         batch[row, : len(motion)] = torch.from_numpy((motion - mean) / std)
     found = judge.embed_motion(batch, torch.tensor(lengths))
     for row, motion in enumerate(motions):
-        expected = slow_motion(weights, torch.from_numpy((motion - mean) / std))
+        expected = slow_motion(nets, torch.from_numpy((motion - mean) / std))
         torch.testing.assert_close(found[row], expected, rtol=1e-5, atol=1e-5)
     assert found.std() > 0.1, "latents that say something"
     # As an evaluation embeds them, float32 in and cut to 196 frames.
@@ -130,7 +175,7 @@ def test_latents_are_those_of_the_published_definition(release: Path, folder: Pa
 
 def test_captions_are_read_as_published(release: Path, folder: Path) -> None:
     """Marks at both ends, 20 words, lists before tags, unknown words and tags."""
-    judge, weights = load_published(folder), published(release)
+    judge, nets = load_published(folder), published(release)
     judge.net.double()
     captions = {
         "the person walks": ["the/DET", "person/NOUN", "walk/VERB"],
@@ -140,7 +185,7 @@ def test_captions_are_read_as_published(release: Path, folder: Path) -> None:
     vectors = torch.from_numpy(np.load(release / "glove/our_vab_data.npy")).float().double()
     rows = pickle.loads((release / "glove/our_vab_idx.pkl").read_bytes())
 
-    def word(name: str, kind: str) -> tuple[torch.Tensor, int]:
+    def word(name: str, kind: str) -> tuple[Tensor, int]:
         return vectors[rows[name]], CLASSES.index(kind)
 
     begin, end, the = word("sos", "OTHER"), word("eos", "OTHER"), word("the", "DET")
@@ -151,7 +196,7 @@ def test_captions_are_read_as_published(release: Path, folder: Path) -> None:
     ]
     found = judge.embed_captions(list(captions), list(captions.values()))
     for row, words in enumerate(expected):
-        torch.testing.assert_close(found[row], slow_text(weights, words), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(found[row], slow_text(nets, words), rtol=1e-5, atol=1e-5)
 
 
 def test_a_caption_without_tags_is_refused(folder: Path) -> None:

@@ -7,14 +7,13 @@ models of dances. The processes of the two ranks run this file as a script.
 from __future__ import annotations
 
 import os
-import sys
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from same_stage import assert_kills_change_nothing, assert_ranks_equal_one
-from two_ranks import run_two_ranks
+from two_ranks import pair_of, work
 from ude_training import NAMES, train
 
 
@@ -32,20 +31,12 @@ BOUND = 1e-5
 
 
 def worker(out: Path) -> None:
-    torch.set_num_threads(1)
     for name, dtype in PAIRS.items():
         module = train(name, out / name, dtype=dtype, devices=2)
         torch.save(module.state_dict(), out / f"{name}-{os.environ['RANK']}.pt")
-    torch.distributed.barrier()
-    os._exit(0)  # without destructors, as the program does
 
 
-@pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folders of the trainings on two ranks."""
-    folder = tmp_path_factory.mktemp("pair")
-    run_two_ranks(__file__, folder)
-    return folder
+pair = pair_of(__file__)
 
 
 @pytest.mark.slow
@@ -57,4 +48,4 @@ def test_two_ranks_equal_one(name: str, pair: Path, tmp_path: Path) -> None:
 
 
 if __name__ == "__main__":
-    worker(Path(sys.argv[1]))
+    work(worker)

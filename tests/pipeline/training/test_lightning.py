@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from plain_training import take_steps
 from rank_cases import CASES
 from tiny_adversaries import Duel, Vectors
 from torch.utils.data import DataLoader, Dataset
-from two_ranks import run_two_ranks
+from two_ranks import pair_of, work
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import StageModule
@@ -131,22 +130,22 @@ def test_resumes_from_its_checkpoint_and_monitors(name: str, tmp_path: Path) -> 
 
 
 def worker(folder: Path) -> None:
-    torch.set_num_threads(1)
     for name in ude_training.NAMES:
         own = ude_training.train(name, folder / name, devices=2, dropout=0.1, steps=STEPS, validate_every=0)
         module = ude_training.module_of(name, STEPS, dropout=0.1)
         trainer(folder, devices=2, strategy="ddp", use_distributed_sampler=True).fit(module, stage_data(name))
         assert_equal(own, module)
     (folder / f"done{os.environ['RANK']}").touch()
-    os._exit(0)  # without destructors: those of DDP and gloo can wait for each other
+
+
+pair = pair_of(__file__)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(240)
-def test_two_processes_equal_the_own_loop_on_two(tmp_path: Path) -> None:
-    run_two_ranks(__file__, tmp_path)
-    assert {path.name for path in tmp_path.glob("done*")} == {"done0", "done1"}
+def test_two_processes_equal_the_own_loop_on_two(pair: Path) -> None:
+    assert {path.name for path in pair.glob("done*")} == {"done0", "done1"}
 
 
 if __name__ == "__main__":
-    worker(Path(sys.argv[1]))
+    work(worker)
