@@ -36,15 +36,18 @@ class Compiled:
 
         if self.compiled is None:
             self.compiled = self._compile()
+        failures = RuntimeError if self.graphs else exc.TorchDynamoException  # graphs fail as they run, too
         if self.graphs:
             torch.compiler.cudagraph_mark_step_begin()  # type: ignore[no-untyped-call]
         try:
             return self.compiled(*arguments)
-        except (exc.TorchDynamoException, exc.FailOnRecompileLimitHit) as error:
+        except (failures, exc.FailOnRecompileLimitHit) as error:
             reason = getattr(error, "inner_exception", error)
             first = next(iter(str(reason).strip().splitlines()), type(reason).__name__)
             warnings.warn(f"torch.compile failed, training goes on without: {first}", stacklevel=2)
             self.compiled = self.losses
+            if self.graphs:  # which may have drawn
+                torch.manual_seed(torch.initial_seed())
             return self.losses(*arguments)
 
     def _compile(self) -> Callable[..., dict[str, Tensor]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
+import signal
 import subprocess
 import sysconfig
 import time
@@ -181,11 +182,12 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.fixture(scope="session")
-def start() -> Callable[..., subprocess.Popen[str]]:
+def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """`start("run", recipe) -> Popen`: the installed program in a process group of its own."""
+    started: list[subprocess.Popen[str]] = []
 
     def go(*arguments: object, program: tuple[object, ...] = (PROGRAM,)) -> subprocess.Popen[str]:
-        return subprocess.Popen(
+        process = subprocess.Popen(
             [*map(str, program), *map(str, arguments)],
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -193,8 +195,13 @@ def start() -> Callable[..., subprocess.Popen[str]]:
             env={**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "140"},
             start_new_session=True,
         )
+        started.append(process)
+        return process
 
-    return go
+    yield go
+    for process in started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
 
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

@@ -83,3 +83,21 @@ def test_no_step_of_players_is_compiled_anew(
     with warnings.catch_warnings():
         warnings.filterwarnings("error", "torch.compile failed")
         assert train(name, tmp_path, compile=True, validate_every=0).step == 16
+
+
+def test_graphs_that_fail_as_they_run_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With one warning, and the same draws."""
+
+    def failing(*_: Any, **__: Any) -> Any:
+        torch.rand(3)
+        raise RuntimeError("CUDA error: nothing to replay")
+
+    module, batches = drawing_mdm()
+    plain, found = module.double().losses, []
+    monkeypatch.setattr(torch, "compile", lambda *_, **__: failing)
+    module.compile_losses(graphs=True)
+    with pytest.warns(UserWarning, match="nothing to replay") as said:
+        for losses in (plain, module.losses, module.losses):
+            torch.manual_seed(5)
+            found.append(losses(batches(0))["loss"].item())
+    assert found[0] == found[1] == found[2] and len(said) == 1

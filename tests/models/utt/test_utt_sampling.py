@@ -87,15 +87,26 @@ def test_window_slides_by_halves_when_full() -> None:
     assert window_start(10_000, 160, 1) + 160 > 10_000
 
 
-@pytest.mark.parametrize("groups", [3, 11])
-@pytest.mark.parametrize("settings", [{}, {"temperature": 0}, {"top_k": 3, "top_p": 0.8, "temperature": 1.3}])
-def test_cached_equals_uncached_over_several_windows(utt: Utt, groups: int, settings: dict[str, Any]) -> None:
-    condition, seeds = conditions(2, [5, 2]), sample_seeds(7, 2)
-    out = generate(utt, condition, groups=torch.full((2,), groups), seed=7, how=Drawing(**settings))
+@pytest.mark.parametrize(
+    ("groups", "scale", "settings"),
+    [
+        *((n, 1.0, how) for n in (3, 11) for how in ({}, {"temperature": 0})),
+        (11, 1.0, {"top_k": 3, "top_p": 0.8, "temperature": 1.3}),
+        (6, 3.0, {"temperature": 0.8}),
+    ],
+)
+def test_cached_equals_uncached_over_several_windows(
+    utt: Utt, groups: int, scale: float, settings: dict[str, Any]
+) -> None:
+    condition, seeds, count = conditions(2, [5, 2]), sample_seeds(7, 2), torch.full((2,), groups)
+    given: dict[str, Any] = {"cfg_scale": scale, "how": Drawing(**settings)}
+    out = generate(utt, condition, null=null(2), groups=count, seed=7, **given)
     sequence = interleave(out.codes, PATTERN, groups=out.groups)
+    guide = None if scale == 1 else null(1)
     for index in range(2):
         mine = condition.rows(slice(index, index + 1))
-        assert sequence.tokens[index].tolist() == slow(utt, mine, seeds[index], groups, start=[], **settings)
+        wanted = slow(utt, mine, seeds[index], groups, start=[], guide=guide, scale=scale, **settings)
+        assert sequence.tokens[index].tolist() == wanted
 
 
 def test_continues_given_tokens_of_different_lengths(utt: Utt) -> None:
@@ -159,15 +170,6 @@ def test_alone_equals_in_a_batch(utt: Utt, scale: float | list[float]) -> None:
     settings |= {"null": null(6), "start": start, "cfg_scale": scale}
     other = generate(utt, condition, seed=4, **settings)
     assert any(row(other, i) != row(together, i) for i in range(6))
-
-
-def test_guidance_equals_the_slow_mix(utt: Utt) -> None:
-    condition, seeds = conditions(1), sample_seeds(2, 1)
-    out = generate(
-        utt, condition, null=null(1), cfg_scale=3.0, groups=torch.tensor([6]), seed=2, how=Drawing(0.8)
-    )
-    expected = slow(utt, condition, seeds[0], 6, start=[], guide=null(1), scale=3.0, temperature=0.8)
-    assert interleave(out.codes, PATTERN).tokens[0].tolist() == expected
 
 
 def test_z_makes_samples_differ_and_is_the_seeds_alone(utt: Utt) -> None:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,23 +48,6 @@ def single(small_run: Any, recipe: Path, tmp_path_factory: pytest.TempPathFactor
     return run_recipe(recipe, run, select=Selection(until="gpt"), replace=True, console=Console(quiet=True))
 
 
-@pytest.fixture
-def running(start: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
-    """Like `start`, and nothing outlives the test."""
-    processes = []
-
-    def go(*arguments: object, **options: Any) -> Any:
-        processes.append(start(*arguments, **options))
-        return processes[-1]
-
-    yield go
-    for process in processes:
-        try:
-            os.killpg(process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            continue
-
-
 def finish(process: Any, code: int = 0, seconds: float = 240) -> str:
     """The output of a process that must end by itself."""
     output: str = process.communicate(timeout=seconds)[0]
@@ -98,7 +79,7 @@ def assert_same_training(one: Path, two: Path, stage: str) -> None:
 
 
 def test_torchrun_equals_one_process(
-    single: Path, recipe: Path, running: Callable[..., Any], tmp_path: Path
+    single: Path, recipe: Path, start: Callable[..., Any], tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
     shutil.copytree(single, run)
@@ -106,19 +87,19 @@ def test_torchrun_equals_one_process(
     program = Path(sys.executable).with_name("motionloom")
     # The GPT alone, so that both have exactly the same tokens.
     words = ("--no-python", program, "run", recipe, "--out", run, "--from", "gpt", "--until", "gpt")
-    output = finish(running(*words, program=torchrun))
+    output = finish(start(*words, program=torchrun))
     assert output.count("[9/15] gpt") == 1
     assert files(run) == files(single)
     assert_same_training(single, run, "gpt")
 
 
 def test_an_error_of_the_lead_ends_those_who_wait(
-    single: Path, recipe: Path, running: Callable[..., Any], tmp_path: Path
+    single: Path, recipe: Path, start: Callable[..., Any], tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
     shutil.copytree(single, run)
     (run / "stages/.tokens.removed").write_text("in the way")  # the lead cannot clear the stage's folder
     words = ("run", recipe, "--out", run, "--from", "tokens", "--until", "gpt", *PAIR)
-    output = finish(running(*words), code=2)
+    output = finish(start(*words), code=2)
     assert "where a folder is" in output
     assert "process 1: another process" in output

@@ -48,7 +48,7 @@ def tried(tmp_path_factory: pytest.TempPathFactory) -> Tried:
 def test_two_ranks_killed_in_a_write_and_elsewhere_train_the_same(tried: Tried) -> None:
     """Samples and losses of every step of both ranks, and the files of the stage."""
     seen = tried.seen
-    assert (seen.kills, seen.in_a_write, seen.steps) == (3, 1, STEPS)
+    assert (seen.kills, seen.steps) == (3, STEPS) and seen.in_a_write > 0
     assert seen.exact, seen
 
 

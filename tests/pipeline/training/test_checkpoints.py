@@ -130,10 +130,6 @@ def test_a_full_disk_leaves_the_previous_checkpoints(
     assert next(readable(folder))[0] == new
 
 
-def newest(folder: Path) -> Path:
-    return next(readable(folder))[0]
-
-
 def state() -> dict[str, Any]:
     """What trainings have: views, empty tensors, state of optimizers by number."""
     table = torch.arange(20.0).reshape(4, 5)
@@ -158,7 +154,7 @@ def test_what_is_trained_meanwhile_is_not_in_the_file(
     writer.write({"global_step": 14}, tmp_path / name_of(14))
     assert (tmp_path / name_of(7)).exists()
     writer.finish()
-    assert not writer.busy and newest(tmp_path) == tmp_path / name_of(14)
+    assert not writer.busy and next(readable(tmp_path))[0] == tmp_path / name_of(14)
     assert_equal(dict(read_checkpoint(tmp_path / name_of(7))), state())
 
 

@@ -17,7 +17,7 @@ from lightning.pytorch.plugins import MixedPrecision
 from plain_training import take_steps
 from rank_cases import CASES
 from tiny_adversaries import Duel, Vectors
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 from two_ranks import pair_of, work
 
 from motionloom.datasets.schema import UserError
@@ -28,19 +28,6 @@ from motionloom.pipeline.training.trained_stage import Batches
 
 STEPS = 6
 Opened = tuple[StageModule, Callable[[int], dict[str, Any]]]
-
-
-class Numbered(Dataset[Any]):
-    """Batches by number, of one process."""
-
-    def __init__(self, batch: Callable[[int], dict[str, Any]], count: int) -> None:
-        self.batch, self.count = batch, count
-
-    def __len__(self) -> int:
-        return self.count
-
-    def __getitem__(self, k: int) -> dict[str, Any]:
-        return self.batch(k)
 
 
 def opened(name: str) -> Opened:
@@ -80,7 +67,7 @@ def test_a_trainer_equals_the_own_loop(name: str, parts: int, tmp_path: Path) ->
     (own, batch), (module, same) = opened(name), opened(name)
     own.accumulate = module.accumulate = parts
     take_steps(own, [batch(k) for k in range(STEPS * parts)])
-    data = DataLoader(Numbered(same, STEPS * parts), batch_size=None)
+    data = DataLoader([same(k) for k in range(STEPS * parts)], batch_size=None)
     settings = {"accumulate_grad_batches": parts} if module.automatic_optimization else {}
     trainer(tmp_path, **settings).fit(module, data)
     assert own.step == module.step == STEPS
@@ -91,7 +78,7 @@ def test_a_trainer_equals_the_own_loop(name: str, parts: int, tmp_path: Path) ->
 def test_in_half_precision(name: str, tmp_path: Path) -> None:
     (own, batch), (module, same) = opened(name), opened(name)
     take_steps(own, [batch(k) for k in range(STEPS)], "bf16-mixed")
-    data = DataLoader(Numbered(same, STEPS), batch_size=None)
+    data = DataLoader([same(k) for k in range(STEPS)], batch_size=None)
     trainer(tmp_path, precision="bf16-mixed").fit(module, data)
     assert_equal(own, module)
     scaled = MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu"))
