@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tarfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,15 @@ def write_clip(path: Path, seed: int, frames: int = 90, fps: float = 30.0, *, z_
         rotations[:, 0], root = turn @ rotations[:, 0], root @ turn.T
     write_bvh(path, SKELETON, rotations, root, fps)
     return path
+
+
+def write_source(folder: Path, names: Iterable[str]) -> Path:
+    """Clips of 36 frames, some in folders, and `map.json`, which reads them."""
+    for seed, name in enumerate(names):
+        (folder / name).parent.mkdir(exist_ok=True)
+        write_clip(folder / f"{name}.bvh", seed, frames=36)
+    write_map(folder / "map.json")
+    return folder
 
 
 def write_map(path: Path) -> Path:

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map, summary
-from motionloom.datasets.convert.bvh.read import read_header, read_motion
+from motionloom.datasets.convert.bvh.read import FoundFile, list_files, read_file, read_motion, scan_files
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.captions.humanml_index import (
     ORIGINALS,
@@ -33,7 +33,6 @@ from motionloom.datasets.convert.common.facts import Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.scan import FoundFile, list_files, read_file, scan_files
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -295,7 +294,7 @@ def plan_bvh(
 ) -> tuple[ConversionPlan[BvhClip], JointMaps]:
     """Find every clip and decide what becomes of it, without converting anything; and the joint maps."""
     folder, names = config.files()
-    found = scan_files(folder, names, read_header, workers=settings.workers, progress=settings.progress)
+    found = scan_files(folder, names, workers=settings.workers, progress=settings.progress)
     if config.humanml_index is None:
         draft = _decide(config, folder, found, stated)
     else:

@@ -1,14 +1,101 @@
-"""Motion files of the `bvh` source: BVH, and AMC behind its ASF (`common/scan.py` joins the two)."""
+"""Motion files of a source: BVH, and AMC behind the ASF of its subject; and what their headers say."""
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
-from motionloom.datasets.motion.bvh.asf import FPS, JOINED, count_frames, read_amc, skeleton_of
+from motionloom.datasets.convert.common.files import read_in_threads, walk_files
+from motionloom.datasets.motion.bvh.asf import FPS, JOINED, frame_marks, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, read_plain
+from motionloom.datasets.shards.left_out import drop
+
+SUFFIX = (".bvh", ".amc")
+MAX_FILE_BYTES = 1 << 30
+"""A motion file beyond this is refused unread: a few hours of text, or a bomb."""
+MAX_SKELETON_BYTES = 1 << 20
+
+
+def list_files(source: Path) -> tuple[Path, list[str]]:
+    """Return a folder and the motion files in it by name: those under `source`, or `source` itself."""
+    if source.is_file():
+        root, names = source.parent, [source.name]
+    elif source.is_dir():
+        root = source
+        names = walk_files(source)
+    else:
+        raise UserError(f"{source}: no such file or folder")
+    names = [name for name in names if name.lower().endswith(SUFFIX)]
+    if not names:
+        raise UserError(f"{source}: no {' or '.join(SUFFIX)} file in it (unpack archives first)")
+    return root, names
+
+
+def read_file(path: Path, label: str) -> bytes:
+    """Return the content of a motion file; an .amc's stands behind that of its .asf skeleton and `JOINED`.
+
+    `UserError` when it cannot be read; `label` names it.
+    """
+    try:
+        data = read_plain(path, MAX_FILE_BYTES, label)
+        if path.suffix.lower() != ".amc":
+            return data
+        skeletons = _skeletons(path)
+        found = next((one for one in skeletons if one.is_file()), None)
+        if found is None:
+            names = " or ".join(one.name for one in skeletons[-2:])
+            raise UserError(
+                f"{label}: no .asf skeleton beside it: an .amc needs its subject's, such as {names}"
+            )
+        return read_plain(found, MAX_SKELETON_BYTES, label) + JOINED + data
+    except OSError as error:
+        raise UserError(f"{label}: cannot read ({error.strerror})") from None
+
+
+def _skeletons(path: Path) -> list[Path]:
+    """Where the skeleton of `01_02.amc` may be: `01_02.asf`, or its subject's `01.asf`."""
+    words = path.stem.split("_")
+    return [path.with_name("_".join(words[:count]) + ".asf") for count in range(len(words), 0, -1)]
+
+
+@dataclass(frozen=True)
+class FoundFile:
+    """One motion file as the scan finds it."""
+
+    path: str
+    """Inside the source; names it in reports."""
+    sha256: str = ""
+    """Empty when it cannot be opened."""
+    frames: int = 0
+    fps: float = 0.0
+    skeleton: str = ""
+    """The same in files with one hierarchy; empty when it cannot be read."""
+    joints: tuple[str, ...] = ()
+    """Names of the skeleton's joints."""
+    problem: str = ""
+    """Reason that the file cannot be read; empty when it can."""
+
+
+def scan_files(root: Path, names: Sequence[str], *, workers: int, progress: bool) -> list[FoundFile]:
+    """Read the header of every motion file, in the order of `names`."""
+    return list(read_in_threads(partial(_scan, root), names, workers=workers, progress=progress))
+
+
+def _scan(root: Path, name: str) -> FoundFile:
+    digest = ""
+    try:
+        data = read_file(root / name, name)
+        digest = hashlib.sha256(data).hexdigest()
+        return FoundFile(name, digest, *_read_header(data, name))
+    except Exception as error:  # whatever bad bytes or names make of the libraries below
+        return FoundFile(name, digest, problem=drop(name, error).reason)
 
 
 def read_motion(data: bytes, label: str) -> BvhMotion:
@@ -17,12 +104,12 @@ def read_motion(data: bytes, label: str) -> BvhMotion:
     return read_amc(asf, amc, name=label) if joined else read_bvh(data, name=label)
 
 
-def read_header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
+def _read_header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
     """Frames, frame rate, skeleton and its joints; `UserError` when the file cannot be read."""
     asf, joined, amc = data.partition(JOINED)
     if joined:
         found, parents = skeleton_of(asf, label)
-        return count_frames(amc, label), FPS, skeleton_key(found, parents), found
+        return len(frame_marks(amc, label)), FPS, skeleton_key(found, parents), found
     text, where = load_text(data, label)
     section = find_motion(text, where)
     require_all_frames(text, section, where)

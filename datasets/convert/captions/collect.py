@@ -22,11 +22,6 @@ from motionloom.datasets.schema import UserError
 TABLES = (".csv", ".tsv", ".tab", ".jsonl", ".json")
 
 
-def read_captions(*places: Path) -> dict[str, CaptionRow]:
-    """The rows of files and folders by clip id; `UserError` names file and line of anything malformed."""
-    return Captions.read(places).rows
-
-
 @dataclass(frozen=True)
 class Captions:
     """Captions of several files and folders; a clip that several name has the captions of all."""
@@ -40,6 +35,7 @@ class Captions:
 
     @classmethod
     def read(cls, places: Iterable[Path]) -> Captions:
+        """Read files and folders; `UserError` names file and line of anything malformed."""
         captions = cls()
         for place in places:
             path, columns = place_of(place)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Literal
 
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.common.scan import list_files
+from motionloom.datasets.convert.bvh.read import list_files
 from motionloom.datasets.convert.common.tables import captions_of, read_csv, read_json_lines
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row
 from motionloom.datasets.schema import Caption, UserError

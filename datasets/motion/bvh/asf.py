@@ -81,13 +81,8 @@ def read_amc(asf: bytes, amc: bytes, *, name: str) -> BvhMotion:
     )
 
 
-def count_frames(amc: bytes, name: str) -> int:
-    """Frames of an AMC text, without reading their numbers."""
-    return len(_marks(amc, name))
-
-
-def _marks(amc: bytes, where: str) -> list[tuple[int, int]]:
-    """Return the places of the lines that number the frames."""
+def frame_marks(amc: bytes, where: str) -> list[tuple[int, int]]:
+    """Return the places of the lines that number the frames of an AMC text."""
     marks = [mark.span() for mark in _FRAME.finditer(amc)]
     if not marks:
         raise UserError(f"{where}: no frames; an AMC file numbers each on a line of its own")
@@ -179,7 +174,7 @@ def _bones(sections: dict[str, list[list[str]]], unit: float, degree: float) -> 
 
 def _frames(text: bytes, bones: dict[str, _Bone], where: str) -> tuple[dict[str, Floats], int]:
     """Numbers of every bone that the file moves [T, degrees of freedom], and T."""
-    marks = _marks(text, where)
+    marks = frame_marks(text, where)
     frames = [text[a:b].split() for (_, a), (b, _) in zip(marks, [*marks[1:], (len(text), 0)], strict=True)]
     moved = [word.decode("utf-8", "replace") for word in frames[0] if word[:1].isalpha()]
     stray = [bone for bone in moved if bone not in bones]

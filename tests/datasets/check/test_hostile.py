@@ -24,7 +24,7 @@ from shard_samples import write
 from motionloom.datasets.audio.sound import MAX_RATE, read_sound
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.amass.smpl_npz import read_motion
-from motionloom.datasets.convert.captions.collect import read_captions
+from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
@@ -85,8 +85,8 @@ HOSTILE: dict[str, Callable[[Path], object]] = {
     "a manifest that is a pipe": lambda f: load_manifest(pipe(f / "manifest.json").parent),
     "a manifest of a terabyte": lambda f: load_manifest(huge(f / "manifest.json").parent),
     "a shard's index that is a pipe": lambda f: Manifest.load_json(pipe(f / "x.index.json")),
-    "captions that are a pipe": lambda f: read_captions(pipe(f / "c.csv")),
-    "captions that are a device": lambda f: read_captions(Path("/dev/zero")),
+    "captions that are a pipe": lambda f: Captions.read([pipe(f / "c.csv")]).rows,
+    "captions that are a device": lambda f: Captions.read([Path("/dev/zero")]).rows,
     "a joint map that is a pipe": lambda f: JointMap.load(pipe(f / "m.json")),
     "a shard of too many clips": lambda f: scan_tar(tar_of(f / "x.tar", MOST_CLIPS + 1)),
     "a shard of more clips than its manifest has": lambda f: scan_tar(tar_of(f / "x.tar", 9), most=8),

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bvh_clips import write_clip, write_map
+from bvh_clips import write_source
 from rich.console import Console
 
 from motionloom.datasets.convert.bvh.plan import BvhConfig
-from motionloom.datasets.convert.captions.collect import read_captions
+from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.convert.captions.options import list_clips
 from motionloom.datasets.convert.common.splits import hash_split, read_split_files, subject_of
 from motionloom.datasets.convert.registry import prepare
@@ -34,12 +34,7 @@ Rows = dict[str, list[str]]
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three clips, one of them in a folder, and their joint map."""
-    folder = tmp_path_factory.mktemp("source")
-    (folder / "sub").mkdir()
-    for seed, name in enumerate(TEXTS):
-        write_clip(folder / f"{name}.bvh", seed, frames=36)
-    write_map(folder / "map.json")
-    return folder
+    return write_source(tmp_path_factory.mktemp("source"), TEXTS)
 
 
 def lines(path: Path, rows: Rows, key: str) -> Path:
@@ -123,7 +118,7 @@ def test_every_form_gives_the_same_data_set(
     captions = FORMS[form](tmp_path / "captions", TEXTS)
     assert "3 of 3 clips" in convert(source, tmp_path / "out", captions)
     if form == "HumanML3D":  # brings tokens, so the shards are not the same bytes
-        rows = read_captions(captions)
+        rows = Captions.read([captions]).rows
         assert {name: [text.text for text in row.texts] for name, row in rows.items()} == TEXTS
         assert [text.tokens for row in rows.values() for text in row.texts] == [["a/DET"]] * 4
         assert all((text.start, text.end) == (0.0, None) for row in rows.values() for text in row.texts)
@@ -170,7 +165,7 @@ def test_a_broken_line_is_named(name: str, content: str | bytes, place: str, tmp
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(UserError) as caught:
-        read_captions(path if path.parent == tmp_path else path.parent)
+        Captions.read([path if path.parent == tmp_path else path.parent])
     assert str(caught.value).startswith(f"{path}{place}")
 
 
@@ -226,7 +221,7 @@ def test_captions_with_times_other_keys_and_several_columns(tmp_path: Path) -> N
         "walks;7;C:\\mocap\\a.bvh;120;goes;Valid;0.5;2\n"
         ";8;b.bvh;;;;;\n"
     )
-    rows = read_captions(path)
+    rows = Captions.read([path]).rows
     a = rows["a"]
     assert [(c.text, c.start, c.end, c.source) for c in a.texts] == [
         ("walks", 0.5, 2.0, "captions"),
@@ -238,15 +233,15 @@ def test_captions_with_times_other_keys_and_several_columns(tmp_path: Path) -> N
     path.write_text(
         '{"id": 7, "text": "x", "start": 1}\n{"id": 7, "text": "y", "take": 3}\n{"id": 7, "text": "y"}'
     )
-    assert [(c.text, c.start) for c in read_captions(path)["7"].texts] == [("x", 1.0), ("y", 0.0)]
+    assert [(c.text, c.start) for c in Captions.read([path]).rows["7"].texts] == [("x", 1.0), ("y", 0.0)]
     path.write_text('{"id": "a", "text": "x", "split": "dev"}\n{"id": "a", "text": "y", "split": "test"}')
     with pytest.raises(UserError, match=r":2: .*'a'.*'test'.*'val'.*:1"):
-        read_captions(path)
+        Captions.read([path])
 
 
 def test_names_of_clips_find_their_files(tmp_path: Path) -> None:
     def found(names: list[str], paths: list[str]) -> dict[str, str]:
-        rows = read_captions(lines(tmp_path / "c", {name: ["x"] for name in names}, "captions"))
+        rows = Captions.read([lines(tmp_path / "c", {name: ["x"] for name in names}, "captions")]).rows
         listing = list_clips(paths, rows.values(), None, [])
         return {path: row.id for path, row in listing.rows.items()}
 

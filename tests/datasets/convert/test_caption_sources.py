@@ -9,13 +9,13 @@ import shutil
 from pathlib import Path
 
 import pytest
-from bvh_clips import write_clip, write_map
+from bvh_clips import write_source
 from rich.console import Console
 from typer.testing import CliRunner
 
 from motionloom.datasets.convert.bvh.plan import BvhConfig
-from motionloom.datasets.convert.captions.collect import read_captions
-from motionloom.datasets.convert.common.scan import list_files
+from motionloom.datasets.convert.bvh.read import list_files
+from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.convert.common.splits import hash_split, subject_of
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.schema import UserError
@@ -28,12 +28,7 @@ NAMES = ("walk_a", "jump", "sub/turn")
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three clips, one of them in a folder, and their joint map."""
-    folder = tmp_path_factory.mktemp("source")
-    (folder / "sub").mkdir()
-    for seed, name in enumerate(NAMES):
-        write_clip(folder / f"{name}.bvh", seed, frames=36)
-    write_map(folder / "map.json")
-    return folder
+    return write_source(tmp_path_factory.mktemp("source"), NAMES)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -105,7 +100,7 @@ def test_captions_of_several_files_count_together(source: Path, tmp_path: Path) 
         ("text=X,file=Datei", "Datei"),
     ):
         with pytest.raises(UserError, match=told):
-            read_captions(Path(f"{german}:{wrong}"))
+            Captions.read([Path(f"{german}:{wrong}")])
 
 
 def test_files_of_captions_that_are_not_used_are_said(source: Path, tmp_path: Path) -> None:

@@ -179,5 +179,3 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
         prepare(config(copy, source=tmp_path / "nothing"))
     with pytest.raises(UserError, match="no such file"):
         prepare(config(copy, source=tmp_path / "none"))
-    with pytest.raises(UserError, match="layout smpl75"):
-        convert(config(copy, layout="smpl75"), tmp_path / "raw")

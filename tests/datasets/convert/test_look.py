@@ -114,12 +114,6 @@ def test_left_for_right_is_seen_by_the_feet(source: Path, tmp_path: Path) -> Non
     assert [line.split(":")[0] for line in said(seen)] == ["in the joint map"]
 
 
-def test_a_row_without_its_joint_is_refused(source: Path, tmp_path: Path) -> None:
-    wrong = with_map(source, tmp_path, lambda rows: rows[0].__setitem__(2, "Pelvis"))
-    with pytest.raises(UserError, match=r"one/.*'Pelvis'"):
-        look(source, joint_map=wrong)
-
-
 def test_a_floating_source_is_refused_and_a_floating_set_fails_the_check(
     source: Path, tmp_path: Path
 ) -> None:
