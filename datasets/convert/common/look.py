@@ -124,6 +124,9 @@ def head_axis(clips: Iterable[SourceJoints]) -> str:
 MOST_CLIPS = 96
 """Clips that are looked at in all; of sources with more subsets, fewer a subset and then fewer subsets."""
 
+_SPARE = 8
+"""Clips of a subset that may be damaged before the look gives it up [ours]."""
+
 _FRAMES_A_SECOND = 10.0
 
 T = TypeVar("T")
@@ -211,11 +214,13 @@ def look_at(
     label: Callable[[T], str],
 ) -> Look:
     """Read and measure `config.look` clips of every subset, chosen by a hash of their names."""
-    chosen, subsets = _choose(items, subset_of, config.look, label)
+    chosen, each, subsets = _choose(items, subset_of, config.look, label)
     clips: dict[str, list[SourceJoints]] = {name: [] for name, _ in chosen}
     rates: dict[str, set[float]] = defaultdict(set)
     failed: list[tuple[str, Dropped]] = []
     for name, item in chosen:
+        if len(clips[name]) == each:
+            continue
         try:
             seen = see(item)
             if not np.isfinite(seen.joints).all():
@@ -252,8 +257,10 @@ def look_at(
 
 def _choose(
     items: Sequence[T], subset_of: Callable[[T], str], count: int, label: Callable[[T], str]
-) -> tuple[list[tuple[str, T]], int]:
-    """(subset, item) of the clips to look at, and how many subsets there are."""
+) -> tuple[list[tuple[str, T]], int, int]:
+    """(subset, item) of the clips to look at and of others in place of damaged ones, how many are wanted of
+    each subset, and how many subsets there are.
+    """
     by_subset: dict[str, list[T]] = defaultdict(list)
     for item in items:
         by_subset[subset_of(item)].append(item)
@@ -267,8 +274,8 @@ def _choose(
         members = by_subset[name]
         if len(members) > each:
             members = sorted(members, key=lambda item: sha256_of_json(label(item)))
-        chosen += [(name, item) for item in members[:each]]
-    return chosen, len(by_subset)
+        chosen += [(name, item) for item in members[: each + _SPARE]]
+    return chosen, each, len(by_subset)
 
 
 def _subset(name: str, clips: list[SourceJoints], unreadable: int, rates: set[float]) -> SubsetLook:

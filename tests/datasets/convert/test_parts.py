@@ -140,7 +140,7 @@ def test_one_damaged_or_misnamed_file_leaves_the_others(
     sentence says what is wrong.
     """
     converter, whole = converter_named(kind), source_of(kind, tmp_path / "whole", shared, source)
-    seed = random.randrange(2**32)
+    seed = 7 if tries < 10 else random.randrange(2**32)
     rng, before = random.Random(seed), -1
     for number in range(tries + 1):
         case, folder = f"{kind}: damage {number} of seed {seed}", tmp_path / "folder"
