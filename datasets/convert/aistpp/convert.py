@@ -49,7 +49,8 @@ _SEQUENCE = re.compile(
     r"g(?P<genre>[A-Z]{2})_s(?P<situation>[A-Z]{2})_c(?:All|\d\d)_d(?P<dancer>\d+)_(?P<music>m[A-Z]{2}\d+)"
     r"_ch(?P<choreography>\d+)"
 )
-"""The situation is BM, basic, or FM, advanced."""
+"""Genre `BR` and music `mBR0` of `gBR_sBM_cAll_d04_mBR0_ch01`; the situation is BM, basic, or FM, advanced.
+"""
 
 
 class AistppConfig(BodyConfig):
@@ -113,11 +114,11 @@ class Aistpp(BodyRelease[AistppConfig]):
         music = self._music()
         here = sorted(path.stem for path in folder.glob("*.pkl") if path.name[0] != ".")
         for name in here:
-            facts: dict[str, str] = {}
-            with draft.reading(f"{MOTIONS}/{name}.pkl"):
-                facts = _facts(name)
-            if not facts:
+            match, file = _SEQUENCE.fullmatch(name), f"{MOTIONS}/{name}.pkl"
+            if match is None:
+                draft.fail(file, UserError("not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01"))
                 continue
+            facts = match.groupdict()
             problem = "on the ignore list" if name in self.ignored else ""
             if self.config.has_band and facts["music"] not in TEMPI:
                 problem = f"no tempo is known of music '{facts['music']}'; AIST's pieces are mBR0 to mJB5"
@@ -125,7 +126,7 @@ class Aistpp(BodyRelease[AistppConfig]):
             caption = Caption(text=f"a dancer performs {genre}", source="genre")
             # By music: pieces are shared by many dances, and one in two splits would leak.
             yield Entry(
-                name, f"{MOTIONS}/{name}.pkl", (caption,) if self.config.caption_genre else (),
+                name, file, (caption,) if self.config.caption_genre else (),
                 group=facts["music"], facts=dict(facts),
                 sound=music.get(name) or music.get(facts["music"]),
                 problem=problem,
@@ -199,11 +200,3 @@ class Aistpp(BodyRelease[AistppConfig]):
         label = clip.entry.file
         poses, trans = read_aist_motion(self.path_of(label), label)
         return Figure(rotations=poses.reshape(-1, SMPL_JOINTS, 3).astype(np.float64), trans=trans)
-
-
-def _facts(sequence: str) -> dict[str, str]:
-    """Return the facts in a name: genre `BR` and music `mBR0` of `gBR_sBM_cAll_d04_mBR0_ch01`."""
-    match = _SEQUENCE.fullmatch(sequence)
-    if match is None:
-        raise UserError(f"'{sequence}' is not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01")
-    return match.groupdict()

@@ -93,11 +93,6 @@ class MotionXConfig(ReleaseConfig):
     """Your SMPL-X or SMPL-H model (.npz), for joints with each clip's own shape; else a neutral skeleton."""
     uncaptioned: Literal["drop", "keep"] = "drop"
 
-    @property
-    def skeleton(self) -> SkeletonName:
-        """The skeleton that is posed: of smplx322 and layouts with fingers, the one with fingers."""
-        return "smpl22" if self.motion_layout().skeleton_name == "smpl22" else "smplx52"
-
 
 @dataclass(frozen=True)
 class MotionXEntry(Entry):
@@ -106,11 +101,6 @@ class MotionXEntry(Entry):
     face_texts: tuple[Caption, ...] = ()
     face: str | None = None
     """Face motion to write in."""
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Every file the sample is made of, but for texts."""
-        return (self.file, self.face) if self.face else (self.file,)
 
 
 _Found = tuple[MotionXEntry, ConversionPlan[ReleaseClip]]
@@ -130,8 +120,10 @@ class MotionX(Release[MotionXConfig]):
 
     def __init__(self, config: MotionXConfig) -> None:
         super().__init__(config)
+        # Of smplx322 and layouts with fingers, the skeleton with fingers is posed.
+        skeleton: SkeletonName = "smpl22" if self.layout.skeleton_name == "smpl22" else "smplx52"
         model = config.body_model  # a wrong one fails here
-        self.body = BodyModel.load(model, config.skeleton) if model else BodyModel.neutral(config.skeleton)
+        self.body = BodyModel.load(model, skeleton) if model else BodyModel.neutral(skeleton)
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         config = self.config
@@ -209,9 +201,10 @@ class MotionX(Release[MotionXConfig]):
 
     def depends_on(self, clip: ReleaseClip) -> list[object]:
         entry = _with_face(clip)
-        sizes = [self.path_of(file).stat().st_size for file in entry.files]
+        files = [entry.file, *([entry.face] if entry.face else [])]
+        sizes = [self.path_of(file).stat().st_size for file in files]
         texts = [caption.dump() for caption in (*entry.texts, *entry.face_texts)]
-        return [clip.id, entry.files, sizes, clip.licence, texts]
+        return [clip.id, files, sizes, clip.licence, texts]
 
     def options(self) -> dict[str, object]:
         return super().options() | {"body_model": self.body.statement}
