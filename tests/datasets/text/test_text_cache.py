@@ -79,25 +79,6 @@ def tiny_distilbert(folder: Path, seed: int = 0) -> Path:
     return folder / "model"
 
 
-def test_a_plain_bert_like_folder_works(tmp_path: Path) -> None:
-    from transformers import DistilBertModel
-
-    tiny_distilbert(tmp_path)
-    encoder = load_text_encoder(str(tmp_path / "model"))
-    out = encoder.encode(["a person walks", "jump"])
-    assert encoder.dim == 16 and out.tokens.shape == (2, 5, 16)
-    assert out.mask.sum(axis=1).tolist() == [5, 3]
-    model = DistilBertModel.from_pretrained(tmp_path / "model").eval()
-    with torch.no_grad():
-        want = model(torch.tensor([[2, 8, 3]])).last_hidden_state[0].numpy()  # [CLS] jump [SEP]
-    np.testing.assert_allclose(out.tokens[1, :3], want, atol=1e-5)
-    alone = encoder.encode(["jump"])
-    np.testing.assert_allclose(alone.tokens[0], want, atol=1e-5)
-    np.testing.assert_allclose(alone.sentence[0], out.sentence[1], atol=1e-5)
-    tiny_distilbert(tmp_path, seed=1)
-    assert load_text_encoder(str(tmp_path / "model")).name != encoder.name, "other weights, other name"
-
-
 def tiny_clip(folder: Path) -> Path:
     from transformers import CLIPTextConfig, CLIPTextModelWithProjection, CLIPTokenizerFast
 
@@ -220,13 +201,10 @@ def phrases(count: int) -> list[str]:
     return [" ".join(rng.choice(WORDS, 1 + i % 11)) + f" {i}" for i in range(count)]
 
 
-@pytest.mark.parametrize("kind", ["clip", pytest.param("distilbert", marks=pytest.mark.slow)])
-def test_same_bytes_for_any_number_of_workers(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_same_bytes_for_any_number_of_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(build_module, "PART", 16)
     monkeypatch.setattr(build_module, "PARTS_A_WORKER", 1)
-    model = str(tiny_distilbert(tmp_path) if kind == "distilbert" else tiny_clip(tmp_path))
+    model = str(tiny_clip(tmp_path))
     captions = phrases(100)
     caches = [build_text_cache(tmp_path / str(n), captions, model, workers=n, progress=False) for n in (1, 2)]
     assert digests(tmp_path / "1") == digests(tmp_path / "2")
