@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.inference.edits.clip_file import read_clip
@@ -26,12 +27,7 @@ from motionloom.pipeline.inference.edits.frames import edit_frames
 from motionloom.pipeline.inference.model import MotionModel, original_of
 
 GAP = (0.3, 0.7)
-PINS = {
-    "no pin": None,
-    "5 cm up": (0.0, 0.05, 0.0),
-    "30 cm up": (0.0, 0.3, 0.0),
-    "50 m away": (0.0, 0.0, 50.0),
-}
+PINS = {"no pin": None, "5 cm up": (0, 0.05, 0), "30 cm up": (0, 0.3, 0), "50 m away": (0, 0, 50)}
 ELBOW, WRIST = "left_elbow", "left_wrist"
 
 
@@ -74,8 +70,7 @@ def positions(path: Path) -> tuple[list[str], NDArray[np.float64]]:
                     place["XYZ".index(channel[0])] = value
                 else:
                     own = own @ turn(channel[0], value)
-            base = np.zeros(3) if parent < 0 else out[frame, parent]
-            carried = np.eye(3) if parent < 0 else world[parent]
+            base, carried = (np.zeros(3), np.eye(3)) if parent < 0 else (out[frame, parent], world[parent])
             out[frame, joint] = base + carried @ place
             world.append(carried @ own)
     return names, out / 100
@@ -86,7 +81,7 @@ def main() -> None:
     parser.add_argument("model", type=Path, help="an exported folder, or the name of a model of the package")
     parser.add_argument("clips", nargs="+", type=Path, help="clips to edit: .bvh, .npz, .glb")
     args = arguments(parser)
-    model, console = MotionModel(args.model, "cpu"), Console(width=140)
+    model = MotionModel(args.model, "cpu")
     table = Table("clip", "pin", "kept, cm (mean, most)", "pin off, cm", "forearm, cm", "it says")
     for clip in args.clips:
         with tempfile.TemporaryDirectory() as folder:
@@ -99,22 +94,26 @@ def main() -> None:
             wanted = own[middle, names.index(WRIST)] + (away or (0, 0, 0))
             if away is not None:
                 task["pins"] = [{"at": middle / model.fps, "joint": WRIST, "position": wanted.tolist()}]
+            try:
+                made = model.edit(clip, task)[0]
+            except UserError as error:
+                table.add_row(clip.name, title, "", "", "", str(error)[:80])
+                continue
             with tempfile.TemporaryDirectory() as folder:
-                try:
-                    made = model.edit(clip, task)[0]
-                except UserError as error:
-                    table.add_row(clip.name, title, "", "", "", str(error)[:80])
-                    continue
                 _, found = positions(made.save(Path(folder) / "after.bvh"))
+            body = [names.index(joint) for joint in Skeleton.named("smpl22").joints]  # fingers may be new
             kept = np.r_[0:start, stop : min(len(own), len(found))]
-            off = 100 * np.linalg.norm(found[kept] - own[kept], axis=-1)
-            fore = 100 * np.linalg.norm(found[:, names.index(WRIST)] - found[:, names.index(ELBOW)], axis=-1)
-            miss = 100 * np.linalg.norm(found[middle, names.index(WRIST)] - wanted)
-            table.add_row(
-                clip.name, title, f"{off.mean():.2f}, {off.max():.2f}", f"{miss:.1f}" if away else "",
-                f"{fore.min():.1f} to {fore.max():.1f}", "; ".join(made.report.lines()[:2]),
-            )  # fmt: skip
-    console.print(table)
+            off = 100 * np.linalg.norm(found[kept][:, body] - own[kept][:, body], axis=-1)
+            wrist, elbow = (found[:, names.index(joint)] for joint in (WRIST, ELBOW))
+            fore = 100 * np.linalg.norm(wrist - elbow, axis=-1)
+            miss = 100 * np.linalg.norm(wrist[middle] - wanted)
+            told = [
+                f"{off.mean():.2f}, {off.max():.2f}",
+                f"{miss:.1f}",
+                f"{fore.min():.1f} to {fore.max():.1f}",
+            ]
+            table.add_row(clip.name, title, *told, "; ".join(made.report.lines()[:2]))
+    Console(width=140).print(table)
 
 
 if __name__ == "__main__":

@@ -116,13 +116,8 @@ class Clips:
         # JSON knows no NaN, which stands for what a task does not ask.
         report = {key: None if value != value else value for key, value in asdict(made.report).items()}
         cells, lines = {"before": made.original, "after": made}, made.report.lines()
-        facts = {
-            "clip": name,
-            "seed": asked.seed,
-            "notes": list(made.remarks),
-            "report": report,
-            "lines": lines,
-        }
+        facts = {"clip": name, "seed": asked.seed, "notes": list(made.remarks)}
+        facts |= {"report": report, "lines": lines}
         return answer(made, asked.format, facts, "\n".join(lines), cells)
 
 

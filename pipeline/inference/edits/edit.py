@@ -124,15 +124,16 @@ def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMo
     own[kept] = clip.rotations[kept]
     root[inside][rooted] = clip.root[rooted]
     turn = Rotation.from_euler("y", (heading[inside] - frames.clip_root.heading)[:, None]).as_matrix()
+    posing = (clip.skeleton.offsets, clip.skeleton.parents)
+    _, was = forward_kinematics(clip.rotations, clip.root, *posing)
+    _, seen = forward_kinematics(figure.rotations[inside], clip.root, *posing)
     for joint, parent in enumerate(clip.skeleton.parents):
-        loose = kept[:, joint] & ~kept[:, parent]
+        loose, wanted = kept[:, joint] & ~kept[:, parent], turn @ was[:, joint]
+        if joint in frames.bare_wrists:  # new fingers come with the hand that they were made on
+            loose, wanted = kept[:, joint], seen[:, joint]
         if pieces[joint] in _TRUNK_AND_ARMS and loose.any():
-            _, was = forward_kinematics(
-                clip.rotations, clip.root, clip.skeleton.offsets, clip.skeleton.parents
-            )
-            _, now = forward_kinematics(own, root[inside], clip.skeleton.offsets, clip.skeleton.parents)
-            aligned = now[:, parent].swapaxes(-1, -2) @ turn @ was[:, joint]
-            own[loose, joint] = aligned[loose]
+            _, now = forward_kinematics(own, clip.root, *posing)
+            own[loose, joint] = (now[:, parent].swapaxes(-1, -2) @ wanted)[loose]
     return RigidMotion.posed(clip.skeleton, rotations, root, figure.joints)
 
 

@@ -31,6 +31,8 @@ from motionloom.models.diffusion.editing import tangent
 from motionloom.models.diffusion.observed import Places
 from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask, RecordedClip
 
+_WRISTS = ("left_wrist", "right_wrist")
+
 
 @dataclass(frozen=True)
 class RootPath:
@@ -80,6 +82,8 @@ class EditFrames:
     """Where the clip's first root is in the clip's world, z + i x."""
     turn: float
     """The heading of the clip's first root there, in radians."""
+    bare_wrists: tuple[int, ...]
+    """Wrists of a clip without fingers, where the model makes these."""
     remarks: tuple[str, ...]
 
     @property
@@ -190,6 +194,7 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         lift=lift,
         origin=origin,
         turn=turn,
+        bare_wrists=() if clip.has_hands or not hands else tuple(map(layout.skeleton.index, _WRISTS)),
         remarks=tuple(remarks),
     )
 
