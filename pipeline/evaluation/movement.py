@@ -51,17 +51,17 @@ METRICS = tuple(
 )
 
 
-def features_of(joints: Joints, fps: float, feature_fps: float = FEATURE_FPS) -> Features:
+def features_of(joints: Joints, fps: float) -> Features:
     """Features [F] of one motion [T, N, 3]; NaN where it is too short for them."""
     if len(joints) < MIN_FRAMES:
         return {kind: np.full(width, np.nan) for kind, width in WIDTHS.items()}
-    body = zero_start(resample(joints[:, :BODY_JOINTS], fps, feature_fps))
+    body = zero_start(resample(joints[:, :BODY_JOINTS], fps, FEATURE_FPS))
     return {"k": kinetic_features(body), "m": manual_features(body)}
 
 
-def all_features(motions: Iterable[Joints], fps: float, feature_fps: float = FEATURE_FPS) -> Features:
+def all_features(motions: Iterable[Joints], fps: float) -> Features:
     """Features [n, F] of n motions."""
-    each = [features_of(joints, fps, feature_fps) for joints in motions]
+    each = [features_of(joints, fps) for joints in motions]
     return {
         kind: np.stack([one[kind] for one in each]) if each else np.zeros((0, width))
         for kind, width in WIDTHS.items()

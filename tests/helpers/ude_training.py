@@ -123,7 +123,7 @@ def dances(name: str, given: dict[str, Any], dropout: float) -> StageModule:
     """The module of a model of dances; motions are taken for 25 joints."""
     sizes: dict[str, Any] = {"dim": 8, "heads": 2, "ff": 8, "layers": 1, "dropout": dropout}
     if name == "fact":
-        lengths = {"motion_frames": 10, "music_frames": 16, "predicted_frames": 3, "input_noise": dropout}
+        lengths = {"motion_frames": 10, "music_frames": 16, "predicted_frames": 3}
         config = FactConfig(**sizes, **lengths, motion_layers=1, music_layers=1)
         return FactModule(Fact(config, LAYOUT, "all", music_dim=3), OPTIM, **given)
     codes = DanceVqConfig(width=8, depth=1, code_dim=8, halvings=2, num_codes=9, decay=0.8, reset_below=0.1)

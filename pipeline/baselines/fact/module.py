@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 from torch.nn import functional
 
@@ -30,12 +29,9 @@ class FactModule(StageModule):
         lacking = max(0, config.music_frames - features.shape[1])
         music = read_music(functional.pad(features[:, : config.music_frames], (0, 0, 0, lacking)))
         before, after = motion[:, : config.motion_frames], motion[:, config.motion_frames :]
-        given = before
-        if self.training and config.input_noise:
-            given = before + config.input_noise * torch.randn_like(before)
         counts = (heard.any(1) & (batch["length"] >= end))[:, None].expand(-1, config.predicted_frames)
         present = None if net.columns.matrices else batch.get("present")
-        made, still = net(given, music).float(), before[:, -1:].expand_as(after)
+        made, still = net(before, music).float(), before[:, -1:].expand_as(after)
         loss, of_still = (
             masked_mean(functional.mse_loss(one, after, reduction="none"), counts, present)
             for one in (made, still)

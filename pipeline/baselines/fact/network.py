@@ -118,9 +118,6 @@ class FactConfig(StackConfig):
     """Frames that it learns to predict; in generation it keeps the first."""
     columns: Columns = "features"
     """Motion as the layout's normalised columns, or SMPL parameters as the paper's 225 numbers."""
-    input_noise: float = Field(default=0.0, ge=0)
-    """Standard deviation of noise on the motion that is read in training, so that it learns to go on from
-    what it has made itself [ours]; the paper has none."""
 
     @model_validator(mode="after")
     def _within_the_motion(self) -> Self:

@@ -84,6 +84,8 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
     return done
 
 
+BEAM = 4
+"""Unfinished sentences that the search keeps, at least **[ours]**."""
 _AT_ONCE = 32
 """Motions that are read together."""
 
@@ -95,8 +97,6 @@ class TokenCaptioner:
     net: Captioner
     tokenizer: TrainedTokenizer
     vocabulary: Vocabulary
-    beam: int = 4
-    """Unfinished sentences that the search keeps, at least."""
 
     @property
     def layout(self) -> MotionLayout:
@@ -148,7 +148,7 @@ class TokenCaptioner:
         near = tokens._replace(tokens=tokens.tokens.cpu(), kinds=tokens.kinds.cpu())
         known = present.known(list(range(len(motions))), near, net.ends.cpu()).to(device)
         embedded = net.embedded(tokens.tokens, tokens.kinds, known)
-        found = likeliest(net, net.begin(embedded, tokens.tokens >= 0), count, self.beam)
+        found = likeliest(net, net.begin(embedded, tokens.tokens >= 0), count, BEAM)
         return [
             [Sentence(self.vocabulary.decode(one.words), one.log_probability) for one in sentences]
             for sentences in found

@@ -56,8 +56,6 @@ class CaptionerStageConfig(TrainedStageConfig):
     """Training captions that must have a word for it to be kept."""
     min_frames: int = Field(16, ge=1)
     """Captions about fewer frames are left out where the clip has a longer one."""
-    beam: int = Field(4, ge=1)
-    """Unfinished sentences that the search keeps; as many as sentences are asked for, at least."""
 
 
 class CaptionerInputs(Inputs):
@@ -122,7 +120,7 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
 
     def captioner(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionCaptioner:
         loaded: TokenCaptioner = self.load(stage, given, device)
-        return TokenCaptioner(loaded.net, loaded.tokenizer, loaded.vocabulary, stage.config.beam)
+        return loaded
 
     def loaded(self, net: Captioner, facts: ModelFacts, inputs: CaptionerInputs) -> TokenCaptioner:
         return TokenCaptioner(net, inputs.tokenizer, _words(facts))

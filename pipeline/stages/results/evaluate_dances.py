@@ -47,7 +47,7 @@ from motionloom.pipeline.evaluation.figures import (
     FigureFile,
     group_figures,
 )
-from motionloom.pipeline.evaluation.movement import all_features, movement_figures
+from motionloom.pipeline.evaluation.movement import FEATURE_FPS, all_features, movement_figures
 from motionloom.pipeline.evaluation.reference_baselines import mean_poses, nearest_dances, random_dances
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.stages.results.evaluation import Evaluation, EvaluationStage, bundle_driven_by
@@ -71,8 +71,6 @@ class EvaluateDancesConfig(StageConfig):
     """Other songs that each dance is compared with, for the beats of shuffled music."""
     pool: int = Field(400, ge=2)
     """Training dances that the reference baselines choose from, at most."""
-    feature_fps: float = Field(60.0, gt=0)
-    """Frame rate that motions are resampled to for FID, Diversity and MultiModality; published: 60."""
     sampling: SamplingConfig = SamplingConfig()
 
 
@@ -122,7 +120,7 @@ class _DanceEvaluation(Evaluation):
         pieces = self.pieces
         sizes = [piece.stop - piece.start for _, piece in pieces]
         self.make("generated", "generating", sizes, lambda k: self.dance(*pieces[k]))
-        self.make_reference(SOUND, self.config.feature_fps)
+        self.make_reference(SOUND)
 
     @cached_property
     def pieces(self) -> list[tuple[int, slice]]:
@@ -147,7 +145,7 @@ class _DanceEvaluation(Evaluation):
             "songs": len({clip.song for clip in clips}),
             "clips_sha256": digest_of_dances(clips),
             "shuffles": config.shuffles,
-            "feature_fps": config.feature_fps,
+            "feature_fps": FEATURE_FPS,
             **({"seed_motion": f"the first {self.begun} frames of each recording"} if self.begun else {}),
             **({"note": maker.capabilities.note} if maker.capabilities.note else {}),
             **self.drawn_as(self.bundle),
@@ -164,10 +162,7 @@ class _DanceEvaluation(Evaluation):
         figures = clip_figures(metrics_of("dances"), rows, self.protocol)
         chance = plain({f"recognition.{name}": share for name, share in commonest(clips).items()})
         figures += group_figures(RECOGNITION.name, RECOGNITION.columns, {CHANCE: chance}, self.protocol)
-        features = {
-            row: [all_features(one, self.fps, self.config.feature_fps) for one in repeats]
-            for row, repeats in motions.items()
-        }
+        features = {row: [all_features(one, self.fps) for one in repeats] for row, repeats in motions.items()}
         real = features[RECORDED][0]
         figures += movement_figures(self.reference(SOUND), real, features, self.protocol)
         return FigureFile("evaluate_dances", tuple(figures), self.about(self.bundle))

@@ -31,7 +31,7 @@ from motionloom.pipeline.evaluation.figures import (
     figure_tables,
     print_tables,
 )
-from motionloom.pipeline.evaluation.movement import FEATURE_FPS, Features, all_features
+from motionloom.pipeline.evaluation.movement import Features, all_features
 from motionloom.pipeline.inference.bundle import Bundle
 
 _REFERENCE = 64
@@ -131,7 +131,7 @@ class Evaluation:
         with Meter(what, units.mine(sizes), console=self.context.console) as meter:
             units.make(name, len(sizes), result, lambda k: meter.advance(sizes[k]))
 
-    def make_reference(self, member: str, feature_fps: float = FEATURE_FPS) -> None:
+    def make_reference(self, member: str) -> None:
         """This process's share of the features of all motions whose clips have `member`."""
         motions = self._reference(member)
         slices = even_slices(len(motions), _REFERENCE)
@@ -139,7 +139,7 @@ class Evaluation:
         def features(number: int) -> Arrays:
             layout, some = self.dataset.layout, motions[slices[number]]
             bodies = (np.asarray(data.motion(k))[:, layout.part("bodyhand")] for data, k in some)
-            return dict(all_features((joints_of(x, layout) for x in bodies), layout.fps, feature_fps))
+            return dict(all_features((joints_of(x, layout) for x in bodies), layout.fps))
 
         self.make("reference", "features of all motions", [s.stop - s.start for s in slices], features)
 

@@ -54,8 +54,6 @@ def test_what_was_trained_on_is_found_itself(splits: tuple[ShardDataset, ShardDa
         assert t.caption in [caption.text for caption in train.texts(train.ids.index(one.id))]
     for one, t in zip(by_nearest_labels(train, truths), truths, strict=True):
         assert one.truth == t.truth
-
-
-def test_data_without_truth_have_no_labels(splits: tuple[ShardDataset, ShardDataset]) -> None:
-    train, test = splits
-    assert by_nearest_labels(train, [replace(truth_of(test, 0), truth=None)]) == []
+    assert by_nearest_labels(train, [replace(truths[0], truth=None)]) == [], (
+        "data without truth have no labels"
+    )

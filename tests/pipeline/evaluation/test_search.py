@@ -16,7 +16,6 @@ import torch
 
 from motionloom.datasets.check.suspects import decide
 from motionloom.datasets.loading.statistics import FeatureStats, compute
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Decisions, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
@@ -143,13 +142,6 @@ def test_captions_that_fit_worse_than_all_others(root: Path, model: SimpleNamesp
     for place, fault in misfits:
         own = {caption.text for caption in found.splits[place.split].texts(place.clip)}
         assert fault.weight > 1 and any(f"'{text}' fits worse" in fault.text for text in own)
-
-
-def test_a_body_without_hands_in_a_layout_with_hands(model: SimpleNamespace, root: Path) -> None:
-    layout = MotionLayout.named("wholebody313", fps=20.0)
-    joints = searching.floored_joints(Search.open(root, "any").splits["train"], 0)
-    features, present = searching.features_for(SimpleNamespace(layout=layout), joints, 20.0)  # type: ignore[arg-type]
-    assert features.shape == (len(joints), 313) and not present & 1
 
 
 def test_models_without_a_tma(tmp_path: Path) -> None:

@@ -301,60 +301,9 @@ def test_the_page_plays_the_music(run: tuple[Path, str]) -> None:
     assert "media-src blob:" in page.read_text() and "Beat Align" in page.read_text()
 
 
-def test_generated_files_have_their_music(run: tuple[Path, str]) -> None:
-    folder = run[0] / "stages/generate/motions"
-    shown = sorted(path.suffix for path in folder.iterdir() if not path.name.startswith("."))
-    assert shown == [".html", *[".npz"] * 3]
-    data = page_data(folder / "index.html", "viewer-data")
-    assert ["sound" in motion for motion in data["motions"]] == [False, True, True]
-    assert [len(np.load(path)["joints"]) for path in sorted(folder.glob("*.npz"))][1:] == [40, 40]
-
-
 def test_evaluate_runs_every_stage_of_figures(run: tuple[Path, str]) -> None:
     out = evaluate_run(run[0], clips=2, repeats=1, console=Console(quiet=True))
     for path in (out / "metrics.json", out / "evaluate_dances/metrics.json"):
         file = FigureFile.read(path)
         assert {one.protocol["clips"] for one in file.figures} == {2}
         assert file.of("movement.mm_k") is None or path.parent.name == "evaluate_dances", "decoded twice"
-
-
-TINY = "train: {steps: 2, batch_size: 4, checkpoint_every: 2, validate_every: 2}"
-MUSIC_ONLY = f"""
-extends: ude-tiny
-name: music
-hardware: {{accelerator: cpu, threads: 1, convert_workers: 1}}
-stages:
-  data:
-    {{clips: 18, layout: wholebody363, actions: [dance], max_seconds: 5, test_fraction: 0.34,
-     val_fraction: 0.17, dances: {{songs: 6, song_seconds: 6, share: 1, conditions: {{audio: 1, both: 0}}}}}}
-  text: null
-  tma: null
-  dmd: null
-  evaluate_dances: null
-  tokenizer: {{net: {{width: 16, code_dim: 8, num_codes: 16}}, {TINY}}}
-  utt:
-    modalities: [audio]
-    net: {{layers: 1, dim: 16, heads: 2, ff: 16, z_dim: 4}}
-    mate: {{dim: 16, layers: 1, heads: 2, ff: 16}}
-    loss: {{adversarial_start: 2, adversarial_ramp: 2, discriminator: {{dim: 16, ff: 16, heads: 2}}}}
-    {TINY}
-  generate: {{dances: 1, formats: [npz]}}
-  evaluate: {{clips: 3, repeats: 1}}
-  report: {{dances: 1}}
-"""
-
-
-def test_music_alone_is_enough(tmp_path: Path) -> None:
-    """No captions anywhere; a tokenizer of all columns, the face included."""
-    (tmp_path / "music.yaml").write_text(MUSIC_ONLY)
-    run_recipe(tmp_path / "music.yaml", tmp_path / "run", console=Console(quiet=True))
-    stages = tmp_path / "run/stages"
-    file = FigureFile.read(stages / "evaluate/metrics.json")
-    assert {one.protocol["clips"] for one in file.figures} == {3}, "of the reconstruction alone"
-    for part in ("body", "hand"):
-        assert file.of(f"reconstruction.mpjpe_{part}") is not None
-    data = page_data(stages / "report/report.html")
-    assert len(data["sounds"]) == 1 and all(motion["face"] for motion in data["motions"])
-    faces = [motion["face"] for motion in data["motions"]]
-    assert len(set(faces)) == 3, "recorded, kept by the tokenizer, generated"
-    assert len(list((stages / "generate/motions").glob("*.npz"))) == 1

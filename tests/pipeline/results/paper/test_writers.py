@@ -72,9 +72,6 @@ def test_a_papers_name_is_all_of_its_tables(call: Call, tmp_path: Path) -> None:
     assert done.code == 0, done.err
     found = re.findall(r"^\*\*UDE Table (\d)", (tmp_path / "all.md").read_text(encoding="utf-8"), re.M)
     assert found == ["1", "2", "3", "4", "5"]
-
-
-def test_the_list_of_tables(call: Call) -> None:
     shown = call("evaluate", "--table", "list")
     assert shown.code == 0
     assert re.findall(r"(?:humantomato|ude)/\d+", shown.out) == list(shipped_tables())
