@@ -121,6 +121,9 @@ def run(
             help="Go on in this folder even where that replaces trainings, or another recipe's run.",
         ),
     ] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="First compare all files of finished stages with their sha256.")
+    ] = False,
 ) -> None:
     """Run a recipe: every stage that is not finished, in order.
 
@@ -147,6 +150,7 @@ def run(
         go_on=go_on or (),
         dry_run=dry_run,
         replace=replace,
+        verify=verify,
         console=make_console(),
     )
 

@@ -28,7 +28,7 @@ from motionloom.pipeline.runs.execute import context_of, execute, perform
 from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.snapshot import run_at
-from motionloom.pipeline.store.artifact import require_consistent
+from motionloom.pipeline.store.artifact import require_consistent, require_unchanged
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import hint_at, owner_of, require_own, require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, run_state
@@ -43,9 +43,12 @@ def run_recipe(
     go_on: Collection[str] = (),
     dry_run: bool = False,
     replace: bool = False,
+    verify: bool = False,
     console: Console | None = None,
 ) -> Path:
     """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
+
+    With `verify` all files of finished stages are compared with their checksums first.
 
     Without `replace`, a run that would replace work that took long (`dry_run.py`), or that would write into
     the folder of another recipe's run, is refused. Trainings in `go_on` go on from their newest checkpoints
@@ -54,6 +57,9 @@ def run_recipe(
     console = console or make_console()
     loaded = load_recipe(recipe, overrides)
     run = out or Path("runs") / loaded.name
+    if verify:
+        count = sum(require_unchanged(stage_folder(run, stage.name), again=True) for stage in loaded.stages)
+        say(console, f"{run}: {count} files have the sha256 that their stages noted")
     try:
         plan = make_plan(loaded, run, select, go_on)
     except UserError:

@@ -252,15 +252,16 @@ class Compared(Config):
             write_json(path, Compared(files=files).dump())
 
 
-def require_unchanged(folder: Path) -> int:
+def require_unchanged(folder: Path, *, again: bool = False) -> int:
     """Refuse a finished stage one of whose files is not the one that it made; how many were read.
 
-    Those of an export are compared each time. Shards are left to whoever reads them (`verify_shards.py`).
+    Those of an export are compared each time, those of a run once, or `again`. Shards are left
+    to whoever reads them (`verify_shards.py`).
     """
     artifact, run, exported = Artifact.find(folder), owner_of(folder), in_export(folder)
     if artifact is None:
         return 0
-    known = Compared(files={}) if exported else Compared.read(run / NOTE)
+    known = Compared(files={}) if exported or again else Compared.read(run / NOTE)
     compared: dict[str, tuple[str, State]] = {}
     for name, info in artifact.outputs.items():
         path = folder / name

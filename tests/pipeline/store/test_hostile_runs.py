@@ -98,6 +98,8 @@ def test_a_finished_stage_that_was_damaged_is_named_when_it_is_opened(toy: Path)
     damage = f"{re.escape(str(path))}: is not the file that its stage made.*--from data"
     with pytest.raises(UserError, match=damage):
         StageCache().get(finished_stages(toy)["data"])
+    with pytest.raises(UserError, match=damage):
+        run_recipe(toy / "recipe.yaml", toy, verify=True, console=Console(quiet=True))
     path.unlink()
     with pytest.raises(UserError, match=r"value\.json: is gone"):
         require_unchanged(path.parent)
