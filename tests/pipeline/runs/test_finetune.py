@@ -158,7 +158,7 @@ def test_a_run_is_gone_on_from_and_exported_with_the_stages_of_the_other(
     other.rename(tmp_path / "away")
     again = Bundle.open(tmp_path / "exported").generate(["a person waves"], seconds=2.0, seed=1)[0]
     np.testing.assert_array_equal(again.features, made.features)
-    with pytest.raises(UserError, match=f"stage 'gpt' was made from {other}/stages/tokenizer, where no"):
+    with pytest.raises(UserError, match=f"stage 'gpt' was made from {other}/stages/tma, where no"):
         Bundle.open(run)
 
 
