@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import difflib
 import json
+import math
 import re
 import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
 
 SCHEMA_VERSION = 3
 
@@ -73,20 +74,75 @@ def read_plain(path: Path, most: int = MOST_JSON_BYTES, name: str = "") -> bytes
     pipe, which would be read without end. `FileNotFoundError` when there is none. Errors name it by its path,
     or by `name`.
     """
-    about = path.stat()
-    if not stat.S_ISREG(about.st_mode):
-        raise UserError(f"{name or path}: not a plain file")
-    if about.st_size > most:
-        raise UserError(f"{name or path}: {about.st_size:,} bytes; at most {most:,} are read")
+    size = require_plain(path, name)
+    if size > most:
+        raise UserError(f"{name or path}: {size:,} bytes; at most {most:,} are read")
     return path.read_bytes()
 
 
+def require_plain(path: Path, name: str = "") -> int:
+    """Bytes of a plain file; `UserError` for a device or a pipe, which would be waited for without end."""
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
+        raise UserError(f"{name or path}: not a plain file")
+    return about.st_size
+
+
+_HALF_LETTER = re.compile(r"\\u[dD][89a-fA-F]")
+"""Begins the escape of a surrogate, which with another makes a letter."""
+
+
 def parse_json(raw: str | bytes, where: str, **how: Any) -> Any:
-    """Return JSON decoded, with `how` as for `json.loads`; `UserError` beginning with `where` otherwise."""
+    """Return JSON decoded, with `how` as for `json.loads`; `UserError` beginning with `where` otherwise.
+
+    All JSON from outside comes through here: numbers are finite, whole ones of 64 bits, and no text holds
+    half of a letter, which nothing can be written with. `RecursionError` bounds the depth.
+    """
     try:
-        return json.loads(raw.decode() if isinstance(raw, bytes) else raw, **how)
+        text = raw.decode() if isinstance(raw, bytes) else raw
+        found = json.loads(text, parse_float=_finite, parse_int=_of_64_bits, parse_constant=_finite, **how)
+        (json.dumps(found, ensure_ascii=False) if _HALF_LETTER.search(text) else text).encode()
+    except UnicodeEncodeError:
+        raise UserError(f"{where}: not valid JSON (half of a letter, a lone surrogate)") from None
     except (ValueError, RecursionError) as error:
         raise UserError(f"{where}: not valid JSON ({error or 'too deep'})") from None
+    return found
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f"{text:.20} is not a finite number")
+    return value
+
+
+def _of_64_bits(text: str) -> int:
+    if len(text) > 20 or not -(2**63) <= (value := int(text)) < 2**63:
+        raise ValueError(f"{text:.20} is beyond 64 bits")
+    return value
+
+
+def number(value: object, where: str, most: float = 1e9, least: float = 0) -> float:
+    """The number that a field of a table or of JSON says; `UserError` beginning with `where` for anything
+    else, and beyond `least` to `most`.
+    """
+    try:
+        found = float(value) if isinstance(value, str | int | float) else math.nan
+    except (ValueError, OverflowError):
+        found = math.nan
+    if not least <= found <= most:
+        raise UserError(f"{where}: '{value!s:.20}' is no number from {least:g} to {most:g}")
+    return found
+
+
+def whole(value: object, where: str, most: float = 1e9) -> int:
+    """The same of a whole number from 0 on, such as one of frames."""
+    if (found := number(value, where, most)) % 1:
+        raise UserError(f"{where}: '{value!s:.20}' is no whole number")
+    return int(found)
+
+
+FrameRate = Annotated[float, Field(ge=0.1, le=1000)]
+"""Frames a second of a motion."""
 
 
 class Config(BaseModel):
@@ -164,6 +220,10 @@ _Text = Annotated[
     str | None, BeforeValidator(lambda text: text or None), PlainSerializer(lambda text: text or "")
 ]
 """None is stored as empty text."""
+_Written = Annotated[
+    str, BeforeValidator(lambda text: str(text).encode("utf-8", "backslashreplace").decode())
+]
+"""Bytes of a file's name that are no UTF-8, lone surrogates here, are stored as `\\udc8f`."""
 _End = Annotated[
     float | None,
     BeforeValidator(lambda end: None if end == -1 else end),
@@ -206,7 +266,7 @@ class ClipMeta(Config):
     split: Split
     layout: str
     family: Literal["exact", "h3d", "raw"]
-    fps: float
+    fps: FrameRate
     skeleton: str
     frames: int
     licence: str
@@ -238,8 +298,8 @@ class ShardInfo(Config):
 class Dropped(Config):
     """A source clip that did not become a sample, and why."""
 
-    source: str
-    reason: str
+    source: _Written
+    reason: _Written
     kind: Literal["rejected", "unreadable", "missing"] = "rejected"
     """`rejected`: it is in the source, but cannot or must not become a sample. `unreadable`: a file, of
     motion or of texts, that is damaged. `missing`: listed somewhere, but not in the source."""
@@ -252,7 +312,7 @@ class Manifest(Config):
     name: str
     layout: str
     family: Literal["exact", "h3d", "raw"]
-    fps: float
+    fps: FrameRate
     skeleton: str
     licence: str
     converter: str

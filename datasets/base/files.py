@@ -99,7 +99,6 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text atomically, newlines as they are."""
-    # Bytes of a file's name that are no UTF-8 are lone surrogates here: `\udc8f`, as JSON escapes them.
     write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
@@ -109,7 +108,8 @@ def write_json(path: Path, data: object, *, sort_keys: bool = False, allow_nan: 
     Keys stay in their order (a manifest reads best as its schema lists it) unless `sort_keys`.
     """
     text = json.dumps(data, indent=1, ensure_ascii=False, sort_keys=sort_keys, allow_nan=allow_nan)
-    write_text(path, text + "\n")
+    # Bytes of a file's name that are no UTF-8 are lone surrogates here, which no reader of JSON takes.
+    write_text(path, re.sub("[\ud800-\udfff]", lambda half: f"\\\\u{ord(half[0]):x}", text) + "\n")
 
 
 def sync_folder(folder: Path) -> None:

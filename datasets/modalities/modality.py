@@ -22,7 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from motionloom.datasets.base.files import atomic_file, sorted_header
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, require_plain
 
 if TYPE_CHECKING:
     from motionloom.datasets.conditions import Condition
@@ -41,6 +41,7 @@ def save_columns(path: Path, mean: Columns, std: Columns, frames: int, **about: 
 def load_columns(path: Path, stage: str) -> tuple[Columns, Columns, int, dict[str, str]]:
     """Read what `save_columns` wrote; `UserError` when it is not that. `stage` is the one to run again."""
     try:
+        require_plain(path)
         with safe_open(path, framework="numpy") as stored:
             mean, std, about = stored.get_tensor("mean"), stored.get_tensor("std"), stored.metadata() or {}
         frames = int(about["frames"])

@@ -9,7 +9,7 @@ from typing import Literal
 from pydantic import Field
 
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SCHEMA_VERSION, Config, Dropped, MotionType, UserError
+from motionloom.datasets.schema import SCHEMA_VERSION, Config, Dropped, MotionType, UserError, whole
 from motionloom.datasets.shards.cache import CacheConfig
 
 SOURCE_CHECKSUM = "source_sha256"
@@ -31,9 +31,8 @@ class Part:
     def parse(cls, text: str) -> Part:
         """The part of `3/8`."""
         number, _, count = text.partition("/")
-        if not (number.isdecimal() and count.isdecimal() and int(count)):
-            raise UserError(f"part '{text}': write it as K/N, such as 3/8 for the third of eight parts")
-        return cls(int(number), int(count))
+        where = f"part '{text}': write it as K/N, such as 3/8 for the third of eight parts"
+        return cls(whole(number, where), whole(count, where))
 
     def __str__(self) -> str:
         return f"{self.number}/{self.count}"

@@ -19,7 +19,14 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
-from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError, read_plain
+from motionloom.datasets.schema import (
+    INDEX_FILE,
+    MANIFEST_FILE,
+    ShardInfo,
+    UserError,
+    read_plain,
+    require_plain,
+)
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 from motionloom.datasets.shards.checksums import LocalShard, fault_of
 
@@ -99,8 +106,7 @@ class LocalStore:
 
     def _open(self, name: str) -> BinaryIO:
         try:
-            if (self.root / name).exists() and not (self.root / name).is_file():  # a pipe would be waited for
-                raise UserError(f"{self.where(name)}: not a plain file")
+            require_plain(self.root / name, self.where(name))
             return (self.root / name).open("rb")
         except FileNotFoundError:
             raise MissingFileError(f"{self.where(name)}: no such file") from None

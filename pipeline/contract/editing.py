@@ -22,7 +22,7 @@ from motionloom.datasets.schema import Config
 
 MAX_SPEED = 12.0
 """Metres a second of a root; the fastest sprint that was measured (Bolt, Berlin 2009) reached 12.4."""
-Seconds = Annotated[float, Field(allow_inf_nan=False)]
+Seconds = Annotated[float, Field(ge=-3600, le=3600)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1000, le=1000)]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
@@ -19,7 +18,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, parse_json
 from motionloom.pipeline.contract.editing import MAX_SPEED
 from motionloom.pipeline.inference.edits.edit import require_editor
 from motionloom.pipeline.inference.model import MotionModel
@@ -170,13 +169,7 @@ class Site:
             raise HTTPException(415, "send JSON with Content-Type: application/json")
         most = round(self.config.max_request_kb * 1024)
         data = await read_body(http, "the request", most, self.config.patience)
-        try:
-            fields = json.loads(data)
-            json.dumps(fields, ensure_ascii=False).encode()  # half of a letter cannot be answered later
-        except UnicodeEncodeError:
-            raise HTTPException(400, "the request holds half of a letter (a lone surrogate)") from None
-        except (ValueError, RecursionError):
-            raise HTTPException(400, "the request is not JSON") from None
+        fields = parse_json(data, "the request")
         if not isinstance(fields, dict):
             raise HTTPException(400, 'the request is not a JSON object like {"caption": "a person waves"}')
         request = kind.parse(fields, "request")

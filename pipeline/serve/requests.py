@@ -94,7 +94,7 @@ class MotionRequest(Config):
     """Describes the face; empty takes `caption`."""
     sound: str | None = Field(None, max_length=64)
     """Name of a sound that was sent before."""
-    seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
+    seconds: float | None = Field(None, gt=0, le=3600)
     """Length; without it the model decides, or the sound, or it is four seconds."""
     seed: int = Field(0, ge=0, lt=2**63)
     cfg_scale: float = Field(1.0, ge=1, le=20, allow_inf_nan=False)

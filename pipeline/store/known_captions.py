@@ -26,7 +26,7 @@ from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import Config, UserError, require_plain
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 
@@ -202,6 +202,7 @@ def load_known(folder: Path) -> tuple[KnownTexts, dict[str, KnownCaptions]]:
         return KnownTexts(body=KnownText(), face=KnownText()), {}
     found = KnownTexts.load_json(texts)
     try:
+        require_plain(embeddings)
         arrays = load_file(embeddings)
     except (OSError, SafetensorError) as error:
         raise UserError(

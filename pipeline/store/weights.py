@@ -24,7 +24,7 @@ from torch.nn.modules.module import (
 
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import Config, FrameRate, UserError, require_plain
 from motionloom.pipeline.store.files import write_json
 
 Fact = TypeVar("Fact")
@@ -38,7 +38,7 @@ class LayoutFacts(Config):
     """The arguments of `MotionLayout.named` for a layout."""
 
     name: str
-    fps: float
+    fps: FrameRate
     family: str
 
     @staticmethod
@@ -129,6 +129,7 @@ def built(folder: Path, build: Callable[[], N]) -> N:
     """
     path = folder / "model.safetensors"
     try:
+        require_plain(path)
         with safe_open(path, "pt") as file:
             sizes = [torch.Size(file.get_slice(name).get_shape()).numel() for name in list(file.keys())]
     except (OSError, SafetensorError) as error:
@@ -241,8 +242,9 @@ def exact_tensors(
     `fix` ends the message of what is refused; tensors that match a pattern of `unread` are passed over.
     """
     try:
+        require_plain(path)
         found = load_file(path)
-    except (OSError, SafetensorError) as error:
+    except (OSError, SafetensorError, RuntimeError, MemoryError) as error:
         raise UserError(f"{path}: cannot be read ({' '.join(str(error).split())[:200]}); {fix}") from None
     idle = {name for name in found.keys() - shapes.keys() if any(fnmatchcase(name, one) for one in unread)}
     for name in sorted((shapes.keys() | found.keys()) - idle):
@@ -251,9 +253,24 @@ def exact_tensors(
         if shape is None or wanted is None or _without_ones(shape) != _without_ones(wanted):
             here, there = ("no tensor" if one is None else one for one in (shape, wanted))
             raise UserError(f"{path}: tensor '{name}' is {here}, and the published one {there}; {fix}")
-        if not bool(found[name].isfinite().all()):
-            raise UserError(f"{path}: tensor '{name}' holds numbers that are not finite; {fix}")
-    return {name: found[name].float().reshape(shape) for name, shape in shapes.items()}
+    return {
+        name: _as_type(found[name], torch.float32, f"{path}: tensor '{name}'", fix).reshape(shape)
+        for name, shape in shapes.items()
+    }
+
+
+_FLOATS = (torch.float32, torch.float16, torch.bfloat16, torch.float64)
+"""Types of weights; of eight bits they are nothing without the scales that quantised releases keep apart."""
+
+
+def _as_type(value: torch.Tensor, to: torch.dtype, where: str, fix: str) -> torch.Tensor:
+    """A tensor as a network has it, one float type as another; finite afterwards, as 1e308 is no float32."""
+    if value.dtype != to and not {value.dtype, to} <= {*_FLOATS}:
+        raise UserError(f"{where} is of {value.dtype}, not {to} or another float type; {fix}")
+    made = value.to(to)
+    if made.is_floating_point() and not bool(made.isfinite().all()):
+        raise UserError(f"{where} holds numbers that are not finite; {fix}")
+    return made
 
 
 def _without_ones(shape: list[int]) -> list[int]:
@@ -264,12 +281,15 @@ def load_weights(folder: Path, net: torch.nn.Module) -> None:
     """Fill `net`; a file that does not fit is refused by name."""
     path = folder / "model.safetensors"
     try:
-        state = load_file(path)
-        for name, value in state.items():
-            if value.is_floating_point() and not bool(value.isfinite().all()):
-                raise UserError(f"{path}: '{name}' holds numbers that are not finite; run its stage again")
-        net.load_state_dict(state)
-    except (FileNotFoundError, SafetensorError, RuntimeError) as error:
+        require_plain(path)
+        own, fix = net.state_dict(), "run its stage again"
+        net.load_state_dict(
+            {
+                name: _as_type(value, own[name].dtype, f"{path}: '{name}'", fix) if name in own else value
+                for name, value in load_file(path).items()
+            }
+        )
+    except (FileNotFoundError, MemoryError, SafetensorError, RuntimeError) as error:
         why = " ".join(str(error).split())[:300]
         raise UserError(
             f"{path}: cannot load these weights; were they made by another version? Run the stage that made "

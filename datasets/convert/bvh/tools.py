@@ -79,7 +79,9 @@ def by_word(joints: Sequence[str]) -> dict[tuple[str, str], int]:
 
 def _pieces(name: str) -> list[str]:
     """`DEF-upper_arm.L.001` -> def, upper, arm, l, 1."""
-    return [piece.lstrip("0") or "0" if piece.isdigit() else piece.lower() for piece in _PIECE.findall(name)]
+    return [
+        piece.lstrip("0") or "0" if piece.isdecimal() else piece.lower() for piece in _PIECE.findall(name)
+    ]
 
 
 def _common(pieces: list[list[str]], end: int) -> str:

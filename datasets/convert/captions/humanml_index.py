@@ -31,7 +31,7 @@ from motionloom.datasets.convert.common.splits import (
     split_files,
 )
 from motionloom.datasets.convert.common.tables import read_csv
-from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.schema import Caption, Split, UserError, whole
 
 INDEX_FPS = 20
 """Frames a second that the index means."""
@@ -313,13 +313,6 @@ def read_index(path: Path) -> list[IndexRow]:
 
 def _row(line: dict[str, str], where: str) -> IndexRow:
     source = line["source_path"].removeprefix("./").removeprefix("pose_data/")
-    try:
-        start, end = int(line["start_frame"]), int(line["end_frame"])
-    except ValueError:
-        raise UserError(
-            f"{where}: frames '{line['start_frame'][:20]}' to '{line['end_frame'][:20]}' are not numbers"
-        ) from None
-    if start < 0:
-        raise UserError(f"{where}: start_frame {start} is negative")
+    start, end = (whole(line[key], f"{where}: {key}") for key in ("start_frame", "end_frame"))
     name = check_id(line["new_name"].removesuffix(".npy"), where)
     return IndexRow(name, check_id(source, where), start, end)

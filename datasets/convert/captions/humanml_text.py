@@ -11,13 +11,12 @@ Choices:
 
 from __future__ import annotations
 
-import math
 import re
 from pathlib import Path
 
 from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.files import read_text_file
-from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.schema import Caption, UserError, number
 from motionloom.datasets.text.clean import clean_caption, usable_caption
 
 _TOKEN = re.compile(r"\S+/[A-Z]+")
@@ -33,13 +32,13 @@ def read_humanml_captions(
     """
     captions: list[Caption] = []
     problems: list[str] = []
-    for number, line in enumerate(read_text_file(path, name).split("\n"), start=1):
+    for row, line in enumerate(read_text_file(path, name).split("\n"), start=1):
         if not line.strip():
             continue
         try:
             captions.append(parse_caption(line, seconds=seconds, source=source))
         except UserError as error:
-            problems.append(f"line {number}: {error}")
+            problems.append(f"line {row}: {error}")
     return captions, problems
 
 
@@ -77,12 +76,4 @@ def _caption_and_tokens(fields: list[str]) -> tuple[str, list[str] | None]:
 
 def _seconds(field: str, what: str) -> float:
     text = field.strip()
-    try:
-        value = float(text)
-    except ValueError:
-        raise UserError(f"{what} '{text[:20]}' is not a number of seconds") from None
-    if math.isnan(value):
-        return 0.0
-    if not 0 <= value < 1e6:
-        raise UserError(f"{what} {text[:20]} s is not a time in the clip")
-    return value
+    return 0.0 if text.lower() == "nan" else number(text, what, 1e6)

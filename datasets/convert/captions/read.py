@@ -9,7 +9,6 @@ passes through pydantic.
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -128,8 +127,6 @@ def _captions(where: str, value: object, shared: dict[str, object]) -> Iterator[
         if not 0 <= caption.start < (float("inf") if caption.end is None else caption.end):
             raise UserError(f"{where}: the caption ends at {caption.end} s and starts at {caption.start:g} s")
         words = " ".join(caption.text.split())
-        if any("\ud800" <= letter <= "\udfff" for letter in words):
-            raise UserError(f"{where} holds half a character (\\ud800 to \\udfff)")
         if words:
             yield caption.model_copy(update={"text": words})
 
@@ -198,8 +195,8 @@ def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | Non
     of AMASS, `{path, annotations}`. Sentences about mirror images (`M/…`) are of clips that nobody recorded.
     """
     try:
-        named = json.loads(text, object_pairs_hook=_without_repeats)
-    except (ValueError, RecursionError):
+        named = _decode(str(path), text)
+    except UserError:
         return None  # JSON lines; or they will say what is wrong
     if not isinstance(named, dict) or _text_keys(tuple(named)) or {*ID_KEYS, *FILE_KEYS} & named.keys():
         return None

@@ -31,6 +31,7 @@ from motionloom.datasets.schema import (
     ShardInfo,
     UserError,
     nearest,
+    whole,
 )
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.finish import OLD_FOLDER, Planned, finish
@@ -206,7 +207,7 @@ def _rewritten(
         for clip in index.clips
         if clip.made_from not in left
     }
-    number = int(shard.name.removesuffix(".tar").rpartition("-")[2])
+    number = whole(shard.name.removesuffix(".tar").rpartition("-")[2], f"{root}: {shard.name}")
     task = ShardTask[None](
         root / shard.name, shard.split, number, tuple(items.values()), manifest_layout(manifest), "float32",
         False, without(index.fingerprint, left), dict.fromkeys(items, old),

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal, cast
 
 from motionloom.datasets.convert.common.files import check_id, read_text_file
-from motionloom.datasets.schema import SPLITS, Split, UserError
+from motionloom.datasets.schema import SPLITS, Split, UserError, whole
 
 TRAIN_SHARE, VAL_SHARE = 0.80, 0.05
 """80/5/15, the split of HumanML3D and Motion-X, where a source brings none."""
@@ -153,7 +153,9 @@ class SplitRule:
     def parse(cls, words: str) -> SplitRule | None:
         """Return the rule that some words name, or None."""
         found = _RULE.fullmatch(words)
-        return found and cls(cast(Literal["subjects", "clips"], found[1]), int(found[2] or 0))
+        return found and cls(
+            cast(Literal["subjects", "clips"], found[1]), whole(found[2] or 0, f"split {words}")
+        )
 
     def name(self, clip_id: str, path: str) -> str:
         """Return what of a clip is hashed."""

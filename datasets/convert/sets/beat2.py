@@ -22,7 +22,7 @@ from motionloom.datasets.convert.common.tables import captions_of, read_csv
 from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.motion.npz import NpzFile
-from motionloom.datasets.schema import Caption, Split, UserError
+from motionloom.datasets.schema import Caption, Split, UserError, number
 
 MOTION, SPEECH, WORDS, LISTS = "smplxflame_30", "wave16k", "textgrid", "train_test_split.csv"
 _SPLITS: dict[str, Split] = {"train": "train", "val": "val", "test": "test"}
@@ -90,8 +90,8 @@ class Beat2(BodyRelease[Beat2Config]):
     ) -> Entry:
         facts: dict[str, Fact] = {"language": language, "type": kind or ""}
         parts = name.split("_")
-        if len(parts) >= 2 and parts[0].isdigit():
-            facts |= {"speaker_id": float(parts[0]), "speaker": f"{parts[0]}_{parts[1]}"}
+        if len(parts) >= 2 and re.fullmatch("[0-9]{1,9}", parts[0]):
+            facts |= {"speaker_id": number(parts[0], name), "speaker": f"{parts[0]}_{parts[1]}"}
         problem = ""
         if has_list and kind is None:
             problem = f"not in {LISTS}"
@@ -114,7 +114,7 @@ class Beat2(BodyRelease[Beat2Config]):
             if tier is None:
                 raise UserError(f'{file}: no tier "words" in it')
             found = _WORD.findall(tier[0])
-            words = [(float(a), float(b), text.strip()) for a, b, text in found if text.strip()]
+            words = [(number(a, file), number(b, file), text.strip()) for a, b, text in found if text.strip()]
         phrase: list[str] = []
         start = end = 0.0
         for begin, stop, word in words:

@@ -18,7 +18,7 @@ from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.bvh.read import list_files
 from motionloom.datasets.convert.common.tables import captions_of, read_csv, read_json_lines
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row
-from motionloom.datasets.schema import Caption, UserError
+from motionloom.datasets.schema import Caption, UserError, number, whole
 
 FPS = 120.0
 _FACTS = (
@@ -65,9 +65,7 @@ def _rows(folder: Path) -> dict[str, Row]:
     found: dict[str, Row] = {}
     for _, row in read_csv(tables[-1], ("filename", "move_duration_frames", "is_mirror", "actor_uid")):
         name, frames = row["filename"], row["move_duration_frames"]
-        if not frames.strip().isdigit():
-            raise UserError(f"{tables[-1].name}: '{name}' has {frames or 'no'} move_duration_frames")
-        seconds = int(frames) / FPS
+        seconds = whole(frames, f"{tables[-1].name}: '{name}': move_duration_frames") / FPS
         texts = [
             text
             for kind, columns in _CAPTIONS.items()
@@ -89,7 +87,7 @@ def _timeline(path: Path) -> dict[str, list[Caption]]:
         events = record.get("events")
         try:
             for event in events if isinstance(events, list) else ():
-                start, end = float(event["start_time"]), float(event["end_time"])
+                start, end = (number(event[key], f"{place}: {key}") for key in ("start_time", "end_time"))
                 texts = captions_of(event["description"], "timeline", start, end)
                 found.setdefault(str(record["filename"]), []).extend(texts if start < end else ())
         except (KeyError, TypeError, ValueError) as error:

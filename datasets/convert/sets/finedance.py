@@ -117,4 +117,4 @@ _LIMITS = np.concatenate([np.full(3, 1e3), np.full(6 * JOINTS, 10.0)])
 
 
 def _is(number: str, listed: Iterable[int]) -> bool:
-    return number.isdigit() and int(number) in set(listed)
+    return (number.lstrip("0") or "0") in map(str, listed)

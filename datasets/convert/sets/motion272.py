@@ -32,7 +32,7 @@ from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.common.tables import captions_of
 from motionloom.datasets.convert.sets.shared.vectors import walked
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
+from motionloom.datasets.schema import SPLITS, Caption, Split, UserError, whole
 
 FPS, WIDTH = 30.0, 272
 _STEP, _TURN, _POSITIONS = slice(0, 2), slice(2, 8), slice(8, 8 + 3 * BODY_JOINTS)
@@ -111,7 +111,7 @@ class Motion272(Release[Motion272Config]):
                 return
             for line in lines:
                 if file.split("/")[0].endswith("_stream_text") and (row := _STREAMED.fullmatch(line)):
-                    change = int(row["frames"]) / self.config.source_fps
+                    change = whole(row["frames"], file) / self.config.source_fps
                     yield from captions_of(row["first"], "babel", 0.0, change)
                     yield from captions_of(row["second"], "babel", change)
                 else:

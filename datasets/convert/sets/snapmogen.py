@@ -26,7 +26,7 @@ from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.shared.vectors import walked
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, whole
 
 FPS, JOINTS = 30.0, 24
 WIDTH = 4 + 12 * JOINTS + 4
@@ -66,12 +66,13 @@ class SnapMoGen(Release[SnapMoGenConfig]):
             where = f"{CAPTIONS}: '{key}'"
             record = require_record(records.get(key, {}), where)
             recording, *bounds = key.split("#")
-            if len(bounds) != 2 or not all(bound.isdigit() for bound in bounds):
+            if len(bounds) != 2:
                 raise UserError(f"{where}: a clip is named NAME#FIRST#LAST, with frames for FIRST and LAST")
+            first, last = (whole(bound, f"{where}: FIRST and LAST of NAME#FIRST#LAST") for bound in bounds)
             texts = [text for kind in ("manual", "gpt") for text in captions_of(record.get(kind), kind)]
             yield Entry(
                 key, f"{FEATURES}/{recording}.npy", tuple(texts), None, recording,
-                {"recording": recording}, first=int(bounds[0]), last=int(bounds[1]),
+                {"recording": recording}, first=first, last=last,
             )  # fmt: skip
 
     def length(self, path: Path, label: str) -> tuple[int, float]:

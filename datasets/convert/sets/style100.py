@@ -14,7 +14,7 @@ from pathlib import Path
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.common.tables import captions_of, read_csv
 from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, stem
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, whole
 
 CUTS, STYLES = "Frame_Cuts.csv", "Dataset_List.csv"
 MOVEMENTS = {
@@ -82,10 +82,7 @@ def _cuts(source: Path) -> dict[str, slice]:
             if start in ("", "N/A", "NA", "nan") or stop in ("", "N/A", "NA", "nan"):
                 continue
             name = f"{row['STYLE_NAME'].strip()}_{movement}"
-            try:
-                found[name] = slice(int(float(start)), int(float(stop)))
-            except ValueError:
-                raise UserError(f"{CUTS}: {name}: frames '{start}' to '{stop}' are no numbers") from None
+            found[name] = slice(*(whole(frame, f"{CUTS}: {name}: frames") for frame in (start, stop)))
     return found
 
 

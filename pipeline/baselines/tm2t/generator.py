@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import PRESENT_ALL, UserError
+from motionloom.datasets.schema import PRESENT_ALL, UserError, require_plain
 from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.gpt.tokens import interleave
 from motionloom.pipeline.baselines.tm2t.network import END, START, Captioner, Reading, Vocabulary
@@ -211,6 +211,7 @@ def captioner_names(net: Captioner) -> dict[str, Source]:
 def published_words(path: Path) -> tuple[str, ...]:
     """The words of published weights, in the order of their table; they stand in the file's metadata."""
     try:
+        require_plain(path.expanduser())
         with safe_open(path.expanduser(), "pt") as file:
             said = (file.metadata() or {}).get("words", "")
     except (OSError, SafetensorError) as error:

@@ -22,7 +22,7 @@ from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.body.rigid import RigidMotion, on_one_skeleton
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, number, parse_json, read_plain
 from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS
 from motionloom.pipeline.render.body.mesh import FIRST_OF_HEAD, Body, body_for, colours
 
@@ -258,8 +258,8 @@ def read_glb(path: Path) -> tuple[NDArray[np.float64], float, str]:
 
     `UserError` for a file of other figures than those of `write_glb`, and for a damaged one.
     """
-    if path.stat().st_size > _LARGEST:
-        raise UserError(f"{path}: {path.stat().st_size:,} bytes; at most {_LARGEST:,} are read")
+    raw = read_plain(path, _LARGEST)
+    parse_json(raw[20 : 20 + int.from_bytes(raw[12:16], "little")], str(path))
     try:
         from pygltflib import GLTF2
     except ModuleNotFoundError:
@@ -267,11 +267,11 @@ def read_glb(path: Path) -> tuple[NDArray[np.float64], float, str]:
     from scipy.spatial.transform import Rotation
 
     try:
-        gltf = GLTF2().load_binary(str(path))
+        gltf = GLTF2.load_from_bytes(raw)
         blob = gltf.binary_blob() or b""
         nodes = [gltf.nodes[node] for node in gltf.skins[0].joints]
         animation = gltf.animations[0]
-        fps = float(animation.extras["fps"])
+        stated = animation.extras["fps"]
 
         def values(number: int) -> NDArray[np.float64]:
             accessor = gltf.accessors[number]
@@ -303,4 +303,4 @@ def read_glb(path: Path) -> tuple[NDArray[np.float64], float, str]:
             f"{path}: not a GLB file that motionloom wrote ({type(error).__name__}); give its BVH or npz"
         ) from None
     joints, _ = forward_kinematics(rotations, root, offsets, skeleton.parents)
-    return joints, fps, str(animation.name or "")
+    return joints, number(stated, f"{path}: fps", 1000, 0.1), str(animation.name or "")

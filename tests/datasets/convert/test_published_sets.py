@@ -241,7 +241,7 @@ DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
      "'gone#0#90': a JSON object is expected"),
     ("beat2", lambda root: nan_at(root / TALK, "expressions"), "expressions: nan at frame 5, column 1"),
     ("beat2", lambda root: text(root / GRID, '"words"', '"letters"'), f'{GRID}: no tier "words" in it'),
-    ("style100", lambda root: text(root / CUTS, "Old,40", "Old,now"), "frames 'now' to '221'"),
+    ("style100", lambda root: text(root / CUTS, "Old,40", "Old,now"), "frames: 'now' is no number"),
     ("style100", lambda root: text(root / CUTS, "Old,40,221", "Old,999,1200"), "shorter than 1 s"),
     ("style100", lambda root: (root / CUTS).unlink(), "no Frame_Cuts.csv in it"),
 ]  # fmt: skip

@@ -79,10 +79,10 @@ def test_good_lines(given: str, caption: Caption) -> None:
     ("given", "reason"),
     [
         (line("x walks", 2, "nan"), "not after its start"),
-        (line("x walks", 0, "inf"), "not a time"),
+        (line("x walks", 0, "inf"), "is no number"),
         (line("x walks", 0, "9.6"), "beyond the clip"),
         (line("x walks", "9.0", "9.3"), "beyond the clip"),
-        (line("x walks", "", ""), "not a number"),
+        (line("x walks", "", ""), "is no number"),
         ("move #3#0.0#0.0", "no word/POS tokens"),
         (line("M007482"), "no usable caption"),
     ],
