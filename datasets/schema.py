@@ -134,9 +134,9 @@ def number(value: object, where: str, most: float = 1e9, least: float = 0) -> fl
     return found
 
 
-def whole(value: object, where: str, most: float = 1e9) -> int:
-    """The same of a whole number from 0 on, such as one of frames."""
-    if (found := number(value, where, most)) % 1:
+def whole(value: object, where: str, most: float = 1e9, least: float = 0) -> int:
+    """The same of a whole number, such as one of frames."""
+    if (found := number(value, where, most, least)) % 1:
         raise UserError(f"{where}: '{value!s:.20}' is no whole number")
     return int(found)
 

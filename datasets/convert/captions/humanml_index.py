@@ -313,6 +313,7 @@ def read_index(path: Path) -> list[IndexRow]:
 
 def _row(line: dict[str, str], where: str) -> IndexRow:
     source = line["source_path"].removeprefix("./").removeprefix("pose_data/")
-    start, end = (whole(line[key], f"{where}: {key}") for key in ("start_frame", "end_frame"))
+    start = whole(line["start_frame"], f"{where}: start_frame")
+    end = whole(line["end_frame"], f"{where}: end_frame", least=-1e9)  # counted from the end, as slices are
     name = check_id(line["new_name"].removesuffix(".npy"), where)
     return IndexRow(name, check_id(source, where), start, end)

@@ -20,7 +20,7 @@ from motionloom.datasets.base.printable import printable
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import Facts, parse_where, require_known
 from motionloom.datasets.convert.common.look import Look
-from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError
+from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError, number
 from motionloom.datasets.shards.left_out import drop, grouped, grouped_notes
 
 
@@ -119,7 +119,7 @@ class ConversionPlan(Generic[C]):
         facts = facts_of(clip)
         self.known.update(facts)
         self.clips += 1
-        self.hours += float(str(facts.get("seconds", 0.0))) / 3600
+        self.hours += number(facts.get("seconds", 0.0), "seconds") / 3600
         if not reason and not all(one.holds(facts) for one in parse_where(self.config.where)):
             reason = f"not where {self.config.where.strip()}"
         if reason:

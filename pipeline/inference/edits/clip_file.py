@@ -17,7 +17,7 @@ from motionloom.datasets.motion.canonical import facing, ground, mirror, resampl
 from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import FACE, HANDS, UserError, parse_json
+from motionloom.datasets.schema import FACE, HANDS, UserError, number, parse_json
 from motionloom.pipeline.contract.editing import EditTask, RecordedClip
 
 ENDINGS = (".bvh", ".npz", ".glb")
@@ -128,9 +128,6 @@ def _read_npz(path: Path) -> RecordedClip:
         raise UserError(f"{path}: joints of shape {list(joints.shape)}, wanted [T, 22 or 52, 3]")
     if face is not None and face.shape != (len(joints), FACE_DIMS):
         raise UserError(f"{path}: a face of shape {list(face.shape)}, wanted [{len(joints)}, {FACE_DIMS}]")
-    fps = facts.get("fps") if isinstance(facts, dict) else None
-    if not isinstance(fps, int | float) or not 0 < fps <= 1000:
-        raise UserError(
-            f"{path}: its metadata do not say the frames a second; save it with motionloom generate"
-        )
-    return RecordedClip(str(path), joints, float(fps), face, str(facts.get("caption", "")))
+    facts = facts if isinstance(facts, dict) else {}
+    fps = number(facts.get("fps"), f"{path}: its metadata: fps", 1000, 0.1)
+    return RecordedClip(str(path), joints, fps, face, str(facts.get("caption", "")))

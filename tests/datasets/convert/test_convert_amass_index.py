@@ -101,8 +101,8 @@ def test_humanml_index_at_250_frames_a_second_is_thinned_to_20_83(amass: ModuleT
     [
         ("path,start\n", r"no column 'source_path'"),
         ("{head}./pose_data/A/b/c.npy,0,9\n", r":2: 3 columns"),
-        ("{head}./pose_data/A/b/c.npy,x,9,000000.npy\n", r":2: frames 'x' to '9' are not numbers"),
-        ("{head}./pose_data/A/b/c.npy,-3,9,000000.npy\n", r":2: start_frame -3 is negative"),
+        ("{head}./pose_data/A/b/c.npy,x,9,000000.npy\n", r":2: start_frame: 'x' is no number"),
+        ("{head}./pose_data/A/b/c.npy,-3,9,000000.npy\n", r":2: start_frame: '-3' is no number"),
         ("{head}./pose_data/../../x.npy,0,9,000000.npy\n", r":2: clip id .* is not a plain relative name"),
         ("{head}a/b/c.npy,0,9,../../x.npy\n", r":2: clip id .* is not a plain relative name"),
         ("{head}a/b/c.npy,0,9,1.npy\na/b/c.npy,0,9,1.npy\n", r":3: clip '1' has a row already"),

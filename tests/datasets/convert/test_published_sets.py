@@ -233,7 +233,6 @@ DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
     ("finedance", lambda root: wide(root / DANCE, 315), f"{DANCE}: no rotation at frame 0, joint 0"),
     ("bones_seed", lambda root: text(root / META, "actor_uid", "actor"), "no column 'actor_uid'"),
     ("bones_seed", lambda root: text(root / META, ",A1,", ","), "6 columns, the header has 7"),
-    ("bones_seed", lambda root: text(root / META, ",361,Dances", ",long,Dances"), "move_duration_frames"),
     ("bones_seed", lambda root: text(root / LABELS, "end_time", "end"), "needs filename, and events with"),
     ("motion272", lambda root: wide(root / VECTORS, 263), f"{VECTORS}: expected [T, 272], found [90, 263]"),
     ("snapmogen", lambda root: text(root / SAID, "gone#0#90", "gone"), "a clip is named NAME#FIRST#LAST"),

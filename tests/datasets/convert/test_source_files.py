@@ -82,7 +82,6 @@ def test_good_lines(given: str, caption: Caption) -> None:
         (line("x walks", 0, "inf"), "is no number"),
         (line("x walks", 0, "9.6"), "beyond the clip"),
         (line("x walks", "9.0", "9.3"), "beyond the clip"),
-        (line("x walks", "", ""), "is no number"),
         ("move #3#0.0#0.0", "no word/POS tokens"),
         (line("M007482"), "no usable caption"),
     ],

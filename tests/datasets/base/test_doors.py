@@ -1,0 +1,134 @@
+"""Numbers and text from outside come through one door each: JSON, tables, times and weights of others."""
+
+from __future__ import annotations
+
+import ast
+import json
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors.torch import save_file
+
+from motionloom.datasets.schema import UserError, number, parse_json, whole
+from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.store.weights import exact_tensors, load_weights
+
+ROOT = Path(__file__).parents[3]
+FLOATS = ("float32", "float16", "bfloat16", "float64")
+FOLDERS = ("datasets/convert", "datasets/shards", "pipeline/serve", "pipeline/inference/edits")
+LETTERS = st.text(st.characters(exclude_categories=()), max_size=6)
+LEAVES = st.none() | st.booleans() | st.integers() | st.floats() | LETTERS
+VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner) | st.dictionaries(LETTERS, inner), max_leaves=8)
+
+
+def fine(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(fine(key) and fine(one) for key, one in value.items())
+    if isinstance(value, list):
+        return all(map(fine, value))
+    if isinstance(value, str):
+        return not any("\ud800" <= letter <= "\udfff" for letter in value)
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return value is None or -(2**63) <= value < 2**63
+
+
+@settings(max_examples=400, deadline=None)
+@given(VALUES, st.booleans())
+def test_json_is_finite_of_64_bits_and_whole_letters(value: Any, escaped: bool) -> None:
+    text = json.dumps(value, ensure_ascii=escaped)
+    if fine(json.loads(text)):
+        assert parse_json(text, "x") == json.loads(text)
+    else:
+        with pytest.raises(UserError, match=r"^x: not valid JSON"):
+            parse_json(text, "x")
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.floats().map(repr) | st.integers().map(str) | st.text(max_size=8) | st.sampled_from(["²", "9" * 5000])
+)
+def test_fields_are_numbers_within_their_bounds(text: str) -> None:
+    for read in (number, whole):
+        try:
+            found = read(text, "x", 100)
+        except UserError as error:
+            assert str(error).startswith("x: ") and len(str(error)) < 80
+        else:
+            assert 0 <= found <= 100 and found == float(text)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.floats() | st.sampled_from([1e308, 3600.5]), st.sampled_from(["lead", "start", "end", "path", "pins"])
+)
+def test_times_are_an_hour_at_most(seconds: float, key: str) -> None:
+    pin = {"at": seconds, "joint": "head", "position": [0, 1, 0]}
+    path = [{"at": seconds, "x": 0, "z": 0}]
+    task = {"lead": {key: seconds}, "path": {key: path}, "pins": {key: [pin]}}.get(
+        key, {"keep": [{key: seconds}]}
+    )
+    try:
+        EditTask.parse(task, "task")
+    except UserError:
+        assert not 0 < seconds <= 3600
+    else:
+        assert abs(seconds) <= 3600
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.sampled_from([*FLOATS, "int8", "uint8", "int64", "bool", "complex64", "float8_e4m3fn"]), st.floats()
+)
+def test_weights_are_floats_and_finite_as_they_are_taken(
+    tmp_path_factory: pytest.TempPathFactory, kind: str, value: float
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "model.safetensors"
+    whole_number = not kind.startswith(("float", "bfloat", "complex"))
+    made = torch.tensor([[0 if whole_number else value]], dtype=torch.float64).to(getattr(torch, kind))
+    save_file({"weight": made}, path)
+    net = torch.nn.Linear(1, 1, bias=False)
+    reads: list[Callable[[], object]] = [
+        lambda: exact_tensors(path, {"weight": (1, 1)}, "x"),
+        lambda: load_weights(path.parent, net),
+    ]
+    for read in reads:
+        if kind in FLOATS and bool(made.float().isfinite()):
+            read()
+        else:
+            with pytest.raises(UserError, match=r"model\.safetensors: .*'weight'"):
+                read()
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(UserError, match="not a plain file"):
+        load_weights(path.parent, net)
+    path.unlink()
+
+
+KNOWN = {"float(scaling[0])", "float(_BALL[2])", "float(_BALL[1])", "float(bones)", "int(index)", "int(rate)",
+         "float(value)", "int(count)", "int(turn[0])", "int(bad[0])", "int(parent)"}  # fmt: skip
+"""Of numbers; `facts.py` takes what is no number as words."""
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_text_becomes_a_number_at_the_door(folder: str) -> None:
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            where = f"{path.name}:{getattr(node, 'lineno', 0)}: {ast.unparse(node)[:80]}"
+            assert not (isinstance(node, ast.Attribute) and node.attr == "isdigit"), where
+            if not (isinstance(node, ast.Call) and ast.unparse(node.func) in ("int", "float") and node.args):
+                continue
+            given = node.args[0]
+            field = isinstance(given, ast.Subscript) and isinstance(given.value, ast.Name)
+            text = isinstance(given, ast.Call) and ast.unparse(given.func).endswith(
+                ("str", "strip", "get", "group")
+            )
+            bare = isinstance(given, ast.Name) or text or (field and isinstance(given.slice, ast.Constant))
+            assert not bare or ast.unparse(node) in KNOWN, where
