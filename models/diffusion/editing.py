@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.func import jvp
 
 from motionloom.models.diffusion.network import InBetweener
-from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, turned_back
+from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, tangent, turned_back
 from motionloom.models.diffusion.sampling import blend_weights, window_starts
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.layers.frozen import evaluating
@@ -218,15 +218,3 @@ def _places_of_window(places: Places, inside: slice) -> Places:
         heading[0, first] = angle
     relative = turned_back(place - origin, angle)
     return Places(first, heading - angle, relative, heading_known, place_known)
-
-
-def tangent(place: Tensor, known: Tensor) -> Tensor:
-    """Return the heading [1] from the first known place to the next that is half a metre off, or the last.
-
-    Nearer points say little of a direction: a step to the side is a few decimetres.
-    """
-    points = place[known]
-    away = points - points[0]
-    far = away.norm(dim=-1) > 0.5
-    towards = away[far.byte().argmax() if bool(far.any()) else -1]
-    return torch.atan2(towards[1], towards[0])[None]

@@ -93,6 +93,18 @@ def turned_back(place: Tensor, heading: Tensor) -> Tensor:
     return torch.stack([z * cosine + x * sine, x * cosine - z * sine], dim=-1)
 
 
+def tangent(place: Tensor, known: Tensor) -> Tensor:
+    """Return the heading [1] from the first known place to the next that is half a metre off, or the last.
+
+    Nearer points say little of a direction: a step to the side is a few decimetres.
+    """
+    points = place[known]
+    away = points - points[0]
+    far = away.norm(dim=-1) > 0.5
+    towards = away[far.byte().argmax() if bool(far.any()) else -1]
+    return torch.atan2(towards[1], towards[0])[None]
+
+
 class Places(NamedTuple):
     """The root's place and heading where they are known, relative to each row's `anchor` frame."""
 

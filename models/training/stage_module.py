@@ -14,7 +14,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from functools import partial
-from typing import Any, NamedTuple, TypedDict
+from importlib import import_module
+from pathlib import Path
+from typing import IO, Any, NamedTuple, Self, TypedDict
 
 import lightning as L
 import torch
@@ -111,6 +113,38 @@ class StageModule(L.LightningModule, ABC):
         for value in vars(self).values():
             if isinstance(value, Frozen):
                 value.module.to(self.device)
+
+    @classmethod
+    def load_from_checkpoint(
+        cls,
+        checkpoint_path: str | Path | IO[bytes],
+        map_location: Any = None,
+        hparams_file: str | Path | None = None,
+        strict: bool | None = None,
+        weights_only: bool | None = None,
+        **arguments: Any,
+    ) -> Self:
+        """Return a module with a checkpoint's weights, of a run's own training or of a Trainer's.
+
+        Its hyper-parameters name the kind of stage, the config and the folders of the stages that fed it.
+        Those may lie elsewhere by now: `inputs={"data": "runs/other/stages/data"}`. With `net` and `optim`
+        among the arguments the module is built from these alone, as a module built by hand must be.
+
+        Raises:
+            UserError: An input is not there, or the checkpoint has no hyper-parameters.
+        """
+        if "net" in arguments:
+            return super().load_from_checkpoint(
+                checkpoint_path, map_location, hparams_file, strict, weights_only, **arguments
+            )
+        # Kinds of stages stand on the floor above, which only this needs.
+        rebuild = import_module("motionloom.pipeline.training.lightning_data").rebuild
+        content = torch.load(checkpoint_path, map_location or "cpu", weights_only=True)
+        module = rebuild(content, checkpoint_path, arguments.get("inputs", {}))
+        if not isinstance(module, cls):
+            raise TypeError(f"{checkpoint_path} is of a {type(module).__name__}, no {cls.__name__}")
+        module.load_state_dict(content["state_dict"], strict=strict is not False)
+        return module
 
     @abstractmethod
     def losses(self, batch: Batch) -> dict[str, Tensor]:

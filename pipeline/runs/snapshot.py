@@ -174,7 +174,7 @@ def _take(
                 f"{path}: was trained on another '{role}' than is there now; "
                 f"go on with the run: motionloom run {run / 'recipe.yaml'} -o {run}"
             )
-    kind, config, given, seed = describe(hyper, path)
+    kind, config, given, seed = describe(content, path, {})
     net, facts = kind.build(config, kind.inputs.of(StageCache().given(given)), seed)
     weights, prefix = content["state_dict"], "net."
     try:

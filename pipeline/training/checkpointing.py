@@ -62,7 +62,7 @@ class Checkpoint(_Lightning):
     row: list[list[Means]]
     """Means of the log's next row so far, of each rank."""
     hyper_parameters: dict[str, Any]
-    """Plain values that rebuild the network: `trained_stage.hyper_parameters`."""
+    """Plain values that rebuild the module: `trained_stage.hyper_parameters`."""
     validate: bool
     """Whether a signal cut the validation of this step short: the resumed training begins with it."""
 

@@ -1,8 +1,9 @@
-"""A stage's module and batches for `lightning.Trainer`."""
+"""A stage's module and batches for `lightning.Trainer`, and modules from the checkpoints of either loop."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -10,12 +11,12 @@ from torch.utils.data import DataLoader
 
 from motionloom.datasets.loading.steps import Steps
 from motionloom.models.training.stage_module import Batch, StageModule
-from motionloom.pipeline.contract.stage import CompletedStage, StageCache
+from motionloom.pipeline.contract.stage import CompletedStage, Inputs, StageCache
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.execution import prepare_module, set_threads
 from motionloom.pipeline.training.loaders import every_batch, loader
-from motionloom.pipeline.training.trained_stage import Batches, TrainedStage
+from motionloom.pipeline.training.trained_stage import Batches, TrainedStage, describe, hyper_parameters
 
 
 class StageData(L.LightningDataModule):
@@ -62,9 +63,22 @@ def open_training(
     hardware: Hardware | None = None,
 ) -> tuple[StageModule, StageData]:
     """Return the module and the batches of a stage's training, untrained; `given` are its inputs by role."""
+    module, inputs = _open_module(kind, config, given, seed)
+    batches = kind.batches(config, module.net, inputs, seed, lambda _: None)
+    return module, StageData(batches, config.train, hardware)
+
+
+def _open_module(
+    kind: TrainedStage[Any, Any, Any], config: Any, given: Mapping[str, CompletedStage], seed: int
+) -> tuple[StageModule, Inputs]:
     inputs = kind.inputs.of(StageCache().given(given))
     net, _ = kind.build(config, inputs, seed)
     module = kind.module(config, net, inputs, seed)
     prepare_module(module, config.train)
-    batches = kind.batches(config, net, inputs, seed, lambda _: None)
-    return module, StageData(batches, config.train, hardware)
+    module.save_hyperparameters(hyper_parameters(kind.name, config, seed, given, None))
+    return module, inputs
+
+
+def rebuild(content: object, path: object, inputs: Mapping[str, str | Path]) -> StageModule:
+    """Return the module that a checkpoint's hyper-parameters describe, with its first weights."""
+    return _open_module(*describe(content, path, inputs))[0]

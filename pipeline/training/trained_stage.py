@@ -227,28 +227,37 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
 
 
 def hyper_parameters(
-    kind: str, config: TrainedStageConfig, seed: int, given: Mapping[str, CompletedStage], base: Path
+    kind: str, config: TrainedStageConfig, seed: int, given: Mapping[str, CompletedStage], base: Path | None
 ) -> dict[str, object]:
-    """Return what rebuilds a stage's network, as plain values; folders of inputs are as seen from `base`."""
-    places = {role: relpath(one.folder.resolve(), base.resolve()) for role, one in given.items()}
+    """Return what rebuilds a stage's module, as plain values; folders of inputs are as seen from `base`."""
+    folders = {role: stage.folder.resolve() for role, stage in given.items()}
+    places = {
+        role: relpath(folder, base.resolve()) if base else str(folder) for role, folder in folders.items()
+    }
     ids = {role: identity_of(stage.folder) for role, stage in given.items()}
     return {"kind": kind, "config": config.dump(), "seed": seed, "inputs": places, "identities": ids}
 
 
 def describe(
-    hyper: Mapping[str, Any], path: Path
+    content: object, path: object, inputs: Mapping[str, str | Path]
 ) -> tuple[TrainedStage[Any, Any, Any], Any, dict[str, CompletedStage], int]:
-    """Return kind, config, inputs and seed of the training that left a checkpoint."""
+    """Return kind, config, inputs and seed of a checkpoint's training; `inputs` overrule its folders."""
+    hyper = content.get("hyper_parameters") if isinstance(content, dict) else None
+    if not isinstance(hyper, dict) or not {"kind", "config", "seed", "inputs"} <= hyper.keys():
+        raise UserError(f"{path}: no hyper-parameters of a stage; build the module and give net= and optim=")
     kind = stage_kind(str(hyper["kind"]), str(path))
     if not isinstance(kind, TrainedStage):
         raise UserError(f"{path}: stages of kind {kind.name} train no network")
     config = kind.config.parse(dict(hyper["config"]), f"{path}: config")
+    # Of a run's own checkpoint, RUN/stages/NAME/checkpoints/FILE, folders are given as seen from the stage.
+    stage = Path(str(path)).absolute().parent.parent
     given: dict[str, CompletedStage] = {}
-    for role, place in hyper["inputs"].items():
-        # Of RUN/stages/NAME/checkpoints/FILE folders are given as seen from the stage.
-        found = outside_stage(path.absolute().parent.parent / place)
+    for role, place in {**hyper["inputs"], **inputs}.items():
+        found = outside_stage(stage / str(place))
         if found is None:
-            raise UserError(f"{path}: its input {place} is no finished stage; make it again")
+            raise UserError(
+                f'{path}: input {place} is no finished stage; give inputs={{"{role}": its folder}}'
+            )
         given[role] = found
     return kind, config, given, int(hyper["seed"])
 

@@ -27,8 +27,7 @@ from motionloom.datasets.motion.layout import (
     step_columns,
 )
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.editing import tangent
-from motionloom.models.diffusion.observed import Places
+from motionloom.models.diffusion.observed import Places, tangent
 from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask, RecordedClip
 
 _WRISTS = ("left_wrist", "right_wrist")

@@ -1,8 +1,9 @@
-"""`training`: a stage's module and batches for `lightning.Trainer`."""
+"""`training`: a stage's module and batches for `lightning.Trainer`, and modules from checkpoints."""
 
 from __future__ import annotations
 
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from rank_shares import require_rows
 
 from motionloom.datasets.schema import UserError
+from motionloom.models.tma.module import TmaModule
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.runs.training import training
 from motionloom.pipeline.training.lightning_data import StageData
@@ -37,7 +39,7 @@ def fitted(module: StageModule, data: StageData, steps: int, folder: Path) -> L.
 
 @pytest.mark.parametrize("stage", [*SMALL, "utt", "dmd"])
 def test_a_trainer_makes_the_weights_of_the_run(stage: str, request: Any, tmp_path: Path) -> None:
-    """Bit for bit those of the run's first checkpoint that is left."""
+    """Bit for bit those of the run's first checkpoint that is left; and both kinds of checkpoint load."""
     run = request.getfixturevalue("small_run" if stage in SMALL else "ude_run").folder
     first = min((run / "stages" / stage / "checkpoints").glob("*.ckpt"))
     wanted = torch.load(first, weights_only=True)
@@ -47,8 +49,44 @@ def test_a_trainer_makes_the_weights_of_the_run(stage: str, request: Any, tmp_pa
     assert module.state_dict().keys() == wanted["state_dict"].keys()
     for name, value in module.state_dict().items():
         assert torch.equal(value, wanted["state_dict"][name]), name
+    trainer.save_checkpoint(tmp_path / "trainer.ckpt")
     batches = data.batches.train(8, 0, 1)
-    require_rows(batches[0], [pickle.loads(pickle.dumps(batches))[0]])  # a loader's worker gets a copy
+    batch = batches[0]
+    require_rows(batch, [pickle.loads(pickle.dumps(batches))[0]])  # a loader's worker gets a copy
+    losses = []
+    for loaded in (StageModule.load_from_checkpoint(path) for path in (first, tmp_path / "trainer.ckpt")):
+        assert type(loaded) is type(module) and loaded.hparams["config"] == module.hparams["config"]
+        torch.manual_seed(0)
+        losses.append(loaded.eval().losses(batch)["loss"])
+    assert losses[0].isfinite() and torch.equal(losses[0], losses[1])
+
+
+def test_checkpoints_follow_their_run(small_run: Any, tmp_path: Path) -> None:
+    """A run that was moved; a Trainer's checkpoint whose run was; one of another class; one built by hand."""
+    moved = tmp_path / "moved"
+    shutil.copytree(small_run.folder, moved)
+    own = min((moved / "stages/tma/checkpoints").glob("*.ckpt"))
+    module = TmaModule.load_from_checkpoint(own)
+    path = tmp_path / "trainer.ckpt"
+    with pytest.raises(TypeError, match="TmaModule"):
+        type(training(moved, "gpt")[0]).load_from_checkpoint(own)
+    content = torch.load(own, weights_only=True)
+    content["hyper_parameters"]["inputs"] = {"data": "/gone", "stats": "/gone", "text": "/gone"}
+    torch.save(content, path)
+    with pytest.raises(UserError, match=r"trainer\.ckpt.*/gone.*inputs"):
+        TmaModule.load_from_checkpoint(path)
+    places = {role: moved / "stages" / role for role in ("data", "stats", "text")}
+    again = TmaModule.load_from_checkpoint(path, inputs=places)
+    by_hand = TmaModule.load_from_checkpoint(
+        own, net=again.net, optim=again.optim_config, seed=0, max_steps=10, loss=again.loss_config
+    )
+    for other in (again, by_hand):
+        for name, value in module.state_dict().items():
+            assert torch.equal(value, other.state_dict()[name]), name
+    del content["hyper_parameters"]
+    torch.save(content, path)
+    with pytest.raises(UserError, match="net="):
+        TmaModule.load_from_checkpoint(path)
 
 
 def test_a_recipe_makes_what_the_stage_needs(

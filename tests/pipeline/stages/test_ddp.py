@@ -93,6 +93,14 @@ def test_torchrun_equals_one_process(
     assert_same_training(single, run, "gpt")
 
 
+def test_a_batch_that_does_not_divide_is_refused_before_anything_runs(
+    recipe: Path, call: Callable[..., Any], tmp_path: Path
+) -> None:
+    done = call("run", recipe, "--out", tmp_path / "run", "--set", "gpt.train.batch_size=7", *PAIR)
+    assert done.code == 2 and "train.batch_size 7 " in done.err
+    assert not (tmp_path / "run/stages").exists()
+
+
 def test_an_error_of_the_lead_ends_those_who_wait(
     single: Path, recipe: Path, start: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -59,3 +60,16 @@ def test_a_run_killed_four_times_equals_the_undisturbed_one(
     assert artifacts(run) == artifacts(small_run.folder)
     assert len(list(run.glob("stages/tokenizer/checkpoints/*"))) == 2
     assert not list(run.rglob("*.tmp")) and not list(run.glob("stages/.*"))
+
+
+@pytest.mark.parametrize("stage", ["tokenizer", "gpt"])
+def test_killed_between_the_last_step_and_the_artifact(
+    stage: str, small_run: Any, tmp_path: Path, call: Callable[..., Any]
+) -> None:
+    run = tmp_path / small_run.folder.name
+    shutil.copytree(small_run.folder, run)
+    for name in ("artifact.json", "model.json", "model.safetensors"):
+        (run / "stages" / stage / name).unlink()
+    done = call("run", small_run.recipe, "--out", run)
+    assert done.code == 0 and "1 of 15 " in done.out
+    assert artifacts(run) == artifacts(small_run.folder)

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import multiprocessing
 import os
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ import torch
 from same_stage import assert_equal
 from tiny_adversaries import train
 
-from motionloom.datasets.base.files import HashingFile
+from motionloom.datasets.base.files import HashingFile, remove_temporaries
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.training.checkpointing import (
@@ -200,3 +202,47 @@ def test_a_full_disk_ends_a_training_with_a_sentence(tmp_path: Path, monkeypatch
     again = train(tmp_path / "hit", **settings)
     assert torch.equal(whole.net[0].weight, again.net[0].weight)
     assert read_training_log(tmp_path / "hit") == read_training_log(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("ask", ["write", "finish"])
+def test_an_error_comes_out_where_the_training_asks_next(
+    ask: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = BackgroundWriter(keep=2)
+    for step in (1, 2):
+        writer.write({"global_step": step}, tmp_path / name_of(step))
+    writer.finish()
+
+    monkeypatch.setattr(os, "fsync", full)
+    writer.write({"global_step": 3}, tmp_path / name_of(3))
+    while writer.busy:
+        time.sleep(0.001)
+    with pytest.raises(UserError, match=r"3\.ckpt: .*No space left"):
+        writer.write({}, tmp_path / name_of(4)) if ask == "write" else getattr(writer, ask)()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name_of(1), name_of(2)]
+    writer.finish()  # once
+
+
+def write_and_hang(folder: Path, begun: Any) -> None:
+    """Write a checkpoint, and begin another that never ends."""
+    writer = BackgroundWriter(keep=2)
+    writer.write({"global_step": 1}, folder / name_of(1))
+    writer.finish()
+    os.fsync = lambda _: (begun.set(), time.sleep(60))  # type: ignore[assignment,return-value]
+    writer.write({"global_step": 2}, folder / name_of(2))
+
+
+def test_killed_while_it_writes(tmp_path: Path) -> None:
+    """The checkpoint before is the newest, and what was being written goes with the next start."""
+    context = multiprocessing.get_context("fork")  # torch is imported already
+    begun = context.Event()
+    process = context.Process(target=write_and_hang, args=(tmp_path, begun))
+    process.start()
+    assert begun.wait(30)
+    process.kill()
+    process.join()
+    assert len(list(tmp_path.iterdir())) == 2
+    assert next(readable(tmp_path, print))[0] == tmp_path / name_of(1)
+    assert read_checkpoint(tmp_path / name_of(1))["global_step"] == 1
+    remove_temporaries(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [name_of(1)]
