@@ -14,7 +14,7 @@ import re
 import stat
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, BinaryIO, Literal, Self, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer, ValidationError
 
@@ -78,6 +78,12 @@ def read_plain(path: Path, most: int = MOST_JSON_BYTES, name: str = "") -> bytes
     if size > most:
         raise UserError(f"{name or path}: {size:,} bytes; at most {most:,} are read")
     return path.read_bytes()
+
+
+def open_plain(path: Path, name: str = "") -> BinaryIO:
+    """Open a file of others for reading; `UserError` at once for what `require_plain` refuses."""
+    require_plain(path, name)
+    return path.open("rb")
 
 
 def require_plain(path: Path, name: str = "") -> int:

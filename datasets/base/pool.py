@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.connection import wait
+from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -59,9 +62,11 @@ class Workers:
                 self._pool = ProcessPoolExecutor(
                     min(self.count, len(tasks)), context, initializer=_exit_with_parent
                 )
-            futures = {
-                self._pool.submit(on_one_thread, work, task): position for position, task in enumerate(tasks)
-            }
+            with _starting():
+                futures = {
+                    self._pool.submit(on_one_thread, work, task): position
+                    for position, task in enumerate(tasks)
+                }
             for future in as_completed(futures):
                 yield futures[future], future.result()
         except BrokenProcessPool:
@@ -89,8 +94,32 @@ def on_one_thread(work: Callable[[T], R], task: T) -> R:
                 torch.set_num_threads(before)
 
 
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Start workers that leave Ctrl-C to their parent, and where the program came from standard input, which
+    no worker can read again, do not look for it.
+    """
+    program = sys.modules["__main__"]
+    file = getattr(program, "__file__", None)
+    lost = file is not None and not Path(file).exists()
+    # Blocked here, it is blocked in them from their first instruction on, up to `_exit_with_parent`.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        if lost:
+            del program.__file__
+        yield
+    finally:
+        if lost:
+            program.__file__ = file
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _exit_with_parent() -> None:
-    """End this worker when its parent dies, even by SIGKILL; it would otherwise wait for ever."""
+    """End this worker when its parent dies, even by SIGKILL, where it would otherwise wait for ever; and at
+    Ctrl-C without a word: its parent says it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent = multiprocessing.parent_process()
     assert parent is not None
     threading.Thread(target=_watch, args=(parent.sentinel,), daemon=True).start()

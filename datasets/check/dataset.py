@@ -40,6 +40,7 @@ from motionloom.datasets.schema import (
     ShardInfo,
     Split,
     UserError,
+    open_plain,
 )
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import (
@@ -184,7 +185,7 @@ def _checked_clips(
     if len(clips) != shard.samples:
         findings.error("shard", shard.name, f"{len(clips)} samples, the manifest says {shard.samples}")
     frames = 0
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         for row, clip in enumerate(clips):
             try:
                 checked = check_clip(file, path, clip, shard, layout)

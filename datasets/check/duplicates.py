@@ -25,7 +25,7 @@ from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import ClipMeta, ShardInfo
+from motionloom.datasets.schema import ClipMeta, ShardInfo, open_plain
 from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
 
 SAME_METRES = 0.005
@@ -130,7 +130,7 @@ class ClipTable:
 
     def _motion(self, clip: _Seen) -> NDArray[np.floating]:
         path = self.root / self.shards[clip.shard].name
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             start, size = clip.motion
             file.seek(start)
             return npy_from_bytes(file.read(size), f"{path}: '{clip.key}.motion.npy'")

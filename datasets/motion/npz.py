@@ -19,7 +19,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, require_plain
 
 MAX_BYTES = 2**30
 """Largest array read by default: an hour at 200 frames a second of 156 doubles is 0.9 GB."""
@@ -86,6 +86,8 @@ class NpzFile:
     def __init__(self, path: Path | IO[bytes], label: str | None = None) -> None:
         self.label = str(path) if label is None else label
         try:
+            if isinstance(path, Path):
+                require_plain(path, self.label)
             self._zip = zipfile.ZipFile(path)
         except OSError as error:
             raise UserError(f"{self.label}: cannot be read ({error.strerror or error})") from None

@@ -22,7 +22,7 @@ from typing import BinaryIO
 from pydantic import Field
 
 from motionloom.datasets.base.lock import file_lock
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.schema import Config, UserError, open_plain
 
 _OURS = re.compile(r"[0-9a-f]{64}\.(tar|index\.npz|manifest\.json)")
 """Names of what is kept. Nothing else is ever deleted: a recipe may name any folder for the cache."""
@@ -56,7 +56,7 @@ class FileCache:
         """Open a cached file and mark it as used now; None when it is not cached."""
         path = self.folder / name
         try:
-            file = path.open("rb")
+            file = open_plain(path)
         except FileNotFoundError:
             return None
         except OSError as error:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.schema import ShardInfo, UserError
+from motionloom.datasets.schema import ShardInfo, UserError, require_plain
 
 _ADVICE = "copy it back or convert again"
 
@@ -55,6 +55,7 @@ def require_intact(shard: LocalShard, *, content: bool = True) -> None:
 
 def fault_of(shard: LocalShard, *, content: bool = True) -> str:
     """Return what makes a shard another than the manifest's, in words; empty when nothing does."""
+    require_plain(shard.path)
     size = shard.path.stat().st_size
     if size != shard.info.bytes:
         return f"{size} bytes, the manifest says {shard.info.bytes}: truncated or changed"

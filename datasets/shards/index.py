@@ -29,7 +29,16 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.npz import NpzFile, read_npy_header
-from motionloom.datasets.schema import INDEX_FILE, PRESENT_ALL, Config, Dropped, ShardInfo, Split, UserError
+from motionloom.datasets.schema import (
+    INDEX_FILE,
+    PRESENT_ALL,
+    Config,
+    Dropped,
+    ShardInfo,
+    Split,
+    UserError,
+    open_plain,
+)
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.tar import scan_tar
 
@@ -97,7 +106,7 @@ def index_path(tar: Path) -> Path:
 def clip_entries(path: Path, written: list[Written]) -> list[ClipEntry]:
     """Index rows of a tar as it lies on the disk; `written` says the rest of its clips, in order."""
     entries = []
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         for clip, about in zip(scan_tar(path), written, strict=True):
             start, size = clip.members["motion.npy"]
             file.seek(start)
@@ -181,7 +190,7 @@ def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:
     """The arrays of one split of a dataset folder, checked against the manifest's rows for it."""
     path = root / INDEX_FILE
     try:
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             return read_index(file, str(path), split, shards)
     except OSError:
         raise UserError(f"{path}: no such file; convert the dataset again") from None

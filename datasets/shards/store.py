@@ -19,14 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
-from motionloom.datasets.schema import (
-    INDEX_FILE,
-    MANIFEST_FILE,
-    ShardInfo,
-    UserError,
-    read_plain,
-    require_plain,
-)
+from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError, open_plain, read_plain
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 from motionloom.datasets.shards.checksums import LocalShard, fault_of
 
@@ -106,8 +99,7 @@ class LocalStore:
 
     def _open(self, name: str) -> BinaryIO:
         try:
-            require_plain(self.root / name, self.where(name))
-            return (self.root / name).open("rb")
+            return open_plain(self.root / name, self.where(name))
         except FileNotFoundError:
             raise MissingFileError(f"{self.where(name)}: no such file") from None
         except OSError as error:

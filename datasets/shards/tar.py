@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.register import discover
 from motionloom.datasets.motion.npz import read_npy_header
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, require_plain
 from motionloom.datasets.shards.sample import MEMBERS
 
 MOST_CLIPS = 10_000
@@ -39,6 +39,7 @@ def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
     """
     clips: list[TarClip] = []
     seen: set[str] = set()
+    require_plain(path)
     size, end = path.stat().st_size, 0
     if size == 0:
         raise UserError(f"{path}: empty file, 0 bytes: an interrupted download or write")

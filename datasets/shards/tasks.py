@@ -19,7 +19,7 @@ from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of_j
 from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SPLITS, Dropped, MotionType, ShardInfo, Split, UserError
+from motionloom.datasets.schema import SPLITS, Dropped, MotionType, ShardInfo, Split, UserError, open_plain
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, Written, clip_entries, index_path
 from motionloom.datasets.shards.left_out import drop
@@ -179,7 +179,7 @@ Encoded = list[tuple[str, int, dict[str, bytes]]]
 def _kept(tar: Path, made_from: str) -> Encoded:
     """The samples as an earlier run wrote them."""
     out = []
-    with tar.open("rb") as file:
+    with open_plain(tar) as file:
         for clip in _index_of(tar)[1].get(made_from, []):
             members = {}
             for name, (start, size) in clip.members.items():

@@ -24,9 +24,9 @@ from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.motion.npz import MAX_BYTES, NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError
+from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError, read_plain
 from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tar import npy_from_bytes
 from motionloom.pipeline.contract.editing import RecordedClip
@@ -147,7 +147,7 @@ class Search:
             clip = read_clip(path)
         else:
             layout = next(iter(self.splits.values())).layout
-            values = npy_from_bytes(path.read_bytes(), str(path)).astype(np.float64)
+            values = npy_from_bytes(read_plain(path, MAX_BYTES), str(path)).astype(np.float64)
             joints = joints_of(values, layout) if values.ndim == 2 else values
             if joints.ndim != 3 or joints.shape[1] not in (BODY_JOINTS, 52) or joints.shape[2] != 3:
                 raise UserError(f"{path}: {list(joints.shape)}, wanted joints [T, 22 or 52, 3]")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import warnings
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -35,8 +36,17 @@ def say(console: Console, text: object, style: str | None = None) -> None:
     console.print(printable(str(text)), style=style, markup=False, highlight=False, soft_wrap=True)
 
 
+def _tell_warning(message: Warning | str, _category: type[Warning], file: str, *_place: object) -> None:
+    """Print a warning as one sentence; one of another package begins with that package's name."""
+    # Python's own lines quote a place in the source, which tells users nothing.
+    package = Path(file.partition("site-packages")[2]).parts[1:2]
+    who = "" if package in ((), ("motionloom",)) else f"{package[0].removesuffix('.py')}: "
+    say(make_console(aside=True), f"note: {who}{' '.join(str(message).split())}", "yellow")
+
+
 def quiet_libraries() -> None:
     """Keep the libraries' chatter out of the way of our own lines."""
+    warnings.showwarning = _tell_warning
     os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
     # Threads that wait sleep: awake they take the cores of those they wait for, wherever a machine is shared.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

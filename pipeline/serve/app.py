@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
 from importlib import resources
 from typing import TypeVar
 from urllib.parse import quote
@@ -24,7 +25,7 @@ from motionloom.pipeline.inference.edits.edit import require_editor
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
 from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips
-from motionloom.pipeline.serve.guard import OwnPage, allowed_hosts, read_body
+from motionloom.pipeline.serve.guard import Bodies, OwnPage, allowed_hosts
 from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds
 
 RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
@@ -35,7 +36,8 @@ _SCRIPTS = ("serve.js", "edit.js", "lanes.js", "figure.js", "task.js")
 """Scripts of the page, besides the viewer's."""
 
 _UPLOADS = 4
-"""Sounds and clips that are received at a time; others wait unread."""
+"""Sounds and clips that are decoded at a time; a place is taken when all of one is here, so that slow senders
+hold none."""
 
 
 class Site:
@@ -46,7 +48,7 @@ class Site:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="model")
         self._asked = 0
         self.sounds, self.clips = Sounds(config), Clips(model, config)
-        self._uploads = asyncio.Semaphore(_UPLOADS)
+        self._bodies, self._uploads = Bodies(config.patience), asyncio.Semaphore(_UPLOADS)
         self._assets = {
             "serve.css": resource("viewer/viewer.css") + _web_file("serve.css"),
             "viewer.js": viewer_script(),
@@ -149,27 +151,28 @@ class Site:
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
         # Decoded in another thread, so that the server answers meanwhile.
-        data = await self._upload(http, "the sound", self.config.max_sound_mb)
-        name, sound = await asyncio.to_thread(self.sounds.add, data)
+        async with self._upload(http, "the sound", self.config.max_sound_mb) as data:
+            name, sound = await asyncio.to_thread(self.sounds.add, data)
         return JSONResponse({"sound": name, "seconds": round(sound.seconds, 3)})
 
     async def add_clip(self, http: Request) -> Response:
         """Keep the motion file that the body is, under a name for later requests."""
         require_editor(self.model.bundle.generator)
-        data = await self._upload(http, CLIP, self.config.max_clip_mb)
-        return JSONResponse(await asyncio.to_thread(self.clips.add, data))
+        async with self._upload(http, CLIP, self.config.max_clip_mb) as data:
+            return JSONResponse(await asyncio.to_thread(self.clips.add, data))
 
-    async def _upload(self, http: Request, what: str, most: float) -> bytes:
-        async with self._uploads:
-            return await read_body(http, what, _bytes(most), self.config.patience)
+    @asynccontextmanager
+    async def _upload(self, http: Request, what: str, most: float) -> AsyncIterator[bytes]:
+        async with self._bodies.read(http, what, _bytes(most)) as data, self._uploads:
+            yield data
 
     async def _read_request(self, http: Request, kind: type[RequestT]) -> RequestT:
         media = http.headers.get("content-type", "").split(";")[0].strip().lower()
         if media != "application/json":
             raise HTTPException(415, "send JSON with Content-Type: application/json")
         most = round(self.config.max_request_kb * 1024)
-        data = await read_body(http, "the request", most, self.config.patience)
-        fields = parse_json(data, "the request")
+        async with self._bodies.read(http, "the request", most) as data:
+            fields = parse_json(data, "the request")
         if not isinstance(fields, dict):
             raise HTTPException(400, 'the request is not a JSON object like {"caption": "a person waves"}')
         request = kind.parse(fields, "request")

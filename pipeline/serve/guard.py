@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -35,6 +37,9 @@ HEADERS = {
     "cache-control": "no-store",
 }
 """Sent with every answer, also those of uvicorn itself."""
+
+MOST_HELD = 2**28
+"""Bytes of all bodies that are held at a time: a dozen of the largest."""
 
 
 def allowed_hosts(config: ServeConfig) -> list[str]:
@@ -77,24 +82,36 @@ class OwnPage:
         return None
 
 
-async def read_body(request: Request, what: str, most: int, patience: float) -> bytes:
-    """Return the body, at most `most` bytes; 413 as soon as it is larger, 408 after `patience` seconds."""
-    data = bytearray()
+class Bodies:
+    """Reads bodies within limits: of each of them, and of all that are held at a time."""
 
-    async def read() -> None:
-        async for piece in request.stream():
-            data.extend(piece)
-            if len(data) > most:
-                raise HTTPException(
-                    413,
-                    f"{what} is larger than this server takes: at most {most} bytes",
-                    {"connection": "close"},
-                )
+    def __init__(self, patience: float, most: int = MOST_HELD) -> None:
+        self.patience, self.most, self._held = patience, most, 0
 
-    try:
-        await asyncio.wait_for(read(), patience)
-    except TimeoutError:
-        raise HTTPException(
-            408, f"not all of it came within {patience:g} s", {"connection": "close"}
-        ) from None
-    return bytes(data)
+    @asynccontextmanager
+    async def read(self, request: Request, what: str, most: int) -> AsyncIterator[bytes]:
+        """Give the body, at most `most` bytes; 413 as soon as it is larger, 408 after `patience` seconds, 503
+        where those of others, which wait or still come, take all memory that there is for bodies.
+        """
+        pieces, size = list[bytes](), 0
+
+        async def read() -> None:
+            nonlocal size
+            async for piece in request.stream():
+                pieces.append(piece)
+                size, self._held = size + len(piece), self._held + len(piece)
+                if size > most:
+                    words = f"{what} is larger than this server takes: at most {most} bytes"
+                    raise HTTPException(413, words, {"connection": "close"})
+                if self._held > self.most:
+                    words = "too much is being uploaded already; try again in a moment"
+                    raise HTTPException(503, words, {"connection": "close", "retry-after": "5"})
+
+        try:
+            await asyncio.wait_for(read(), self.patience)
+            yield b"".join(pieces)
+        except TimeoutError:
+            words = f"not all of it came within {self.patience:g} s"
+            raise HTTPException(408, words, {"connection": "close"}) from None
+        finally:
+            self._held -= size

@@ -221,7 +221,7 @@ def beat2(root: Path) -> Path:
     sing(folder / "wave16k/2_scott_0_1_1.wav")
     words = ((0.0, 0.2, ""), (0.2, 0.6, "hello"), (0.6, 1.0, "there"), (1.0, 2.0, ""), (2.0, 2.5, "friend"))
     rows = [f'xmin = {a} \n xmax = {b} \n text = "{word}" ' for a, b, word in words]
-    tier = "\n".join([' class = "IntervalTier" ', ' name = "words" ', *rows])
+    tier = "\n".join([' class = "IntervalTier" ', ' name = "words" ' + "\n" * 2**20, *rows])
     phones = tier.replace("words", "phones").replace("hello", "HH")
     text = f'File type = "ooTextFile"\nitem []: \n  item [1]:\n{tier}\n  item [2]:\n{phones}\n'
     put(folder / "textgrid/2_scott_0_1_1.TextGrid", text)

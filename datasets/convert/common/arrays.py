@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.npz import ArrayHeader, read_npy_header
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, open_plain
 
 Limit = float | NDArray[np.float64]
 
@@ -41,7 +41,7 @@ def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | 
     """T of a file that `load_array` accepts as far as header and size tell; `UserError` otherwise."""
     label = str(path) if name is None else name
     try:
-        with path.open("rb") as file:
+        with open_plain(path, label) as file:
             size = os.fstat(file.fileno()).st_size
             if size == 0:
                 raise UserError(f"{label}: empty file")

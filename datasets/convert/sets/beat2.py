@@ -26,7 +26,9 @@ from motionloom.datasets.schema import Caption, Split, UserError, number
 
 MOTION, SPEECH, WORDS, LISTS = "smplxflame_30", "wave16k", "textgrid", "train_test_split.csv"
 _SPLITS: dict[str, Split] = {"train": "train", "val": "val", "test": "test"}
-_TIER = re.compile(r'name\s*=\s*"words".*?(?=\n\s*item\s*\[|\Z)', re.DOTALL)
+_ITEM = re.compile(r"^[ \t]*item[ \t]*\[", re.MULTILINE)
+"""Where a tier begins. `\\s` would run over empty lines, and over all of them again from each."""
+_NAME = re.compile(r'name\s*=\s*"words"(.*)', re.DOTALL)
 _WORD = re.compile(r'xmin\s*=\s*([\d.]+)\s+xmax\s*=\s*([\d.]+)\s+text\s*=\s*"((?:[^"]|"")*)"')
 
 
@@ -110,10 +112,10 @@ class Beat2(BodyRelease[Beat2Config]):
             return
         words: list[tuple[float, float, str]] = []
         with draft.reading(file):
-            tier = _TIER.search(read_text_file(path, file))
+            tier = next(filter(None, map(_NAME.search, _ITEM.split(read_text_file(path, file)))), None)
             if tier is None:
                 raise UserError(f'{file}: no tier "words" in it')
-            found = _WORD.findall(tier[0])
+            found = _WORD.findall(tier[1])
             words = [(number(a, file), number(b, file), text.strip()) for a, b, text in found if text.strip()]
         phrase: list[str] = []
         start = end = 0.0

@@ -25,6 +25,7 @@ from motionloom.datasets.audio.sound import MAX_RATE, read_sound
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.amass.smpl_npz import read_motion
 from motionloom.datasets.convert.captions.collect import Captions
+from motionloom.datasets.convert.common.arrays import check_array_header
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
@@ -79,15 +80,17 @@ def device(folder: Path) -> Path:
 
 
 ONE = [ShardInfo(name="x-train-000000.tar", split="train", samples=1, frames=9, bytes=9, sha256="0")]
+PIPED: tuple[Callable[[Path], object], ...] = (
+    Manifest.load_json, JointMap.load, scan_tar, NpzFile, read_clip, read_sound,
+    lambda path: BodyModel.load(path, "smpl22"), lambda path: Captions.read([path]).rows,
+    lambda path: check_array_header(path, width=1),
+)  # fmt: skip
 HOSTILE: dict[str, Callable[[Path], object]] = {
     "an index that declares 64 MiB for one clip": lambda f: read_index(index_of((2**24,)), "i", "train", ONE),
     "a manifest that is a device": lambda f: load_manifest(device(f)),
-    "a manifest that is a pipe": lambda f: load_manifest(pipe(f / "manifest.json").parent),
+    **{f"a pipe {number}": lambda f, read=read: read(pipe(f / "x")) for number, read in enumerate(PIPED)},
     "a manifest of a terabyte": lambda f: load_manifest(huge(f / "manifest.json").parent),
-    "a shard's index that is a pipe": lambda f: Manifest.load_json(pipe(f / "x.index.json")),
-    "captions that are a pipe": lambda f: Captions.read([pipe(f / "c.csv")]).rows,
     "captions that are a device": lambda f: Captions.read([Path("/dev/zero")]).rows,
-    "a joint map that is a pipe": lambda f: JointMap.load(pipe(f / "m.json")),
     "a shard of too many clips": lambda f: scan_tar(tar_of(f / "x.tar", MOST_CLIPS + 1)),
     "a shard of more clips than its manifest has": lambda f: scan_tar(tar_of(f / "x.tar", 9), most=8),
     "3,000 nested joints": lambda f: read_bvh(nested(3_000)),
@@ -166,10 +169,14 @@ def test_sound_of_a_high_rate_is_brought_down_while_it_is_read(tmp_path: Path) -
 
 
 def test_a_check_looks_at_every_number(tmp_path: Path) -> None:
-    """A manifest with a frame rate that no motion has, and a tar of another tool with 1e308 in it."""
-    write(tmp_path / "set")
+    """A manifest with a frame rate that no motion has, and a pipe in the place of a shard."""
+    made = write(tmp_path / "set")
     data = json.loads((tmp_path / "set/manifest.json").read_text())
     (tmp_path / "set/manifest.json").write_text(json.dumps(data | {"fps": 1e308}))
     assert examine(tmp_path / "set").errors
     with pytest.raises(UserError, match="fps"):
         ShardDataset.open(tmp_path / "set", "train")
+    write(tmp_path / "other")
+    shard = tmp_path / "other" / made.shards[0].name
+    shard.unlink()
+    assert any("plain file" in problem.message for problem in examine(pipe(shard).parent).errors)

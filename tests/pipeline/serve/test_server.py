@@ -130,14 +130,18 @@ def test_what_is_no_request(served: Any) -> None:
 
 
 def test_a_slow_request_is_let_go(run_server: Callable[..., Any], quick: Any) -> None:
-    head = b"POST /api/generate HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
-    with (
-        run_server(quick, patience=0.3) as served,
-        socket.create_connection(("127.0.0.1", served.port)) as raw,
-    ):
-        raw.settimeout(20)
-        raw.sendall(head + b"Content-Length: 100\r\n\r\n{")
-        assert raw.recv(64).startswith(b"HTTP/1.1 408")
+    """And sixty that send a sound slowly keep nobody else's waiting until they are."""
+    head = b"POST /api/sounds HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100\r\n\r\n{"
+    with run_server(quick, patience=5.0) as served, contextlib.ExitStack() as held:
+        slow = [held.enter_context(socket.create_connection(("127.0.0.1", served.port))) for _ in range(60)]
+        for raw in slow:
+            raw.sendall(head)
+        assert served.ask("POST", "/api/sounds", tone(1.0)).status == 200
+        slow[0].setblocking(False)
+        with pytest.raises(BlockingIOError):
+            slow[0].recv(64)
+        slow[0].settimeout(20)
+        assert slow[0].recv(64).startswith(b"HTTP/1.1 408")
 
 
 def test_connections_are_bounded(run_server: Callable[..., Any], quick: Any) -> None:

@@ -1,0 +1,37 @@
+"""Workers of a conversion leave the last word to their parent."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+PROGRAM = """
+import time
+from motionloom.datasets.base.pool import Workers
+if __name__ == "__main__":
+    with Workers(2) as workers:
+        list(workers.run(time.sleep, [SECONDS] * 2))
+"""
+
+
+@pytest.mark.parametrize(("seconds", "after"), [(0.1, None), (60, 0.5), (60, 3.0)])
+def test_of_ctrl_c_and_of_a_program_on_standard_input(seconds: float, after: float | None) -> None:
+    """Whether they are still starting or at work; a program that they cannot read again is no error."""
+    program = subprocess.Popen(
+        [sys.executable, "-P", "-"], text=True, stdin=subprocess.PIPE, stderr=subprocess.PIPE, process_group=0
+    )
+    assert program.stdin is not None
+    program.stdin.write(PROGRAM.replace("SECONDS", str(seconds)))
+    program.stdin.close()
+    program.stdin = None
+    if after is not None:
+        time.sleep(after)
+        os.killpg(program.pid, signal.SIGINT)
+    _, said = program.communicate(timeout=50)
+    assert said.count("Traceback") == (after is not None) and "Process" not in said
+    assert (program.returncode == 0) == (after is None)
