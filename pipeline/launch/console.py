@@ -6,7 +6,7 @@ import logging
 import os
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.text import Text
@@ -36,10 +36,17 @@ def say(console: Console, text: object, style: str | None = None) -> None:
     console.print(printable(str(text)), style=style, markup=False, highlight=False, soft_wrap=True)
 
 
-def _tell_warning(message: Warning | str, _category: type[Warning], file: str, *_place: object) -> None:
+def _tell_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
     """Print a warning as one sentence; one of another package begins with that package's name."""
     # Python's own lines quote a place in the source, which tells users nothing.
-    package = Path(file.partition("site-packages")[2]).parts[1:2]
+    package = Path(filename.partition("site-packages")[2]).parts[1:2]
     who = "" if package in ((), ("motionloom",)) else f"{package[0].removesuffix('.py')}: "
     say(make_console(aside=True), f"note: {who}{' '.join(str(message).split())}", "yellow")
 

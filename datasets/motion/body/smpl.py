@@ -24,7 +24,7 @@ from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError, open_plain
+from motionloom.datasets.schema import UserError
 
 SkeletonName = Literal["smpl22", "smplx52"]
 
@@ -92,7 +92,7 @@ class BodyModel:
         for name, values in (("J_regressor", regressor), ("v_template", vertices), ("shapedirs", shapes)):
             if not np.isfinite(values).all():
                 raise UserError(f"{path}: NaN or infinity in {name}")
-        with open_plain(path) as stream:
+        with path.open("rb") as stream:
             sha256 = hashlib.file_digest(stream, "sha256").hexdigest()
         statement = {
             "kind": kind,
