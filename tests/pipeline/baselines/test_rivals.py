@@ -58,7 +58,7 @@ def test_a_stopped_training_goes_on_exactly_and_its_export_generates(
     shutil.copytree(tmp_path / "whole", tmp_path / "parts")
     shutil.rmtree(tmp_path / "parts/stages/made")
     run("parts", 1)
-    assert "step 1 to 3" in run("parts", 3)
+    assert "continues from step 1 of 3" in run("parts", 3)
     one, two = (load_file(tmp_path / f"{out}/stages/made/model.safetensors") for out in ("whole", "parts"))
     assert one.keys() == two.keys() and all(np.array_equal(one[name], two[name]) for name in one)
     assert call("export", tmp_path / "whole", "-o", tmp_path / "model").code == 0

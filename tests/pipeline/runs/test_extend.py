@@ -115,7 +115,7 @@ def test_a_finished_training_goes_on(tmp_path: Path, long: dict[str, object]) ->
     assert go(tmp_path)[:2] == ("run", "never run")
     action, reason, said = go(tmp_path, LONG)
     assert action == "resume" and reason.startswith("train.steps 12 -> 24: ")
-    assert "step 12 to 24" in said and outcome(tmp_path) == long
+    assert "continues from step 12 of 24" in said and outcome(tmp_path) == long
     assert go(tmp_path, LONG)[0] == "skip"
 
 
@@ -125,7 +125,7 @@ def test_an_unfinished_training_goes_on(tmp_path: Path, long: dict[str, object])
         with pytest.raises(ConnectionResetError):
             go(tmp_path, f"duel.train.steps={steps}")
         assert Artifact.find(tmp_path / "run/stages/duel") is None
-    assert "step 12 to 24" in go(tmp_path, LONG)[2]
+    assert "continues from step 12 of 24" in go(tmp_path, LONG)[2]
     assert outcome(tmp_path) == long
 
 
