@@ -34,7 +34,6 @@ from bench import Column, arguments, command_line, kept, process_seconds, report
 from caption_check import BY_CONTENT
 from numpy.typing import NDArray
 from torch import Tensor
-from wordings_obeyed import Label, read_labels
 
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
@@ -69,6 +68,14 @@ COLUMNS = (
 )
 PROBE = (10, 40)
 """Steps of the two trainings whose difference says what a step costs."""
+Label = tuple[str, str]
+"""Content and style of a clip."""
+
+
+def read_labels(path: Path) -> dict[str, Label]:
+    """Content and style by the clips' ids."""
+    rows = (json.loads(line) for line in path.read_text(encoding="utf-8").splitlines())
+    return {row["id"]: (row["content"], row["style"]) for row in rows}
 
 
 class Clips:
