@@ -26,14 +26,14 @@ from motionloom.pipeline.evaluation.retrieval import alignment_stage, retrieve
 from motionloom.pipeline.evaluation.truth import truth_of
 
 ARMS = {"no filter": None, "exact duplicates": 0.999, "0.95": 0.95, "0.85 (the paper)": 0.85}
-"""Captions with a higher sentence cosine are not negatives of each other; equal ones have 1, but for rounding."""
+"""Captions with a higher sentence cosine are not negatives of each other; equal ones have 1, rounded."""
 OTHER = {"left": "right", "right": "left"}
 FIGURES = ("A.t2m/R@1", "A.m2t/R@1", "B.t2m/R@1", "B.m2t/R@1", "B.t2m/R@3")
 COLUMNS = [Column(figure.replace("/", " ").replace(".", ", ") + ", %", figure, 1, 100) for figure in FIGURES]
 
 
 def sides_told_apart(run: Path, stage: str) -> float:
-    """Return the share of test captions with a side that lie nearer to their clip than with the other side."""
+    """Return the share of test captions with a side that lie nearer to their clip than the other side does."""
     source = alignment_stage(run, stage)
     cache = StageCache("cpu")
     dataset = cache.get(source.inputs["data"]).split("test")
