@@ -33,7 +33,7 @@ COLUMNS = [Column(figure.replace("/", " ").replace(".", ", ") + ", %", figure, 1
 
 
 def sides_told_apart(run: Path, stage: str) -> float:
-    """Return the share of test captions with a side that lie nearer to their clip than the other side does."""
+    """Return the share of test captions with a side that are nearer to their clip than the other side is."""
     source = alignment_stage(run, stage)
     cache = StageCache("cpu")
     dataset = cache.get(source.inputs["data"]).split("test")
