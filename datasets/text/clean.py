@@ -13,14 +13,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-_CLIP_NUMBER = re.compile(r"(?:^|\s+)clip\s*\d+$", re.IGNORECASE)
+_CLIP_NUMBER = re.compile(r"clip ?\d+", re.IGNORECASE)
 _INVISIBLE = re.compile("[\u200b\ufeff]")
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f]")
 _WORD = re.compile(r"[^\W\d_]{2,}")
 _CODE = re.compile(r"[a-z][A-Z]")
 """Fields in names of AIST++: gBR, sBM, cAll."""
 _FILE = re.compile(r"\S+\.(?:npy|npz|pkl|txt|json|csv|bvh|fbx|mp4|avi|mov|wav|mp3|zip|tar)", re.IGNORECASE)
-_PATH = re.compile(r"\S*[\\/]\S*")
+_SLASH = re.compile(r"[\\/]")
 _FILING = frozenset({
     "body", "clip", "file", "frame", "frames", "id", "idx", "motion", "part", "recording", "sample", "seq",
     "sequence", "subset", "take", "video",
@@ -34,11 +34,10 @@ def clean_caption(text: str) -> str:
 
     May be empty. Cleaning twice changes nothing.
     """
-    words = _CONTROL.sub(" ", _INVISIBLE.sub("", text)).replace("_", " ")
-    words = " ".join(words.split())
-    while (shorter := _CLIP_NUMBER.sub("", words)) != words:
-        words = shorter
-    return words
+    words = _CONTROL.sub(" ", _INVISIBLE.sub("", text)).replace("_", " ").split()
+    while number := next((n for n in (1, 2) if _CLIP_NUMBER.fullmatch(" ".join(words[-n:]))), 0):
+        del words[-number:]
+    return " ".join(words)
 
 
 def usable_caption(text: str) -> bool:
@@ -46,7 +45,7 @@ def usable_caption(text: str) -> bool:
     raw = text.strip()
     if raw.lower() in _NOTHING or _FILE.fullmatch(raw):
         return False
-    if _PATH.fullmatch(raw) and re.search(r"[\d_]", raw):
+    if _SLASH.search(raw) and not re.search(r"\s", raw) and re.search(r"[\d_]", raw):
         return False
     words = [w for w in re.split(r"[\s,.;:!?]+", clean_caption(raw)) if not re.search(r"\d", w)]
     found = [match for word in words for match in _WORD.findall(word) if not _CODE.match(match)]

@@ -326,8 +326,7 @@ def _exit_code() -> int:
         errors.print(f"error: {error}", style="red", markup=False)
         return 2
     except TeamError as error:
-        sentence = f"process {process_rank()}: another process of this run has stopped ({error})"
-        errors.print(sentence, style="red", markup=False)
+        errors.print(f"process {process_rank()}: {error}", style="red", markup=False)
         return LOST
     except BrokenPipeError:  # `motionloom info | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

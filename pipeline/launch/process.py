@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
+import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import NoReturn
 
 from motionloom.datasets.schema import UserError
@@ -25,8 +28,45 @@ LOST = 76
 """Exit code of a process that ends because another one of its run has."""
 
 
+_LOOK = 1.0
+"""Seconds to wait for the exit code of a process: its connections close a moment before it has one."""
+
+_PARENT = os.getppid()
+started: list[subprocess.Popen[bytes]] = []
+"""Processes of ranks 1, 2, ... of this machine that this one has started: none under torchrun or srun."""
+
+
 class TeamError(Exception):
-    """Another process of this run has stopped; the message is the backend's."""
+    """Another process of this run has stopped; the message says which, how, and what to do."""
+
+    @classmethod
+    def lost(cls, folder: Path | None = None) -> TeamError:
+        """The error where a connection broke; processes that hung have left their stacks in `folder`."""
+        stacks = sorted(folder.glob("stalled_rank_*.txt")) if folder else []
+        traces = "".join(f"; {path} says where it hung" for path in stacks if path.stat().st_size)
+        return cls(f"{_who_ended()}{traces}; the same command goes on from the newest checkpoint")
+
+
+def _who_ended() -> str:
+    """Name the process that ended first and how, as far as this one can know."""
+    led, end = _started_by_lead(), time.monotonic() + _LOOK
+    while (led or started) and time.monotonic() < end:
+        if led and os.getppid() != _PARENT:
+            return "process 0, which started this one, has ended"
+        for number, process in enumerate(started, start=1):
+            code = process.poll()
+            if code not in (None, 0, LOST):  # those have ended because of another
+                return f"process {number} of this machine (pid {process.pid}) {_how_ended(code or 0)}"
+        time.sleep(0.02)
+    where = "process 0" if led else "the lines above or the launcher's log"
+    return f"another process of this run has stopped; {where} may say which and why"
+
+
+def _how_ended(code: int) -> str:
+    if code > 0:
+        return f"ended with exit code {code}; its lines stand above"
+    memory = ", as the system does where memory runs out" if -code == signal.SIGKILL else ""
+    return f"was ended by signal {-code} ({signal.Signals(-code).name}{memory})"
 
 
 class Interrupted(BaseException):
@@ -66,10 +106,11 @@ def process_rank() -> int:
 
 def _joint_exit(code: int) -> int:
     """The code; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
-    started_by_lead = (
-        "RANK" not in os.environ and srun_tasks() == 1 and int(os.environ.get("LOCAL_RANK", 0)) > 0
-    )
-    return 0 if started_by_lead else code
+    return 0 if _started_by_lead() else code
+
+
+def _started_by_lead() -> bool:
+    return "RANK" not in os.environ and srun_tasks() == 1 and int(os.environ.get("LOCAL_RANK", 0)) > 0
 
 
 def srun_tasks() -> int:

@@ -18,7 +18,7 @@ import torch.distributed as dist
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.launch.process import TeamError, srun_tasks
+from motionloom.pipeline.launch.process import TeamError, srun_tasks, started
 
 if TYPE_CHECKING:
     from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
@@ -63,6 +63,7 @@ class Team:
             plugins=[launcher] if launcher else None,
         )
         fabric.launch()
+        started.extend(getattr(fabric.strategy.launcher, "procs", ()))
         return Team(fabric.global_rank, fabric.world_size, _patient_group())
 
     @property
@@ -74,8 +75,8 @@ class Team:
             return
         try:
             dist.barrier(self.waiting)
-        except RuntimeError as error:
-            raise TeamError(str(error)) from None
+        except RuntimeError:
+            raise TeamError.lost() from None
 
     def gather(self, mine: Found) -> list[Found]:
         """Return in every process the values of all, in the order of their ranks."""
@@ -84,8 +85,8 @@ class Team:
         values = [mine] * self.world
         try:
             dist.all_gather_object(values, mine, self.waiting)
-        except RuntimeError as error:
-            raise TeamError(str(error)) from None
+        except RuntimeError:
+            raise TeamError.lost() from None
         return values
 
 
@@ -102,7 +103,7 @@ def lead_finds(find: Callable[[], Found]) -> Found:
         dist.broadcast_object_list(result, src=0, group=_patient_group())
     except RuntimeError as error:
         if "by peer" in str(error):
-            raise TeamError(str(error)) from None
+            raise TeamError.lost() from None
         raise
     return cast(Found, result[0])
 

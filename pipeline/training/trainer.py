@@ -82,7 +82,7 @@ def fit(
         raise
     except RuntimeError as error:
         if isinstance(error, dist.DistBackendError) or "by peer" in str(error) or "imed out" in str(error):
-            raise TeamError(str(error)) from None
+            raise TeamError.lost(training.log.folder) from None
         if "does not have a deterministic implementation" in str(error):
             what = str(error).partition(",")[0]
             raise UserError(f"stage {context.name}: {what}; set hardware.deterministic: false") from error

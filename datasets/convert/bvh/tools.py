@@ -54,7 +54,7 @@ CONVENTIONS = tuple(_conventions())
 _WORDS = {word for known in CONVENTIONS for word in known.words()}
 _SIDES = {"left": "left", "lft": "left", "l": "left", "right": "right", "rgt": "right", "r": "right"}
 
-_NAMESPACE = re.compile(r".*[:|/]")
+_NAMESPACE = re.compile(r"[:|/]")
 _PIECE = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
 _HELPER = re.compile(r"(^|_)__[^_]")
 """MakeHuman's `__UpLeg_L` is a helper above `UpLeg_L`."""
@@ -64,7 +64,7 @@ _MOST = 0.6
 
 def by_word(joints: Sequence[str]) -> dict[tuple[str, str], int]:
     """The joint of each side (`left`, `right` or empty) and word, where it is the only one."""
-    names = [_NAMESPACE.sub("", name) for name in joints]
+    names = [_NAMESPACE.split(name)[-1] for name in joints]
     pieces = [_pieces(name) for name in names]
     for end, trimmed in ((0, slice(1, None)), (-1, slice(None, -1))):
         while common := _common(pieces, end):

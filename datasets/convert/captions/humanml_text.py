@@ -20,6 +20,8 @@ from motionloom.datasets.schema import Caption, UserError, number
 from motionloom.datasets.text.clean import clean_caption, usable_caption
 
 _TOKEN = re.compile(r"\S+/[A-Z]+")
+_MOST_FIELDS = 100
+"""Between the `#` of a line. Each may be where the tokens begin, so the time to find them grows with both."""
 
 
 def read_humanml_captions(
@@ -45,7 +47,7 @@ def read_humanml_captions(
 def parse_caption(line: str, *, seconds: float | None, source: str = "humanml3d") -> Caption:
     """Return the caption of one line; `UserError` says what is wrong with it."""
     fields = line.split("#")
-    if len(fields) < 4:
+    if not 4 <= len(fields) <= _MOST_FIELDS:
         raise UserError(f"{len(fields)} of the 4 fields caption#tokens#start#end")
     text, tokens = _caption_and_tokens(fields[:-2])
     start, end = _seconds(fields[-2], "start"), _seconds(fields[-1], "end")

@@ -32,8 +32,7 @@ TEXT_KEYS = ("caption", "text", "description")
 
 _TEXT = {word: re.compile(rf"{word}s?(?:_?\d+)?") for word in TEXT_KEYS}
 _SUFFIX = re.compile(r"\.(?:bvh|amc|npz|npy|pkl|fbx|c3d|glb|txt|json|csv|mp4|wav)$", re.IGNORECASE)
-_NUMBER = r"\s*(?:nan|[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|[-+]?\.\d+)\s*"
-_HUMANML = re.compile(rf"[^#].*#.*#{_NUMBER}#{_NUMBER}")
+_NUMBER = re.compile(r"\s*(?:nan|[-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|[-+]?\.\d+)\s*")
 _AMASS = re.compile(r"_(?:poses|stageii)$")
 CATALOGUE = "<catalogue>"
 _RECORD = '{"id": "walk-001", "captions": ["a person walks"]}'
@@ -241,11 +240,17 @@ def text_records(folder: Path, paths: Iterable[Path]) -> Records:
     """
     texts = {path: read_text_file(path).split("\n") for path in paths}
     firsts = (next((line for line in lines if line.strip()), "") for lines in texts.values())
-    humanml = any(_HUMANML.fullmatch(line) for line in firsts)
+    humanml = any(map(_is_humanml, firsts))
     for path, lines in texts.items():
         name = path.relative_to(folder).as_posix().removesuffix(".txt")
         captions = _humanml(path, lines) if humanml else [line for line in lines if line.strip()]
         yield f"{path}:1", {"id": name, "captions": captions}
+
+
+def _is_humanml(line: str) -> bool:
+    """Whether a line has HumanML3D's grammar: a caption, tokens and two numbers between `#`."""
+    fields = line.split("#")
+    return len(fields) >= 4 and bool(fields[0]) and all(map(_NUMBER.fullmatch, fields[-2:]))
 
 
 def _humanml(path: Path, lines: Iterable[str]) -> list[Caption]:

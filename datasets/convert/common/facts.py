@@ -25,7 +25,7 @@ _ORDER: dict[str, Callable[[float, float], bool]] = {
     ">": operator.gt,
     ">=": operator.ge,
 }
-_AND = re.compile(r"\s+and(?:\s+(?=[A-Za-z_][\w.]*\s*[<>=!])|\s*$)", re.IGNORECASE)
+_AND = re.compile(r"(?<!\s)\s+and(?:\s+(?=[A-Za-z_][\w.]*\s*[<>=!])|\s*$)", re.IGNORECASE)
 """The word between two conditions: `and` within a value is followed by no name with an operator."""
 _CONDITION = re.compile(r"""([A-Za-z_][\w.]*)\s*(<=|>=|!=|=|<|>)\s*("[^"]*"|'[^']*'|[^<>=!"']+)""")
 

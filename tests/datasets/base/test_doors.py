@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
 import json
 import math
 import os
-from collections.abc import Callable
+import pkgutil
+import re
+import re._constants as sre
+import re._parser as sre_parser
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import save_file
 
+from motionloom.datasets.convert.captions.humanml_text import parse_caption
 from motionloom.datasets.schema import UserError, number, parse_json, whole
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.store.weights import exact_tensors, load_weights
@@ -132,3 +139,49 @@ def test_text_becomes_a_number_at_the_door(folder: str) -> None:
             )
             bare = isinstance(given, ast.Name) or text or (field and isinstance(given.slice, ast.Constant))
             assert not bare or ast.unparse(node) in KNOWN, where
+
+
+def slow_parts(pattern: str | bytes, flags: int, *, searched: bool) -> int:
+    """Parts of a pattern that may look at the letters of a line once for each letter: a repeat at the start
+    of one that is searched for, at any letter, and further repeats that take what the first one does.
+    """
+    parts = list(flat(sre_parser.parse(pattern, flags)))
+    endless = [
+        op in (sre.MAX_REPEAT, sre.MIN_REPEAT, sre.POSSESSIVE_REPEAT) and arg[1] is sre.MAXREPEAT
+        for op, arg in parts
+    ]
+    wide = 0
+    for at, (_, arg) in enumerate(parts):
+        if endless[at]:
+            kind, taken = arg[2][0]
+            after = parts[at + 1 : at + 2]
+            any_but_one = kind is sre.NOT_LITERAL and after == [(sre.LITERAL, taken)]
+            most = kind is sre.ANY or (kind is sre.IN and taken[0] == (sre.CATEGORY, sre.CATEGORY_NOT_SPACE))
+            wide += most or (kind is sre.NOT_LITERAL and not any_but_one)
+    return (searched and endless[0] and len(parts) > 1) + max(0, wide - 1)
+
+
+def flat(parsed: Any) -> Iterator[tuple[Any, Any]]:
+    for op, arg in parsed:
+        yield from flat(arg[3]) if op is sre.SUBPATTERN else [(op, arg)]
+
+
+def test_no_pattern_looks_at_long_lines_once_for_each_letter() -> None:
+    """By their form, without a clock: `_PLACE` is of words of the command line, `_HEADER` of two lines."""
+    for slow in (r".*[:|/]", r"\s+and", r"[^#].*#.*#\d", r"\S*/\S*"):
+        assert slow_parts(slow, 0, searched=True)
+    seen = 0
+    for folder in ("convert", "motion", "text"):
+        room = importlib.import_module(f"motionloom.datasets.{folder}")
+        for found in pkgutil.walk_packages(room.__path__, f"{room.__name__}."):
+            module = importlib.import_module(found.name)
+            source = inspect.getsource(module)
+            for name, value in vars(module).items():
+                searched = re.search(rf"\b{name}\.(search|sub|split|findall|finditer)\b", source) is not None
+                for one in value.values() if isinstance(value, dict) else [value]:
+                    if isinstance(one, re.Pattern) and name not in ("_PLACE", "_HEADER"):
+                        seen += 1
+                        assert not slow_parts(one.pattern, one.flags, searched=searched), (found.name, name)
+    assert seen > 30
+    with pytest.raises(UserError, match="1001 of the 4"):
+        parse_caption("a person walks" + "#" * 1000, seconds=None)

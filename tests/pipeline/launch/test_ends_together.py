@@ -34,7 +34,9 @@ def test_the_others_end_when_one_dies(jobs: Jobs, tmp_path: Path, rank: int) -> 
     wait_for_step(tmp_path, 5)
     pids = [pid_of(tmp_path, one) for one in range(2)]
     os.kill(pids[rank], signal.SIGKILL)
-    end_of(job, pids)
+    said = end_of(job, pids)
+    who = f"process 1 of this machine (pid {pids[1]})" if rank else "process 0, which started this one, has"
+    assert who in said and ("SIGKILL" in said) == bool(rank) and ".cc:" not in said
 
 
 @pytest.mark.parametrize("how", ["stops", "hangs"])

@@ -110,4 +110,4 @@ def test_an_error_of_the_lead_ends_those_who_wait(
     words = ("run", recipe, "--out", run, "--from", "tokens", "--until", "gpt", *PAIR)
     output = finish(start(*words), code=2)
     assert "where a folder is" in output
-    assert "process 1: another process" in output
+    assert "process 1: process 0, which started this one, has ended" in output
