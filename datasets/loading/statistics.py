@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
 from motionloom.datasets.motion.layout import ROOT, Family, MotionLayout
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, read_plain
 from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.tar import npy_from_bytes
 
 STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
@@ -92,8 +93,8 @@ class FeatureStats:
         arrays = []
         for path in (mean, std):
             try:
-                values = np.load(path, allow_pickle=False)
-            except (OSError, ValueError) as error:
+                values = npy_from_bytes(read_plain(path, _MOST_BYTES), str(path))
+            except OSError as error:
                 raise UserError(f"{path}: cannot be read as an array of numbers ({error})") from None
             if values.shape != (layout.dim,) or values.dtype.kind != "f" or not np.isfinite(values).all():
                 raise UserError(
@@ -196,6 +197,9 @@ def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False)
     std = np.where(counted, np.maximum(std, STD_FLOOR), 1.0)
     return FeatureStats(moments.mean.astype(np.float32), std.astype(np.float32), layout, frames)
 
+
+_MOST_BYTES = 2**20
+"""Largest file of a mean or a deviation: a layout has some hundreds of columns."""
 
 _CONSTANT = 1e-6
 """A column whose standard deviation is below this share of its size (or of 1) does not change."""

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.npz import ArrayHeader, read_npy_header
+from motionloom.datasets.motion.npz import MAX_BYTES, ArrayHeader, read_npy_header
 from motionloom.datasets.schema import UserError, open_plain
 
 Limit = float | NDArray[np.float64]
@@ -45,6 +45,8 @@ def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | 
             size = os.fstat(file.fileno()).st_size
             if size == 0:
                 raise UserError(f"{label}: empty file")
+            if size > MAX_BYTES:
+                raise UserError(f"{label}: {size:,} bytes; at most {MAX_BYTES:,} are read")
             header = read_npy_header(file, label, size)
     except OSError as error:
         raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None

@@ -10,6 +10,8 @@ import pytest
 from motionloom.datasets.convert.captions.humanml_text import parse_caption, read_humanml_captions
 from motionloom.datasets.convert.common.arrays import load_array
 from motionloom.datasets.convert.common.files import inside
+from motionloom.datasets.loading.statistics import FeatureStats
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
 
 
@@ -44,6 +46,18 @@ TOKENS = "a/DET person/NOUN walk/VERB"
 
 def line(text: str, start: object = "0.0", end: object = "0.0", tokens: str = TOKENS) -> str:
     return f"{text}#{tokens}#{start}#{end}"
+
+
+def test_arrays_beyond_the_limit_are_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    frames, layout = 2**27, MotionLayout.named("h3d263")
+    with path.open("wb") as file:  # sparse: 2 GiB that take no room
+        head = {"descr": "<f8", "fortran_order": False, "shape": (frames, 2)}
+        np.lib.format.write_array_header_1_0(file, head)
+        file.truncate(file.tell() + frames * 16)
+    for read in (lambda: load_array(path, width=2), lambda: FeatureStats.of_arrays(path, path, layout)):
+        with pytest.raises(UserError, match=r"a\.npy: .* bytes; at most"):
+            read()
 
 
 @pytest.mark.parametrize("ending", ["\n", "\r\n", "\r"])
