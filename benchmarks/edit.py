@@ -35,11 +35,12 @@ from motionloom.datasets.motion.features.joints import local_joints_of
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
 from motionloom.models.metrics.dance import foot_skating
-from motionloom.pipeline.contract.editing import EditTask, RecordedClip
+from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.edits.clip_file import read_clip
 from motionloom.pipeline.inference.edits.edit import accelerations
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.model import MotionModel, edit_clip
 from motionloom.pipeline.inference.motion import EditedMotion
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder

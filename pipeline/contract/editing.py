@@ -1,4 +1,4 @@
-"""A clip, and `EditTask`: what is to be done to it, for the command line, Python and the page's JSON.
+"""`EditTask`: what is to be done to a clip, for the command line, Python and the page's JSON.
 
 Times are seconds of the clip: 0 is its first frame, what is made before it (`lead`) has negative ones.
 Positions are metres in the clip's world, Y up, the floor at height 0.
@@ -13,38 +13,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from motionloom.datasets.motion.layout import BODY_JOINTS, FigurePart
+from motionloom.datasets.motion.layout import FigurePart
 from motionloom.datasets.schema import Config
 
 MAX_SPEED = 12.0
 """Metres a second of a root; the fastest sprint that was measured (Bolt, Berlin 2009) reached 12.4."""
 Seconds = Annotated[float, Field(ge=-3600, le=3600)]
 Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1000, le=1000)]
-
-
-@dataclass(frozen=True)
-class RecordedClip:
-    """A clip as it was recorded or made."""
-
-    name: str
-    joints: NDArray[np.float64]
-    """Metres, Y up: [T, 22, 3], or [T, 52, 3] where it has hands."""
-    fps: float
-    face: NDArray[np.float32] | None = None
-    """Expression [T, 50]."""
-    caption: str = ""
-
-    @property
-    def has_hands(self) -> bool:
-        return int(self.joints.shape[1]) > BODY_JOINTS
-
-    @property
-    def seconds(self) -> float:
-        return len(self.joints) / self.fps
 
 
 class Kept(Config):

@@ -29,10 +29,10 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError, read_plain
 from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tar import npy_from_bytes
-from motionloom.pipeline.contract.editing import RecordedClip
 from motionloom.pipeline.contract.lookup import finished_stages, open_exported
 from motionloom.pipeline.contract.stage import ALIGNMENT, StageCache
 from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.evaluator import embed_motions

@@ -21,14 +21,17 @@ import torch
 from huggingface_hub import ModelHubMixin
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.bvh.own_file import OwnBvh
+from motionloom.datasets.schema import UserError
 from motionloom.models.layers.seeds import sample_seeds
-from motionloom.pipeline.contract.editing import EditTask, RecordedClip
+from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.edits.clip_file import changed, read_clip, read_seed_motion, require_clip
-from motionloom.pipeline.inference.edits.edit import finish, require_editor, require_work
+from motionloom.pipeline.inference.edits.edit import finish, own_bvh, require_editor, require_work
 from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.requests import require_seed, weight_bytes
@@ -159,7 +162,7 @@ class MotionModel(
         require_editor(self.bundle.generator)
         asked = EditTask.parse(task, "task")
         if isinstance(clip, GeneratedMotion):
-            recorded = RecordedClip("the motion", clip.joints, clip.fps, clip.face, clip.caption)
+            recorded = RecordedClip("the motion", clip.joints, clip.fps, clip.face, clip.caption, clip.bvh)
             require_clip(recorded)
         else:
             recorded = read_clip(Path(clip))
@@ -203,7 +206,7 @@ def edit_clip(
         before = frames = edit_frames(task, clip, layout)
         require_work(frames)
     editor, generator = require_editor(bundle.generator), bundle.generator
-    prompt, original = Prompt(task.caption), original_of(before, clip.caption)
+    prompt, original = Prompt(task.caption), original_of(before, clip.caption, clip.bvh)
     words = bundle.encode(bundle.main, [prompt], [prompt.text]) if prompt.text.strip() else {}
     columns = layout.part(generator.part)
     whole = np.repeat(frames.features[None], samples, axis=0)
@@ -219,17 +222,23 @@ def edit_clip(
             GeneratedMotion(prompt, features[start:end], figure.joints[start:end], None, layout)
             for start, end in frames.stretches
         ]
-        notes = bundle.notes([prompt], stretches) if words else []
+        notes = [*map(str, bundle.notes([prompt], stretches))] if words else []
+        bvh = None
+        if clip.bvh is not None:
+            try:
+                bvh = own_bvh(clip.bvh, frames, figure)
+            except UserError as error:
+                notes.append(f"a BVH of this has a skeleton of ours, not the clip's: {error}")
         out.append(
             EditedMotion(
                 prompt, features, figure.joints, face, layout, seed=seed, figure=figure, original=original,
-                report=report, remarks=(*frames.remarks, *map(str, notes)),
+                report=report, remarks=(*frames.remarks, *notes), bvh=bvh,
             )
         )  # fmt: skip
     return out
 
 
-def original_of(frames: EditFrames, caption: str) -> GeneratedMotion:
+def original_of(frames: EditFrames, caption: str, bvh: OwnBvh | None = None) -> GeneratedMotion:
     """The clip of a task as the model reads it: at its frame rate, on the floor."""
     features, layout = frames.features[frames.inside], frames.layout
     figure = frames.to_world(frames.figure)
@@ -240,4 +249,5 @@ def original_of(frames: EditFrames, caption: str) -> GeneratedMotion:
         frames.face,
         layout,
         figure=figure,
+        bvh=bvh,
     )

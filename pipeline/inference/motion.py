@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.rigid import RigidMotion
+from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Prompt
@@ -39,6 +40,8 @@ class GeneratedMotion:
     """The seed that it was asked for with."""
     figure: RigidMotion | None = None
     """The figure whose joints these are, which is shown as it is; None: one is fitted to them."""
+    bvh: OwnBvh | None = None
+    """The user's own file with what was made in it, which is what is saved as BVH."""
 
     @property
     def caption(self) -> str:

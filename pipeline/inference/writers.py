@@ -135,11 +135,15 @@ def write_npz(path: Path, outputs: Outputs) -> None:
 
 
 def write_bvh(path: Path, outputs: Outputs) -> None:
-    """The figure's bones and rotations."""
+    """The user's own file, where the motion is of one; else the figure's bones and rotations."""
+    from motionloom.datasets.base.files import write_bytes
     from motionloom.datasets.motion.bvh.motion import write_bvh as write
 
     [clip] = outputs.clips
     figure = clip.shown.figure
+    if (own := clip.shown.motion.bvh) is not None:
+        write_bytes(path, own.data)
+        return
     write(path, figure.skeleton, figure.rotations, figure.root, clip.shown.fps)
 
 

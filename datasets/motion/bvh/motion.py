@@ -85,7 +85,7 @@ class BvhMotion:
         list six channels on every joint and fill three.
         """
         out = np.repeat(self.offsets[None], self.frames, axis=0)
-        joints, axes, columns = np.array(_channel_columns(self.channels)[0], dtype=int).reshape(-1, 3).T
+        joints, axes, columns = np.array(channel_columns(self.channels)[0], dtype=int).reshape(-1, 3).T
         inner = np.array(self.parents)[joints] >= 0
         if inner.any() and not self.values[:, columns[inner]].any():
             joints, axes, columns = joints[~inner], axes[~inner], columns[~inner]
@@ -100,7 +100,7 @@ class BvhMotion:
         from scipy.spatial.transform import Rotation  # half a second, which reading a header need not take
 
         out = np.broadcast_to(np.eye(3), (len(wanted), self.frames, 3, 3)).copy()
-        turns = _channel_columns(self.channels)[1]
+        turns = channel_columns(self.channels)[1]
         groups: dict[str, list[int]] = {}
         for row, joint in enumerate(wanted):
             if turns[joint][0]:
@@ -130,7 +130,7 @@ class BvhMotion:
 
 
 @lru_cache(maxsize=8)
-def _channel_columns(
+def channel_columns(
     channels: tuple[tuple[str, ...], ...],
 ) -> tuple[list[tuple[int, int, int]], list[tuple[str, list[int]]]]:
     """Return joint, axis and column of each position channel, and for each joint the order of its rotations

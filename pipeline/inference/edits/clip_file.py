@@ -12,13 +12,17 @@ from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.bvh.joint_map import metres
 from motionloom.datasets.motion.bvh.motion import read_bvh
+from motionloom.datasets.motion.bvh.own_file import OwnBvh
+from motionloom.datasets.motion.bvh.text import load_text
 from motionloom.datasets.motion.canonical import facing, ground, mirror, resample
 from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import FACE, HANDS, UserError, number, parse_json
-from motionloom.pipeline.contract.editing import EditTask, RecordedClip
+from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
 
 ENDINGS = (".bvh", ".npz", ".glb")
 _BLEND = 0.5
@@ -105,7 +109,8 @@ def features_for(
 
 def _read_bvh(path: Path) -> RecordedClip:
     """The joints that are known by their names; hands only where all fingers are found."""
-    motion = read_bvh(path)
+    data, name = load_text(path, None)
+    motion = read_bvh(data, name=name)
     guesses = [guess_joint_map(motion, Skeleton.named(name)) for name in ("smplx52", "smpl22")]
     joint_map = next((one for one in guesses if not one.open_rows), None)
     if joint_map is None:
@@ -115,7 +120,9 @@ def _read_bvh(path: Path) -> RecordedClip:
         )
     unit, up, _ = settled(joint_map, [motion])
     joints = joint_map.apply(motion, unit=unit, up=up)
-    return RecordedClip(str(path), joints[added_frames(joints) :], motion.fps)
+    added = added_frames(joints)
+    own = OwnBvh(data, motion, joint_map, metres(joint_map.unit or unit), up, added)
+    return RecordedClip(str(path), joints[added:], motion.fps, bvh=own)
 
 
 def _read_npz(path: Path) -> RecordedClip:

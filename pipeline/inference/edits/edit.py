@@ -14,6 +14,7 @@ from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
 from motionloom.datasets.motion.body.landing import eased, landed, reached
 from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
+from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.canonical import facing, ground, retarget
 from motionloom.datasets.motion.features.codec import encode, place
 from motionloom.datasets.motion.features.torch_joints import torch_way
@@ -90,6 +91,14 @@ def finish(
         # These are made of steps between joints, so there is one frame more of joints.
         joints = np.concatenate([joints, 2 * joints[-1:] - joints[-2:-1]])
     return encode(joints, layout), frames.to_world(figure), report
+
+
+def own_bvh(bvh: OwnBvh, frames: EditFrames, figure: RigidMotion) -> OwnBvh:
+    """The clip's own file with a figure in the clip's world. `UserError` where that is not possible."""
+    if frames.task.changes_clip:
+        raise UserError("the clip was mirrored, retimed or repeated")
+    kept = frames.pieces[:, piece_joints(frames.layout)]
+    return bvh.edited(figure.joints, frames.layout.fps, frames.lead, kept, frames.task.seconds)
 
 
 def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, NDArray[np.float64]]:

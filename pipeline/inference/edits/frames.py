@@ -28,7 +28,8 @@ from motionloom.datasets.motion.layout import (
 )
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.observed import Places, tangent
-from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask, RecordedClip
+from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
 
 _WRISTS = ("left_wrist", "right_wrist")
 

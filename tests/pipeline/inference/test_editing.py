@@ -21,13 +21,14 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import Filling
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
-from motionloom.pipeline.contract.editing import EditTask, RecordedClip
+from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
 from motionloom.pipeline.inference.edits.edit import finish
 from motionloom.pipeline.inference.edits.frames import edit_frames
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.inference.model import edit_clip, original_of
 from motionloom.pipeline.inference.motion import EditedMotion
@@ -193,6 +194,19 @@ def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:
         assert one.fps == 20 and one.joints.shape == (60, 52, 3)
         np.testing.assert_allclose(one.joints, made.joints, atol=1e-3)
     assert again[0].caption == "a person walks"
+    # A BVH that is read comes back with its own text, also when the result is edited again.
+    made = edit(editor(), again[1], keep=ENDS)
+    rows = [(tmp_path / "clip.bvh").read_text(), made.save(tmp_path / "made.bvh").read_text()]
+    before, after = (text.splitlines() for text in rows)
+    start = len(before) - 60
+    assert before[: start + 20] == after[: start + 20] and before[-20:] == after[-20:]
+    assert all(one != two for one, two in zip(before[start + 20 : -20], after[start + 20 : -20], strict=True))
+    height = again[1].joints[0, 0, 1] - made.original.joints[0, 0, 1]  # the file has a floor of its own
+    found = read_clip(tmp_path / "made.bvh").joints
+    np.testing.assert_allclose(found, made.joints + np.array([0, height, 0]), atol=0.01)
+    assert made.original.bvh is again[1].bvh
+    upper = edit(editor(), again[1], keep=[{"parts": ["upper"]}])
+    assert upper.bvh is None and any("skeleton of ours" in remark for remark in upper.remarks)
 
 
 REFUSED: list[tuple[dict[str, object], str]] = [
