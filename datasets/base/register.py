@@ -7,14 +7,15 @@ calls `register(thing)`. Recipes, exports and data name no code: reading one run
 
 from __future__ import annotations
 
+import ast
 import os
 import sys
 from collections.abc import Callable, Iterable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import resolve_name
 from pathlib import Path
-from types import ModuleType
 from typing import Any, TypeVar
 
 from motionloom.datasets.base.files import sha256_of, sha256_of_json
@@ -100,19 +101,40 @@ def distribution_of(module: str) -> str:
 def code_of(modules: Iterable[str]) -> dict[str, str]:
     """sha256 of the code of those modules that are neither motionloom's nor Python's, by their names.
 
-    A module's code is its file, or all files of its package. What a notebook or a prompt defines has none.
+    A module's code is its file, and those of its package that it imports, by others or within functions too.
+    What a notebook or a prompt defines has none.
     """
     out = {}
     for name in sorted(set(modules)):
-        top = name.partition(".")[0]
-        if top not in {"motionloom", *sys.stdlib_module_names} and (files := _files(sys.modules.get(top))):
-            out[name] = sha256_of_json({file: sha256_of(path) for file, path in files.items()})
+        if name.partition(".")[0] not in {"motionloom", *sys.stdlib_module_names} and (files := _files(name)):
+            out[name] = sha256_of_json({module: sha256_of(file) for module, file in files.items()})
     return out
 
 
-def _files(top: ModuleType | None) -> dict[str, Path]:
-    """The file of a module, or those of a package, by their places in it."""
-    if folders := [Path(folder) for folder in getattr(top, "__path__", ())]:
-        return {str(file.relative_to(root)): file for root in folders for file in root.rglob("*.py")}
-    file = getattr(top, "__file__", None)
-    return {} if file is None else {Path(file).name: Path(file)}
+def _files(name: str) -> dict[str, Path]:
+    """The files of a module and of what it imports of its package, by the names of the modules."""
+    top = name.partition(".")[0]
+    package = sys.modules.get(top)
+    folders = [Path(folder) for folder in getattr(package, "__path__", ())]
+    if not folders:
+        file = getattr(package, "__file__", None)
+        return {} if file is None else {name: Path(file)}
+    found: dict[str, Path] = {}
+    todo = [name]
+    while todo:
+        module = todo.pop()
+        bases = [folder.joinpath(*module.split(".")[1:]) for folder in folders]
+        places = [place for base in bases for place in (base / "__init__.py", base.with_suffix(".py"))]
+        place = next((place for place in places if place.is_file()), None)
+        if module in found or place is None:  # None: what is imported from a module is no module
+            continue
+        found[module] = place
+        inside = module if place.name == "__init__.py" else module.rpartition(".")[0]
+        for node in ast.walk(ast.parse(place.read_bytes(), str(place))):
+            if isinstance(node, ast.Import):
+                todo += [one.name for one in node.names if one.name.partition(".")[0] == top]
+            elif isinstance(node, ast.ImportFrom):
+                base = resolve_name("." * node.level + (node.module or ""), inside)
+                if base.partition(".")[0] == top:
+                    todo += [base, *(f"{base}.{one.name}" for one in node.names)]
+    return found

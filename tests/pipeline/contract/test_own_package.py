@@ -65,7 +65,7 @@ def test_the_command_line_knows_the_converter_and_the_format(site: Path, source:
     assert "Joints in NumPy files" in program(site, "data", "convert", "arrays", "--help")
     assert "csv (joints as text)" in re.sub(r"[\s│]+", " ", program(site, "generate", "--help"))
     plan = program(site, "data", "convert", "arrays", source, site / "none", "--plan")
-    assert "found 20 " in re.sub(r"[\s│]+", " ", plan) and not (site / "none").exists()
+    assert "found in the source 20 " in re.sub(r"[\s│]+", " ", plan) and not (site / "none").exists()
     program(site, "data", "convert", "arrays", source, site / "shards", "--workers", 2, "-s", "size=1.05")
     made = Manifest.load_json(site / "shards/manifest.json")
     assert (made.converter, made.options["size"]) == ("arrays", 1.05)
