@@ -267,7 +267,7 @@ class Bundle:
         face_model: str | None = None,
         seconds: float | Sequence[float] | None = None,
     ) -> list[Unknown | str]:
-        """What a person should know of prompts, and of motions that are not as was asked for (`seconds`)."""
+        """Return the notes on prompts, and on motions whose length is not the one asked for (`seconds`)."""
         texts, faces = [prompt.text for prompt in prompts], [prompt.face_text for prompt in prompts]
         remarks = dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark)
         found: list[Unknown | str] = [*self.unknown_captions(texts, faces, face_model), *remarks]

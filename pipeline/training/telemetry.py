@@ -1,6 +1,7 @@
-"""Progress and telemetry of a training: the bar, and per rank speed, use and waits.
+"""How a training is watched: the bar, per rank speed, use and waits, and motions drawn while it goes on.
 
-A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, which the report draws.
+A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, which the report draws. Motions
+(`train.sample_every`) are drawn by a process of its own.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import json
 import resource
 import statistics
+import subprocess
 import sys
 import time
 from collections import deque
@@ -23,10 +25,13 @@ from torch import Tensor
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.progress import Pace, bar
+from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
+from motionloom.pipeline.contract.stage import GENERATOR, StageContext, stage_kind
 from motionloom.pipeline.store.files import open_own
-from motionloom.pipeline.store.training_log import FLIGHT, optional, read_rows
+from motionloom.pipeline.store.run_folder import owner_of
+from motionloom.pipeline.store.training_log import FLIGHT, SAMPLES, optional, read_rows
 from motionloom.pipeline.training.utilization import Utilization
 
 
@@ -280,3 +285,38 @@ class StepProgress:
     def close(self) -> None:
         if self._bar is not None:
             self._bar.stop()
+
+
+_PROGRAM = "motionloom.pipeline.runs.samples"
+"""On a floor above, which only the new process needs."""
+
+
+class SampleProcess:
+    """Starts the drawing, one process at a time. The training never waits for it, nor ends with it."""
+
+    def __init__(self, context: StageContext, kind: str, every: int) -> None:
+        """`every` is in steps; 0, or a kind that makes no motion, draws nothing."""
+        makes = every and GENERATOR in stage_kind(kind, context.name).gives(context.config)
+        self.context, self.every = context, every if makes else 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self._failed = False
+
+    def saved(self, step: int) -> None:
+        """The checkpoint of a step is on disk: draw with it, where it is time and no drawing goes on."""
+        code = 0 if self._process is None else self._process.poll()
+        if code is None or not self.every or step % self.every:
+            return
+        log, failed, self._failed = self.context.folder / SAMPLES / "log.txt", self._failed, code != 0
+        with optional(f"{self.context.name}: what train.sample_every draws", self.context.console):
+            if code and not failed:
+                raise UserError(f"the last process failed, {log} says why")
+            run = owner_of(self.context.folder)
+            with open_own(log, "wb") as file:
+                # A session of its own: what signals the training's group does not reach it.
+                self._process = subprocess.Popen(
+                    [sys.executable, "-P", "-m", _PROGRAM, str(run), self.context.name],
+                    stdin=subprocess.DEVNULL,
+                    stdout=file,
+                    stderr=file,
+                    start_new_session=True,
+                )

@@ -50,8 +50,7 @@ from motionloom.pipeline.training.failures import FailureGuard, ShardWatch, Stal
 from motionloom.pipeline.training.loaders import TrainingData, on_device
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
-from motionloom.pipeline.training.samples import SampleProcess
-from motionloom.pipeline.training.telemetry import StepProgress, Telemetry
+from motionloom.pipeline.training.telemetry import SampleProcess, StepProgress, Telemetry
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 

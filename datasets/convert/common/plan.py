@@ -145,7 +145,7 @@ class ConversionPlan(Generic[C]):
 
     @contextmanager
     def reading(self, source: str) -> Iterator[None]:
-        """What cannot be read within is said of `source`, and the plan goes on without it."""
+        """Note `source` as broken, and why, if what is read within fails; the plan goes on without it."""
         try:
             yield
         except Exception as error:  # whatever a bad file, name or number makes of the libraries below

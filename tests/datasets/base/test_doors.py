@@ -121,7 +121,7 @@ def test_weights_are_floats_and_finite_as_they_are_taken(
 
 KNOWN = {"float(scaling[0])", "float(_BALL[2])", "float(_BALL[1])", "float(bones)", "int(index)", "int(rate)",
          "float(value)", "int(count)", "int(turn[0])", "int(bad[0])", "int(parent)"}  # fmt: skip
-"""Of numbers; `facts.py` takes what is no number as words."""
+"""Known uses on numbers; `facts.py` takes what is no number as words."""
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

@@ -72,7 +72,7 @@ def stretched(joints: Joints) -> Joints:
 
 
 def flipped(limb: str, frames: int) -> Callable[[Joints], Joints]:
-    """What hangs at a limb's joint is on its other side for some frames."""
+    """Turn the joints below a limb's joint to its other side for some frames."""
 
     def go(joints: Joints) -> Joints:
         skeleton = LAYOUT.skeleton

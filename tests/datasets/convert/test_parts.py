@@ -136,8 +136,8 @@ def source_of(kind: str, root: Path, shared: Path, mocap: Path) -> Path:
 def test_one_damaged_or_misnamed_file_leaves_the_others(
     kind: str, tries: int, source: Path, shared: Path, tmp_path: Path
 ) -> None:
-    """Of any file of the folder a byte, the end or the name: the others are converted. Of a list of clips, a
-    sentence says what is wrong.
+    """A damaged byte, end or name of any file leaves the others converted; a sentence says what is wrong with
+    a list of clips.
     """
     converter, whole = converter_named(kind), source_of(kind, tmp_path / "whole", shared, source)
     seed = 7 if tries < 10 else random.randrange(2**32)

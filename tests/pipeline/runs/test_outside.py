@@ -189,7 +189,7 @@ def test_another_run_made_of_mixed_stages_is_refused(runs: Path) -> None:
 
 
 def test_another_run_that_is_gone(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What does not need it to load is still there; the recipe, and what needs it, say where it was."""
+    """Stages that load without it are still there; the recipe, and stages that need it, say where it was."""
     run = go(MINE + "  report: {kind: page}\n", "runs/mine")
     (runs / "other").rename(runs / "away")
     for use in (lambda: evaluate_run(run, console=QUIET), lambda: report_run(run, None, console=QUIET)):
