@@ -26,7 +26,7 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.samples import draw_samples
 from motionloom.pipeline.runs.snapshot import run_at
 from motionloom.pipeline.store.artifact import Artifact
-from motionloom.pipeline.training import samples
+from motionloom.pipeline.training import telemetry
 from motionloom.pipeline.training.checkpointing import readable
 
 MODEL = ("artifact.json", "model.json", "model.safetensors")
@@ -161,12 +161,12 @@ def test_samples_of_dances(ude_run: Any, tmp_path: Path) -> None:
 
 
 def test_a_drawing_that_fails_is_one_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(samples, "_PROGRAM", "motionloom.no_such_module")
+    monkeypatch.setattr(telemetry, "_PROGRAM", "motionloom.no_such_module")
     console = Console(file=io.StringIO(), width=200)
     for name in ("gpt", "tma"):
         folder, kind = tmp_path / "stages" / name, stage_kind(name, "")
         context = StageContext(name, "", kind.config(), folder, {}, 0, Hardware(), console, StageCache())
-        process = samples.SampleProcess(context, name, 2)
+        process = telemetry.SampleProcess(context, name, 2)
         for step in range(1, 9):
             process.saved(step)
             if process._process is not None:
