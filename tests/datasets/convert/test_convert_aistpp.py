@@ -248,7 +248,8 @@ def test_a_band_plays_at_the_tempo_and_phase_of_the_dance(fixture: Path, tmp_pat
 def test_planted_beats_are_found_to_one_frame(bpm: int, phase: float, seed: int, fps: float) -> None:
     """A dance that stops on each beat, to which it adds stops elsewhere, halts and trembling."""
     rng = np.random.default_rng(seed)
-    period, t = 60 / bpm, np.arange(round(12 * fps)) / fps
+    # The step that ends at a frame has the speed of the middle between it and the frame before.
+    period, t = 60 / bpm, (np.arange(round(12 * fps)) - 0.5) / fps
     speed = np.abs(np.sin(np.pi * (t / period - phase)))
     for at in rng.uniform(0, 12, 4):
         speed *= 1 - 0.9 * np.exp(-((t - at) ** 2) / (2 * 0.05**2))
