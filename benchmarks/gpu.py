@@ -6,16 +6,16 @@
 All in one process, without network but for a text encoder that is not here. Each row is written to
 WORK/rows.jsonl as it is measured, so a killed run keeps its rows and the same command goes on behind them. A
 row is begun only if the last one of its table would fit into what is left of `--minutes`; what did not fit is
-named at the end. In this order:
+named at the end. `--only "stages" "compiled gpt"` takes rows whose table and title begin so. In this order:
 
 - `steps`: a training step without its loader, on a batch as large as training may see: wall time between
   synchronised points, TFLOP/s and share of the data sheet's peak, peak of memory and what `--dry-run` says;
-  also under `hardware.deterministic`;
-- `trainings`: the same stages as a run trains them, by their own telemetry, the first third left out;
+  "free": without `hardware.deterministic`, which is on by default;
+- `trainings`: stages as a run trains them (compiled), by their own telemetry, the first third left out;
 - `sampling`: whole-body motions of 196 frames, the second of two calls;
 - `bytes`: each training once more: are the weights the same;
 - `stages`: every stage of `baselines-tiny` and `baselines-tiny-ude`, 20 steps each;
-- `compiled`: the steps again, compiled, and replayed as CUDA graphs.
+- `compiled`: the steps again, compiled as by default: replayed as CUDA graphs where networks are small.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.training_log import read_flight
 from motionloom.pipeline.store.yaml import dump_yaml
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import Execution, launch, repeatable
+from motionloom.pipeline.training.execution import LAUNCHES, Execution, launch, repeatable
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}
@@ -64,14 +64,16 @@ Cells = dict[str, str]
 class Rows:
     """Rows in a file, each written as it is measured, while there is time."""
 
-    def __init__(self, path: Path, minutes: float) -> None:
-        self.path, self.end = path, time.monotonic() + 60 * minutes
+    def __init__(self, path: Path, minutes: float, only: list[str]) -> None:
+        self.path, self.end, self.only = path, time.monotonic() + 60 * minutes, tuple(only)
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
         self.rows: list[dict[str, Any]] = [json.loads(line) for line in lines]
         self.left_out: list[str] = []
 
     def measure(self, table: str, title: str, cells: Callable[[], Cells]) -> None:
-        """Add a row unless it is there, or would not be done in time; an error is a row too."""
+        """Add a row unless it is there, not asked for, or not done in time; an error is a row too."""
+        if self.only and not f"{table} {title}".startswith(self.only):
+            return
         of_table = [row for row in self.rows if row["table"] == table]
         if any(row["title"] == title for row in of_table):
             return
@@ -129,7 +131,7 @@ class Benchmark:
                 stages |= {"captioned": None, "dances": None, "text": {"encoder": encoder}}
         else:
             train = {"steps": self.args.steps, "checkpoint_every": self.args.steps, "validate_every": 0}
-            train |= {"precision": "bf16-mixed", "compile": False} | ({} if paper else {"batch_size": 8})
+            train |= {"precision": "bf16-mixed"} | ({} if paper else {"batch_size": 8})
             stages |= {name: {"train": train} for name in TRAINED}
             stages["gpt"]["loss"] = {"align_from": 0}  # a part of every step that is measured
         path = Path(self.args.work / f"{family}.yaml")
@@ -161,14 +163,16 @@ class Benchmark:
             update={"precision": PRECISIONS[precision], "compile": False, "accumulate": 1}
         )
         module = copy.deepcopy(made.module).train()
-        if how in ("compiled", "graphs"):
-            module.compile_losses(graphs=how == "graphs")
+        if how == "compiled":
+            size = sum(param.numel() for param in module.parameters())
+            module.compile_losses(graphs=self.device.type == "cuda" and size < LAUNCHES)
         if self.device.type == "cuda":
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats()
-        hardware = self.recipes["humantomato"].hardware.model_copy(update={"deterministic": how == "equal"})
+        hardware = self.recipes["humantomato"].hardware.model_copy(update={"deterministic": how != "free"})
         fabric = launch(hardware, train)
         execution = Execution(fabric, module, train)
+        module.on_fit_start()  # frozen networks follow
         batch = fabric.to_device(made.batch)
 
         def timed(count: int) -> float:
@@ -268,7 +272,6 @@ class Benchmark:
 
 def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cells]]]:
     """Table, title and measurement of each row, in order."""
-    cuda = bench.device.type == "cuda"
     built: dict[str, Step] = {}
 
     def kept(family: str, name: str) -> Step:
@@ -282,7 +285,7 @@ def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cell
         for precision in PRECISIONS:
             make = partial(kept, family, name)
             yield "steps", f"{name} {precision}", partial(bench.step, make, precision, "eager")
-        yield "steps", f"{name} bf16, equal bytes", partial(bench.step, make, "bf16", "equal")
+        yield "steps", f"{name} bf16, free", partial(bench.step, make, "bf16", "free")
     for name in TRAINED:
         yield "trainings", name, partial(bench.training, name)
     for batch in (1, 32, 256):
@@ -293,10 +296,8 @@ def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cell
         names, run = bench.short(recipe)
         for name in names:
             yield "stages", f"{recipe} {name}", partial(run, name)
-    for how in ("compiled", "graphs") if cuda else ("compiled",):
-        for family, name in stepped:
-            make = partial(kept, family, name)
-            yield "compiled", f"{name} bf16 {how}", partial(bench.step, make, "bf16", how)
+    for family, name in stepped:
+        yield "compiled", f"{name} bf16", partial(bench.step, partial(kept, family, name), "bf16", "compiled")
 
 
 def main() -> None:
@@ -306,9 +307,10 @@ def main() -> None:
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--minutes", type=float, default=10.0, help="after which no row is begun")
     parser.add_argument("--steps", type=int, default=60, help="of each training")
+    parser.add_argument("--only", nargs="+", default=[], metavar="ROWS")
     args = arguments(parser)
     args.work.mkdir(parents=True, exist_ok=True)
-    rows, bench = Rows(args.work / "rows.jsonl", args.minutes), Benchmark(args)
+    rows, bench = Rows(args.work / "rows.jsonl", args.minutes, args.only), Benchmark(args)
     for table, title, cells in measurements(bench):
         rows.measure(table, title, cells)
     named = torch.cuda.get_device_name(bench.device) if bench.device.type == "cuda" else "CPU"

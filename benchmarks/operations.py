@@ -18,7 +18,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from motionloom.models.layers.transformer import SelfAttention
+from motionloom.models.layers.attention import SelfAttention
 from motionloom.pipeline.contract.lookup import previews
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.recipe import load_recipe

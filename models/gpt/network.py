@@ -27,7 +27,8 @@ from torch import Tensor, nn
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.tokens import TokenNetwork
-from motionloom.models.layers.transformer import KVCache, StackConfig, Transformer
+from motionloom.models.layers.attention import KVCache
+from motionloom.models.layers.transformer import StackConfig, Transformer
 from motionloom.models.tokenizer.base import Stream
 
 

@@ -1,17 +1,14 @@
-"""Transformer blocks shared by all networks: GELU, scaled-dot-product attention, optional KV cache.
+"""Transformer blocks shared by all networks: GELU, attention, optional KV cache.
 
 Notable choices:
 - LayerNorm comes before attention and feed-forward ("pre"), as in the GPTs. With "post" it comes after their
   sums, as in torch's own encoder, which TEMOS, TMR and MDM are made of.
-- Attention is always `F.scaled_dot_product_attention`, so fused kernels are used wherever the device has
-  them.
 - Masks are boolean and mark what *may* be attended (True = visible). A stack turns its masks into the numbers
   that are added to the products once; SDPA would in every layer.
 - A causal stack needs no padding mask when sequences are padded on the right: real positions never see
   padding.
 - Dropout acts on the residual branches (`dropout`), of "post" also inside the feed-forward as torch's does,
-  and on the attention weights (`attention_dropout`); CPUs have no fused kernel for the last, so small CPU
-  configs set it to 0.
+  and on the attention weights (`attention_dropout`).
 
 Legend: B batch, L positions, S visible positions, D width, H heads.
 """
@@ -29,6 +26,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from motionloom.datasets.schema import Config
+from motionloom.models.layers.attention import CrossAttention, KVCache, LayerCache, SelfAttention
 
 Norm = Literal["pre", "post"]
 """Position of LayerNorm: before attention and feed-forward, or after their sums."""
@@ -85,100 +83,6 @@ class LayerNorm(nn.LayerNorm):
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x.to(self.weight.dtype))
-
-
-class LayerCache:
-    """Keys and values [B, H, size, D/H] of the positions one layer has seen; allocated once, at the first
-    append.
-    """
-
-    def __init__(self, size: int) -> None:
-        self.size = size
-        self.length = 0
-        self.keys: Tensor | None = None
-        self.values: Tensor | None = None
-
-    def append(self, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Store [B, H, L, D/H] more positions; return everything stored so far."""
-        if self.keys is None or self.values is None:
-            shape = (keys.shape[0], keys.shape[1], self.size, keys.shape[3])
-            self.keys, self.values = keys.new_empty(shape), values.new_empty(shape)
-        end = self.length + keys.shape[2]
-        if end > self.size:
-            raise ValueError(f"the cache holds {self.size} positions, {end} were asked for")
-        self.keys[:, :, self.length : end] = keys
-        self.values[:, :, self.length : end] = values
-        self.length = end
-        return self.keys[:, :, :end], self.values[:, :, :end]
-
-
-class KVCache:
-    """One `LayerCache` a layer, for step-by-step decoding without gradient."""
-
-    def __init__(self, layers: int, size: int) -> None:
-        self.layers = [LayerCache(size) for _ in range(layers)]
-
-    @property
-    def length(self) -> int:
-        return self.layers[0].length
-
-
-class SelfAttention(nn.Module):
-    """Multi-head self-attention."""
-
-    def __init__(self, dim: int, heads: int, attention_dropout: float, qkv_bias: bool = True) -> None:
-        super().__init__()
-        self.heads = heads
-        self.attention_dropout = attention_dropout
-        self.scale: float | None = None
-        """Factor of the products of queries and keys; None is the width of a head to the power of -1/2."""
-        self.qkv = nn.Linear(dim, 3 * dim, bias=qkv_bias)
-        self.out = nn.Linear(dim, dim)
-
-    def forward(
-        self, x: Tensor, mask: Tensor | None = None, causal: bool = False, cache: LayerCache | None = None
-    ) -> Tensor:
-        """x [B, L, D]; mask bool or added, broadcastable to [B, H, L, S], or `causal`; with a cache x goes on
-        behind it.
-        """
-        batch, length, dim = x.shape
-        # Cut along the last dimension: the gradients of the three are put together by one copy, not by two.
-        query, key, value = (self._heads(part) for part in self.qkv(x).chunk(3, dim=-1))
-        if cache is not None:
-            before = cache.length
-            key, value = cache.append(key, value)
-            if causal and before and length > 1:
-                seen = torch.ones(length, before + length, dtype=torch.bool, device=x.device)
-                mask = seen.tril(diagonal=before)
-            # A single new position sees everything stored; a first block is plainly causal.
-            causal = causal and before == 0 and length > 1
-        rate = self.attention_dropout if self.training else 0.0
-        causal = causal and mask is None
-        out = F.scaled_dot_product_attention(
-            query, key, value, mask, dropout_p=rate, is_causal=causal, scale=self.scale
-        )
-        merged: Tensor = self.out(out.transpose(1, 2).reshape(batch, length, dim))
-        return merged
-
-    def _heads(self, x: Tensor) -> Tensor:
-        return x.view(*x.shape[:2], self.heads, -1).transpose(1, 2)
-
-
-class CrossAttention(SelfAttention):
-    """Multi-head attention to another sequence of the same width; the weights are laid out as its base's."""
-
-    def attend(self, x: Tensor, memory: Tensor, mask: Tensor | None = None) -> Tensor:
-        """x [B, L, D], memory [B, S, D]; mask bool or added, broadcastable to [B, H, L, S]."""
-        sizes = [x.shape[2], 2 * x.shape[2]]
-        parts = (torch.split(whole, sizes) for whole in (self.qkv.weight, self.qkv.bias))
-        of_query, of_pairs = zip(*parts, strict=True)
-        query = self._heads(F.linear(x, *of_query))
-        pairs = F.linear(memory, *of_pairs)
-        key, value = (self._heads(half) for half in pairs.chunk(2, dim=-1))
-        rate = self.attention_dropout if self.training else 0.0
-        out = F.scaled_dot_product_attention(query, key, value, mask, dropout_p=rate)
-        merged: Tensor = self.out(out.transpose(1, 2).reshape(x.shape))
-        return merged
 
 
 class Block(nn.Module):

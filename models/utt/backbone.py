@@ -20,7 +20,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from motionloom.models.layers.transformer import KVCache, LayerNorm, Transformer, length_mask
+from motionloom.models.layers.attention import KVCache
+from motionloom.models.layers.transformer import LayerNorm, Transformer, length_mask
 
 
 @dataclass

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from motionloom.models.layers.transformer import SelfAttention
+from motionloom.models.layers.attention import SelfAttention
 from motionloom.models.quantize.ema import EmaQuantizer
 from motionloom.models.training.alternating import AlternatingModule
 from motionloom.models.training.stage_module import Batch, StageModule

@@ -11,6 +11,7 @@ import torch
 from torch import nn
 
 from motionloom.models.diffusion.network import TextDenoiserConfig
+from motionloom.models.layers.attention import unmasked_attention
 from motionloom.models.layers.transformer import (
     Norm,
     SkipTransformer,
@@ -54,6 +55,20 @@ def test_equals_torchs(norm: Norm, memory: bool) -> None:
     else:
         found, want = net(x, mask), own(x, src_key_padding_mask=~mask)
     torch.testing.assert_close(found[mask], want[mask], rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("scale", [None, 1.0])
+def test_keys_hidden_by_a_coordinate_equal_a_mask(scale: float | None) -> None:
+    torch.manual_seed(0)
+    query, key, value = (torch.randn(3, 2, size, 16).requires_grad_() for size in (5, 7, 7))
+    seen = length_mask(torch.tensor([7, 4, 1]), 7)[:, None, None]
+    mask = torch.zeros(seen.shape).masked_fill(~seen, -torch.inf)
+    found = unmasked_attention(query, key, value, mask, 0.0, scale)
+    want = nn.functional.scaled_dot_product_attention(query, key, value, mask, scale=scale)
+    torch.testing.assert_close(found, want, rtol=1e-12, atol=1e-12)
+    grads = [torch.autograd.grad(out.square().sum(), (query, key, value)) for out in (found, want)]
+    torch.testing.assert_close(*grads, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("norm", get_args(Norm))

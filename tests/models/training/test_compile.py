@@ -13,7 +13,7 @@ from rank_cases import CASES, Undrawn, drawing_mdm, rows_of
 from torch import nn
 from ude_training import train
 
-from motionloom.models.layers.transformer import SelfAttention
+from motionloom.models.layers.attention import SelfAttention
 from motionloom.models.training import compiled
 from motionloom.models.training.stage_module import StageModule
 
