@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.layers.transformer import product_type
+from motionloom.models.layers.linear import Linear, product_type
 from motionloom.models.tokenizer.base import Stream
 
 PAD = -1
@@ -193,7 +193,7 @@ class TokenNetwork(nn.Module):
         return nn.ModuleList(nn.Embedding(k + 1, dim) for k in self.num_codes.values())
 
     def _outputs(self, dim: int) -> nn.ModuleList:
-        return nn.ModuleList(nn.Linear(dim, k + 1) for k in self.num_codes.values())
+        return nn.ModuleList(Linear(dim, k + 1) for k in self.num_codes.values())
 
     def _start_tables(self) -> None:
         """Fresh weights for embeddings and heads."""

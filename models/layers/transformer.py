@@ -27,6 +27,7 @@ from torch.utils.checkpoint import checkpoint
 
 from motionloom.datasets.schema import Config
 from motionloom.models.layers.attention import CrossAttention, KVCache, LayerCache, SelfAttention
+from motionloom.models.layers.linear import product_type
 
 Norm = Literal["pre", "post"]
 """Position of LayerNorm: before attention and feed-forward, or after their sums."""
@@ -68,12 +69,6 @@ class StackConfig(Config):
             name, value = self.width
             raise ValueError(f"{name} {value} must be a multiple of heads {self.heads}")
         return self
-
-
-def product_type(x: Tensor) -> torch.dtype:
-    """The type in which matrix products of x are computed, under autocast or without."""
-    device = x.device.type
-    return torch.get_autocast_dtype(device) if torch.is_autocast_enabled(device) else x.dtype
 
 
 class LayerNorm(nn.LayerNorm):

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.models.layers.basis import Basis
+from motionloom.models.layers.linear import Linear
 from motionloom.models.layers.transformer import Norm, StackConfig, Transformer, length_mask, sinusoid
 
 
@@ -61,7 +62,7 @@ class GaussianEncoder(nn.Module):
 
     def __init__(self, config: TmaConfig, dim: int) -> None:
         super().__init__()
-        self.project = nn.Linear(dim, config.latent)
+        self.project = Linear(dim, config.latent)
         self.queries = nn.Parameter(torch.randn(2, config.latent) * config.latent**-0.5)
         self.stack = _stack(config)
 
@@ -82,7 +83,7 @@ class MotionDecoder(nn.Module):
         super().__init__()
         self.latent = nn.Linear(config.latent, config.latent)
         self.stack = _stack(config)
-        self.out = nn.Linear(config.latent, dim)
+        self.out = Linear(config.latent, dim)
 
     def forward(self, z: Tensor, mask: Tensor) -> Tensor:
         """z [B, Z], mask bool [B, L] -> [B, L, D], zero where masked."""

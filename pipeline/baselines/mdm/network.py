@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig, time_embedding
+from motionloom.models.layers.linear import Linear
 from motionloom.models.layers.transformer import Transformer, sinusoid, waves
 
 
@@ -21,12 +22,12 @@ class Mdm(TextDenoiser):
 
     def __init__(self, config: TextDenoiserConfig, motion_dim: int, text_dim: int) -> None:
         super().__init__(config, motion_dim, text_dim)
-        self.enter = nn.Linear(motion_dim, config.dim)
+        self.enter = Linear(motion_dim, config.dim)
         self.text = nn.Linear(text_dim, config.dim)
         self.time = time_embedding(config.dim)
         self.dropout = nn.Dropout(config.dropout)
         self.stack = Transformer(config, config.layers, norm="post")
-        self.leave = nn.Linear(config.dim, motion_dim)
+        self.leave = Linear(config.dim, motion_dim)
 
     def forward(self, noisy: Tensor, step: Tensor, text: Tensor, mask: Tensor, conditioned: Tensor) -> Tensor:
         time = self.time(waves(step, self.config.dim).to(self.text.weight.dtype))

@@ -23,7 +23,8 @@ from torch import Tensor, nn
 from motionloom.datasets.conditions import Condition
 from motionloom.models.diffusion.network import step_waves
 from motionloom.models.diffusion.schedule import ScheduleConfig
-from motionloom.models.layers.transformer import LayerNorm, StackConfig, Transformer, product_type
+from motionloom.models.layers.linear import product_type
+from motionloom.models.layers.transformer import LayerNorm, StackConfig, Transformer
 
 
 class CaptionConfig(StackConfig):

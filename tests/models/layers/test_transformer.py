@@ -12,6 +12,7 @@ from torch import nn
 
 from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.layers.attention import unmasked_attention
+from motionloom.models.layers.linear import Linear
 from motionloom.models.layers.transformer import (
     Norm,
     SkipTransformer,
@@ -69,6 +70,13 @@ def test_keys_hidden_by_a_coordinate_equal_a_mask(scale: float | None) -> None:
     torch.testing.assert_close(found, want, rtol=1e-12, atol=1e-12)
     grads = [torch.autograd.grad(out.square().sum(), (query, key, value)) for out in (found, want)]
     torch.testing.assert_close(*grads, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.usefixtures("float64")
+@pytest.mark.parametrize("sizes", [(313, 256), (256, 513), (3, 1), (16, 8)])
+def test_a_product_filled_up_to_even_sizes_is_the_same(sizes: tuple[int, int]) -> None:
+    layer, x = Linear(*sizes), torch.randn(2, 3, sizes[0])
+    torch.testing.assert_close(layer.filled_up(x), layer(x), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("norm", get_args(Norm))
