@@ -10,6 +10,8 @@ Columns of a part that a clip does not hold (hands, face) come out as 0, the mea
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -64,6 +66,13 @@ KEPT_BYTES = 2**29
 """Size up to which a data set's normalised columns are kept: 512 whole-body clips of 196 frames are 2**27."""
 
 
+_ROOMS = 2
+"""Batches whose memory is kept: the one that is computed, and the one that is being made meanwhile."""
+_PROBE = [np.empty(0, dtype=np.float32)]
+_ALONE = sys.getrefcount(_PROBE[0])
+"""References of an array that one list alone holds, as this Python counts them."""
+
+
 class Cut(NamedTuple):
     """Stretches of clips as one batch."""
 
@@ -100,6 +109,7 @@ class Crops:
         self._scale = 1.0 / stats.std[chosen]
         self._mean_row, self._scale_row = self._mean, self._scale
         self._runs = _runs(chosen)
+        self._rooms: list[NDArray[np.float32]] = []
         self._keep()
 
     def _keep(self) -> None:
@@ -108,7 +118,7 @@ class Crops:
         self._kept: dict[int, NDArray[np.float32]] | None = {} if size <= KEPT_BYTES else None
 
     def __getstate__(self) -> dict[str, object]:
-        return {**vars(self), "_kept": None}
+        return {**vars(self), "_kept": None, "_rooms": []}
 
     def fill(self, out: NDArray[np.float32], clip: int, start: int, length: int) -> None:
         """Normalised frames `start .. start + length` of a clip into `out` [T >= length, C], then zeros."""
@@ -142,10 +152,23 @@ class Crops:
     ) -> Cut:
         """The spans of `clips` [B]; one longer than `most` frames is cropped at `at` [B] in [0, 1)."""
         begin, length, closed = places(spans, at, most)
-        motion = np.empty((len(clips), padded_length(length), self.width), dtype=np.float32)
+        motion = self._room(len(clips), padded_length(length), self.width)
         for row, clip in enumerate(clips.tolist()):
             self.fill(motion[row], clip, int(begin[row]), int(length[row]))
         return Cut(motion, begin, length, closed, self.present[self.dataset.present[clips]])
+
+    def _room(self, *shape: int) -> NDArray[np.float32]:
+        """Return an array for a batch, of any content, in the memory of an earlier one that nobody holds any
+        more if there is one: the first writing to new pages takes as long as the copy of a large batch.
+        """
+        size = math.prod(shape)
+        for n in range(len(self._rooms)):
+            # An array, a tensor or a view of a batch holds its room: free is one that the list alone holds.
+            if len(self._rooms[n]) >= size and sys.getrefcount(self._rooms[n]) == _ALONE:
+                return self._rooms[n][:size].reshape(shape)
+        room = np.empty(size, dtype=np.float32)
+        self._rooms = [*self._rooms, room][-_ROOMS:]
+        return room.reshape(shape)
 
     def _repeated(self, length: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Mean and scale of `length` frames as one row; kept for the longest length asked for."""

@@ -107,6 +107,9 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print the plan with the reason for each stage.")
     ] = False,
+    sizes: Annotated[
+        bool, typer.Option("--sizes", help="A dry run that also measures what each training takes.")
+    ] = False,
     first: Annotated[
         str | None, typer.Option("--from", help="Run this stage and all below it again.")
     ] = None,
@@ -133,6 +136,8 @@ def run(
 
     Example: `motionloom run humantomato-tiny --dry-run`
 
+    Example: `motionloom run humantomato-paper --sizes`
+
     Example: `motionloom run humantomato-tiny -o runs/second --set tma.optim.lr=2e-4 --until tma`
 
     Example: `motionloom run humantomato-tiny --set face_gpt.train.steps=900 --replace`
@@ -149,6 +154,7 @@ def run(
         select=Selection(first, until),
         go_on=go_on or (),
         dry_run=dry_run,
+        sizes=sizes,
         replace=replace,
         verify=verify,
         console=make_console(),

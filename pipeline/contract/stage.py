@@ -288,6 +288,9 @@ class StageKind(ABC, Generic[C]):
 
     # What a dry run and the report say of it.
 
+    def require_inputs(self, config: C, given: Inputs) -> None:
+        """Refuse, with a `UserError`, previews of inputs that a stage of these settings cannot work with."""
+
     def estimate(self, config: C, given: Inputs, hardware: Hardware) -> ModelCard | None:
         """Sizes of a kind that trains; None for the others."""
         return None

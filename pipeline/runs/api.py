@@ -42,11 +42,13 @@ def run_recipe(
     select: Selection | None = None,
     go_on: Collection[str] = (),
     dry_run: bool = False,
+    sizes: bool = False,
     replace: bool = False,
     verify: bool = False,
     console: Console | None = None,
 ) -> Path:
-    """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed.
+    """Run what is not finished; returns the run folder. With `dry_run` only the plan is printed, with `sizes`
+    too what its trainings take (some seconds each the first time, then remembered).
 
     With `verify` all files of finished stages are compared with their checksums first.
 
@@ -60,16 +62,17 @@ def run_recipe(
     if verify:
         count = sum(require_unchanged(stage_folder(run, stage.name), again=True) for stage in loaded.stages)
         say(console, f"{run}: {count} files have the sha256 that their stages noted")
+    dry_run = dry_run or sizes
     try:
         plan = make_plan(loaded, run, select, go_on)
     except UserError:
         if dry_run:
-            say_estimate(loaded, console)  # it needs no data, the plan looks at them
+            say_estimate(loaded, console, measure=sizes)  # it needs no data, the plan looks at them
         raise
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:
         require_fit((row.stage for row in todo), loaded.hardware)  # before the estimate, which takes seconds
-        say_estimate(loaded, console, run, todo)
+        say_estimate(loaded, console, run, todo, measure=sizes)
         console.print(plan_table(loaded, plan))
         for doubt in doubts(loaded, run, (row.stage for row in todo)):
             say(console, doubt, "yellow")

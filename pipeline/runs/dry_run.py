@@ -56,7 +56,8 @@ def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
 class Sizes(Config):
     """`sizes.json` in the user's cache: estimates, which take seconds, by all that they depend on."""
 
-    cards: dict[str, ModelCard]
+    cards: dict[str, ModelCard | None]
+    """None of a training that fits its inputs and was not measured."""
 
     @staticmethod
     def place() -> Path:
@@ -71,7 +72,7 @@ class Sizes(Config):
         except (UserError, OSError):
             return Sizes(cards={})
 
-    def write(self, cards: Mapping[str, ModelCard]) -> None:
+    def write(self, cards: Mapping[str, ModelCard | None]) -> None:
         """Store the sizes with new ones, the newest `_MOST` of all."""
         newest = dict([*self.cards.items(), *cards.items()][-_MOST:])
         with suppress(OSError):  # a home that may only be read
@@ -82,25 +83,35 @@ _MOST = 500
 
 
 def estimate(
-    recipe: Recipe, names: Collection[str] | None = None, plan: Sequence[PlannedStage] = ()
+    recipe: Recipe,
+    names: Collection[str] | None = None,
+    plan: Sequence[PlannedStage] = (),
+    *,
+    measure: bool = True,
 ) -> dict[str, ModelCard]:
     """A card for each stage that trains, of `names` or of all; `UserError` when the layout of the data is not
-    known. Those of a `plan` are remembered from the last time.
+    known, or a network does not fit its inputs. Those of a `plan` are remembered from the last time; without
+    `measure`, which takes seconds, there are no others.
     """
     stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
-    known, keys, new = Sizes.read(), {row.stage.name: _key(recipe, row) for row in plan}, {}
-    cards = {}
+    known, keys = Sizes.read(), {row.stage.name: _key(recipe, row) for row in plan}
+    cards: dict[str, ModelCard] = {}
+    new: dict[str, ModelCard | None] = {}
     for stage in recipe.stages:
         if not stage.kind.trains or (names is not None and stage.name not in names):
             continue
         key = keys.get(stage.name, "")
         card = known.cards.get(key)
-        if card is None:
+        if card is None and (measure or key not in known.cards):
+            inputs = previews(stage, stages)
             try:
-                card = stage.kind.estimate(stage.config, previews(stage, stages), recipe.hardware)
+                if measure:
+                    card = stage.kind.estimate(stage.config, inputs, recipe.hardware)
+                else:
+                    stage.kind.require_inputs(stage.config, inputs)
             except UserError as error:
                 raise UserError(f"stage {stage.name}: {error}") from None
-            if card is not None and key:
+            if key:
                 new[key] = card
         if card is not None:
             cards[stage.name] = card
@@ -161,11 +172,19 @@ def _size(count: int) -> str:
 
 
 def say_estimate(
-    recipe: Recipe, console: Console, run: Path | None = None, todo: Sequence[PlannedStage] | None = None
+    recipe: Recipe,
+    console: Console,
+    run: Path | None = None,
+    todo: Sequence[PlannedStage] | None = None,
+    *,
+    measure: bool = True,
 ) -> None:
-    """Print what the trainings among `todo` (None = all) take, where the recipe says enough."""
+    """Print what the trainings among `todo` (None = all) take, where the recipe says enough; without
+    `measure` as far as it was measured before.
+    """
     named = [row.stage for row in todo] if todo is not None else list(recipe.stages)
-    if not any(stage.kind.trains for stage in named):
+    trained = [stage.name for stage in named if stage.kind.trains]
+    if not trained:
         return
     stages = {stage.name: stage for stage in recipe.stages}
     for stage in recipe.stages:
@@ -177,7 +196,11 @@ def say_estimate(
             if todo is not None:  # else the plan has said it
                 console.print(str(error), markup=False)
             return
-    cards = estimate(recipe, {stage.name for stage in named}, todo or ())
+    cards = estimate(recipe, trained, todo or (), measure=measure)
+    if unknown := [name for name in trained if name not in cards]:
+        console.print(f"not measured yet: {', '.join(unknown)}; --sizes says what they take", markup=False)
+    if not cards:
+        return
     times = {} if run is None or todo is None else training_times(run, todo)
     console.print(estimate_table(cards, times))
     total = sum(times.values())

@@ -212,6 +212,14 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     def export(self, stage: CompletedStage, target: Path) -> None:
         copy_files(stage.folder, target, MODEL_FILES)
 
+    def require_inputs(self, config: C, given: Inputs) -> None:
+        """The network is built on tensors that have shapes but no values."""
+        from torch._subclasses.fake_tensor import FakeTensorMode
+
+        with FakeTensorMode(allow_non_fake_inputs=True):
+            inputs = self.inputs.of(given)
+            self.network(self.facts(config, inputs), inputs)
+
     def estimate(self, config: C, given: Inputs, hardware: Hardware) -> ModelCard:
         """Parameters and memory of one training process, from the code that will run, on fake tensors."""
         from motionloom.pipeline.training.memory import model_card

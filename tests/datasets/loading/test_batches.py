@@ -122,8 +122,10 @@ def test_loader_workers_change_nothing_and_a_run_resumes_anywhere(
 def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCache) -> None:
     batches = caption_batches(train, stats, text, batch_size=16, max_frames=40, min_frames=8, seed=5)
     spans_seen: set[tuple[int, str]] = set()
+    held = []  # views, whose memory no later batch may take
     for k in range(20):
         batch = batches[k]
+        held += [(batch["motion"][k % 16], batch["motion"][k % 16].clone())] if k % 3 else []
         length = batch["length"].numpy()
         assert batch["motion"].shape[1] % 4 == 0
         assert 0 <= batch["motion"].shape[1] - length.max() < 4
@@ -142,6 +144,7 @@ def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCac
             assert (text.features[row][~text.mask[row]] == 0).all()
         assert text.pooled is not None and text.pooled.shape == (16, 4) and text.mask.dtype == torch.bool
         assert batch["conditions"]["text"].features.dtype == torch.float32
+    assert all(torch.equal(view, copy) for view, copy in held)
     both = [clip for clip in range(len(train)) if len({c for i, c in spans_seen if i == clip}) == 2]
     assert len(both) > 10, "both captions of a clip must be drawn in time"
 

@@ -53,7 +53,7 @@ def test_a_stopped_training_goes_on_exactly_and_its_export_generates(
         assert done.code == 0, done.err
         return str(done.out + done.err)
 
-    assert ("2 latents of 16" if kind == "mld" else "made") in run("planned", 3, "--dry-run")
+    assert ("2 latents of 16" if kind == "mld" else "made") in run("planned", 3, "--sizes")
     run("whole", 3)
     shutil.copytree(tmp_path / "whole", tmp_path / "parts")
     shutil.rmtree(tmp_path / "parts/stages/made")

@@ -148,15 +148,17 @@ def test_sizes_are_remembered_until_something_changes(
         return measure(self, config, *rest)
 
     monkeypatch.setattr(TrainedStage, "estimate", counted)
+    recipe = load_recipe(path)
+    plan = make_plan(recipe, tmp_path / "run")
+    assert estimate(recipe, plan=plan, measure=False) == {} and asked == []
     for sets in ([], [], ["tokenizer.train.batch_size=4"], ["tokenizer.train.keep_every=2"], []):
         recipe = load_recipe(path, sets)
         card = estimate(recipe, plan=make_plan(recipe, tmp_path / "run"))["tokenizer"]
         assert card.batch == (4 if "batch" in str(sets) else 8)
     assert asked == [8, 4, 8]
     Sizes.place().write_text("{")
-    recipe = load_recipe(path)
-    estimate(recipe, plan=make_plan(recipe, tmp_path / "run"))
-    assert asked == [8, 4, 8, 8]
+    card = estimate(recipe, plan=plan)["tokenizer"]
+    assert asked == [8, 4, 8, 8] and estimate(recipe, plan=plan, measure=False) == {"tokenizer": card}
 
 
 def test_saved_bytes_of_a_known_network() -> None:
