@@ -109,13 +109,13 @@ class Crops:
         self._scale = 1.0 / stats.std[chosen]
         self._mean_row, self._scale_row = self._mean, self._scale
         self._runs = _runs(chosen)
-        self._rooms: list[NDArray[np.float32]] = []
         self._keep()
 
     def _keep(self) -> None:
-        """Keep what is read from here on, where all of it is small enough."""
+        """Keep what is read from here on, where all of it is small enough, and the memory of batches."""
         size = 4 * self.width * int(self.dataset.frames.sum())
         self._kept: dict[int, NDArray[np.float32]] | None = {} if size <= KEPT_BYTES else None
+        self._rooms: list[NDArray[np.float32]] = []
 
     def __getstate__(self) -> dict[str, object]:
         return {**vars(self), "_kept": None, "_rooms": []}
