@@ -189,8 +189,8 @@ def _report(frames: EditFrames, figure: RigidMotion, heading: NDArray[np.float64
         aside_degrees=float(np.degrees(aside.mean())) if walks.any() else float("nan"),
         seams=_largest(accelerations(joints, fps)[near]),
         inside=_largest(accelerations(clip, fps)),
-        sliding=_sliding(joints, fps, free[1:] | free[:-1]),
-        clip_sliding=_sliding(clip, fps, np.ones(len(clip) - 1, dtype=np.bool_)),
+        sliding=sliding(joints, fps, free[1:] | free[:-1]),
+        clip_sliding=sliding(clip, fps, np.ones(len(clip) - 1, dtype=np.bool_)),
     )
 
 
@@ -199,7 +199,7 @@ def _largest(values: NDArray[np.float64]) -> float:
     return float(values.max(initial=-np.inf)) if values.size else float("nan")
 
 
-def _sliding(joints: NDArray[np.float64], fps: float, steps: NDArray[np.bool_]) -> float:
+def sliding(joints: NDArray[np.float64], fps: float, steps: NDArray[np.bool_]) -> float:
     """Speed along the floor of the slowest of ankles and balls, cm/s, on average over some of the steps."""
     feet = ground(joints[:, [joint for foot in ANKLES_TOES for joint in foot]])
     slowest = 100 * fps * np.abs(np.diff(feet, axis=0)).min(axis=1)
