@@ -13,23 +13,38 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
 from huggingface_hub import ModelHubMixin
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.bvh.own_file import OwnBvh
+from motionloom.datasets.motion.body.rigid import RigidMotion
+from motionloom.datasets.motion.bvh.own_file import between_rows
 from motionloom.datasets.schema import UserError
 from motionloom.models.layers.seeds import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.clip_file import changed, read_clip, read_seed_motion, require_clip
-from motionloom.pipeline.inference.edits.edit import finish, own_bvh, require_editor, require_work
+from motionloom.pipeline.inference.edits.clip_file import (
+    changed,
+    features_for,
+    read_clip,
+    read_seed_motion,
+    require_clip,
+)
+from motionloom.pipeline.inference.edits.edit import (
+    finish,
+    own_bvh,
+    own_figure,
+    report_of,
+    require_editor,
+    require_work,
+)
 from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
@@ -37,6 +52,7 @@ from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
 from motionloom.pipeline.inference.requests import require_seed, weight_bytes
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import find_model
+from motionloom.pipeline.inference.shown import shown
 from motionloom.pipeline.launch.hardware import choose_device, threads_for
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
@@ -162,8 +178,9 @@ class MotionModel(
         require_editor(self.bundle.generator)
         asked = EditTask.parse(task, "task")
         if isinstance(clip, GeneratedMotion):
-            recorded = RecordedClip("the motion", clip.joints, clip.fps, clip.face, clip.caption, clip.bvh)
-            require_clip(recorded)
+            figure = shown(clip).figure
+            facts = (clip.fps, clip.face, clip.caption, clip.bvh, figure)
+            recorded = require_clip(RecordedClip("the motion", figure.joints, *facts))
         else:
             recorded = read_clip(Path(clip))
         with threads_for(samples, weight_bytes(self.bundle.stages)):
@@ -206,7 +223,7 @@ def edit_clip(
         before = frames = edit_frames(task, clip, layout)
         require_work(frames)
     editor, generator = require_editor(bundle.generator), bundle.generator
-    prompt, original = Prompt(task.caption), original_of(before, clip.caption, clip.bvh)
+    prompt, original = Prompt(task.caption), original_of(before, clip)
     words = bundle.encode(bundle.main, [prompt], [prompt.text]) if prompt.text.strip() else {}
     columns = layout.part(generator.part)
     whole = np.repeat(frames.features[None], samples, axis=0)
@@ -215,7 +232,7 @@ def edit_clip(
     has_face = layout.has("face") and (generator.part == "all" or frames.face is not None)
     out = []
     for made in whole:
-        features, figure, report = finish(frames, made[:, layout.part("bodyhand")])
+        features, figure, heading = finish(frames, made[:, layout.part("bodyhand")])
         face = made[:, layout.part("face")] if has_face else None
         # Words are looked for in each stretch that was made, as in motions that are generated.
         stretches = [
@@ -223,31 +240,45 @@ def edit_clip(
             for start, end in frames.stretches
         ]
         notes = [*map(str, bundle.notes([prompt], stretches))] if words else []
-        bvh = None
+        bvh, fps = None, layout.fps
         if clip.bvh is not None:
             try:
                 bvh = own_bvh(clip.bvh, frames, figure)
             except UserError as error:
                 notes.append(f"a BVH of this has a skeleton of ours, not the clip's: {error}")
-        out.append(
-            EditedMotion(
-                prompt, features, figure.joints, face, layout, seed=seed, figure=figure, original=original,
-                report=report, remarks=(*frames.remarks, *notes), bvh=bvh,
-            )
+        elif frames.drawn and not task.changes_clip:
+            figure, fps = own_figure(clip, frames, figure), clip.fps
+        # What is said is of the joints that a file holds.
+        rounded = figure.joints.astype(np.float32)
+        joints = frames.of_file(rounded, fps) if bvh is None else frames.of_file(bvh.places(), bvh.motion.fps)
+        edited = EditedMotion(
+            prompt, features, figure.joints, face, layout, seed=seed, original=original, bvh=bvh,
+            report=report_of(frames, joints, heading), remarks=(*frames.remarks, *notes),
         )  # fmt: skip
+        out.append(_drawn(edited, figure, fps))
     return out
 
 
-def original_of(frames: EditFrames, caption: str, bvh: OwnBvh | None = None) -> GeneratedMotion:
-    """The clip of a task as the model reads it: at its frame rate, on the floor."""
-    features, layout = frames.features[frames.inside], frames.layout
-    figure = frames.to_world(frames.figure)
-    return GeneratedMotion(
-        Prompt(caption),
-        features[:, layout.part("bodyhand")],
-        figure.joints,
-        frames.face,
-        layout,
-        figure=figure,
-        bvh=bvh,
-    )
+def original_of(frames: EditFrames, clip: RecordedClip) -> GeneratedMotion:
+    """The clip of a task: a figure of ours as it is, others as the model reads them."""
+    layout, figure = frames.layout, frames.to_world(frames.figure)
+    features = frames.features[frames.inside][:, layout.part("bodyhand")]
+    motion = GeneratedMotion(Prompt(clip.caption), features, figure.joints, frames.face, layout, bvh=clip.bvh)
+    if frames.drawn and clip.figure is not None and clip.bvh is None:
+        return _drawn(motion, clip.figure, clip.fps)
+    return _drawn(motion, figure, layout.fps)
+
+
+Drawn = TypeVar("Drawn", bound=GeneratedMotion)
+
+
+def _drawn(motion: Drawn, figure: RigidMotion, fps: float) -> Drawn:
+    """The motion with the figure that is shown of it, at the frame rate of that."""
+    joints, face, layout = figure.joints, motion.face, replace(motion.layout, fps=fps)
+    if fps == motion.fps:
+        return replace(motion, figure=figure, joints=joints)
+    if face is not None:
+        at = np.arange(len(joints)) / fps * motion.fps
+        face = between_rows(face[..., None], at.clip(0, len(face) - 1))[..., 0].astype(np.float32)
+    features = features_for(joints, fps, layout.without_face())[0]
+    return replace(motion, figure=figure, joints=joints, face=face, features=features, layout=layout)

@@ -142,7 +142,7 @@ def write_bvh(path: Path, outputs: Outputs) -> None:
     [clip] = outputs.clips
     figure = clip.shown.figure
     if (own := clip.shown.motion.bvh) is not None:
-        write_bytes(path, own.data)
+        write_bytes(path, own.file)
         return
     write(path, figure.skeleton, figure.rotations, figure.root, clip.shown.fps)
 

@@ -87,7 +87,7 @@ class Clips:
                 f"{CLIP} lasts {clip.seconds:.0f} s; this server takes at most {self._config.max_seconds:g} s"
             )
         frames = edit_frames(EditTask(), clip, self._model.bundle.layout)
-        motion = self.kept.made(name_of(data), lambda: original_of(frames, clip.caption, clip.bvh))
+        motion = self.kept.made(name_of(data), lambda: original_of(frames, clip))
         return {
             "clip": name_of(data),
             "caption": motion.caption,

@@ -35,7 +35,7 @@ class OwnBvh:
     """A BVH file, and how its figure is read."""
 
     data: bytes
-    """Its text, lines ended by LF."""
+    """Its text, lines ended by LF, without byte order mark."""
     motion: BvhMotion
     joint_map: JointMap
     unit: float
@@ -43,6 +43,19 @@ class OwnBvh:
     up: Up
     added: int
     """Frames in front that are no motion."""
+    mark: bytes = b""
+    """What stands in front of the text: a byte order mark."""
+    ends: bytes = b"\n"
+    """What its lines end with."""
+
+    @property
+    def file(self) -> bytes:
+        """The bytes of the file."""
+        return self.mark + self.data.replace(b"\n", self.ends)
+
+    def places(self) -> Floats:
+        """Positions [R, N, 3] of the mapped joints, in metres and Y up, without the added frames."""
+        return self.joint_map.apply(self.motion, unit=self.unit, up=self.up)[self.added :]
 
     def edited(self, joints: Floats, fps: float, lead: int, kept: Mask, seconds: float | None) -> OwnBvh:
         """The file with made joints [T, N, 3], in metres and Y up, where not all is kept [T, N].
@@ -55,18 +68,12 @@ class OwnBvh:
         sources = enumerate(self.joint_map.sources[: joints.shape[1]])
         target = {motion.joints.index(names[0]): joint for joint, names in sources if len(names) == 1}
         moving = _moving(motion, target)
-        # Rows of the result, the file's rows that they come from, and their places among the made frames.
-        clip_rows, rate = motion.frames - self.added, motion.fps
-        count = clip_rows if seconds is None else max(1, round(seconds * rate))
-        row = np.arange(-round(lead / fps * rate), count)
-        source = np.clip(row, 0, clip_rows - 1) + self.added
-        at = np.clip((row / rate * fps + lead).round(6), 0, len(joints) - 1)
-        kept = kept[np.floor(at).astype(int)] & kept[np.ceil(at).astype(int)]
-        kept &= ((row >= 0) & (row < clip_rows))[:, None]
+        source, at, kept = own_rows(motion.frames - self.added, motion.fps, fps, lead, kept, seconds)
+        source += self.added
         # A joint without a row in the map goes with its parent. A joint's numbers are the file's where it is
         # kept with all that carries it.
         carrier = [0] * len(parents)
-        own, held = np.ones((2, len(row), len(parents)), dtype=np.bool_)
+        own, held = np.ones((2, len(source), len(parents)), dtype=np.bool_)
         for joint, parent in enumerate(parents):
             carrier[joint] = target.get(joint, carrier[max(parent, 0)])
             own[:, joint] = kept[:, carrier[joint]]
@@ -132,6 +139,29 @@ class OwnBvh:
         header = _FRAMES.sub(rb"\g<1>%d" % len(rows), self.data[section.start : section.body], count=1)
         data = b"".join([self.data[: section.start], header, b"\n".join(rows), b"\n"])
         return replace(self, data=data, motion=read_bvh(data, name=self.motion.name))
+
+
+def own_rows(
+    clip_rows: int, rate: float, fps: float, lead: int, kept: Mask, seconds: float | None
+) -> tuple[Rows, Floats, Mask]:
+    """Of each row of a result at a file's rate: the file's row that it comes from, its place among the frames
+    of the result, and which joints are kept in it [R, N].
+
+    Args:
+        kept: Joints that are kept in each frame [T, N], at `fps`.
+    """
+    count = clip_rows if seconds is None else max(1, round(seconds * rate))
+    row = np.arange(-round(lead / fps * rate), count)
+    at = np.clip((row / rate * fps + lead).round(6), 0, len(kept) - 1)
+    kept = kept[np.floor(at).astype(int)] & kept[np.ceil(at).astype(int)]
+    return np.clip(row, 0, clip_rows - 1), at, kept & ((row >= 0) & (row < clip_rows))[:, None]
+
+
+def between_rows(joints: NDArray[np.floating], at: Floats) -> Floats:
+    """Joints [T, N, 3] on straight lines at places [R] among their frames."""
+    left = np.floor(at).astype(int)
+    share, right = (at - left)[:, None, None], np.minimum(left + 1, len(joints) - 1)
+    return np.asarray(joints[left] * (1 - share) + joints[right] * share, dtype=np.float64)
 
 
 def _moving(motion: BvhMotion, target: dict[int, int]) -> int:

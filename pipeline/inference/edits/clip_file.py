@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.common.features import features_of, require_human
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.body.rigid import RigidMotion, with_offsets
 from motionloom.datasets.motion.bvh.joint_map import metres
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
@@ -27,6 +29,10 @@ from motionloom.pipeline.inference.edits.recorded import RecordedClip
 ENDINGS = (".bvh", ".npz", ".glb")
 _BLEND = 0.5
 """Seconds in which a clip that comes again passes into its beginning [ours]."""
+_FIGURE = ("rotations", "offsets", "root")
+_SAME_MM = 0.1
+"""Millimetres within which an npz's joints are those of its figure: both are rounded to float32."""
+Floats = NDArray[np.float64]
 LEAST_FRAMES = 4
 """Fewer have no motion in them."""
 
@@ -44,8 +50,8 @@ def read_clip(path: Path) -> RecordedClip:
         return require_clip(_read_npz(path))
     from motionloom.pipeline.render.body.glb import read_glb
 
-    joints, fps, name = read_glb(path)
-    return require_clip(RecordedClip(str(path), joints, fps, None, name))
+    figure, fps, name = read_glb(path)
+    return require_clip(RecordedClip(str(path), figure.joints, fps, None, name, figure=figure))
 
 
 def require_clip(clip: RecordedClip) -> RecordedClip:
@@ -78,7 +84,7 @@ def changed(clip: RecordedClip, task: EditTask) -> RecordedClip:
     if face is not None:
         face = resample(face, pace, clip.fps)
         face = np.concatenate([face, *[face[1:]] * (task.repeat - 1)])
-    return replace(clip, joints=joints, face=face)
+    return replace(clip, joints=joints, face=face, figure=None)
 
 
 def read_seed_motion(path: Path, layout: MotionLayout) -> NDArray[np.float32]:
@@ -110,6 +116,9 @@ def features_for(
 def _read_bvh(path: Path) -> RecordedClip:
     """The joints that are known by their names; hands only where all fingers are found."""
     data, name = load_text(path, None)
+    raw = path.read_bytes()
+    mark = BOM_UTF8 if raw.startswith(BOM_UTF8) else b""
+    ends = next((end for end in (b"\r\n", b"\r") if end in raw), b"\n")
     motion = read_bvh(data, name=name)
     guesses = [guess_joint_map(motion, Skeleton.named(name)) for name in ("smplx52", "smpl22")]
     joint_map = next((one for one in guesses if not one.open_rows), None)
@@ -121,7 +130,7 @@ def _read_bvh(path: Path) -> RecordedClip:
     unit, up, _ = settled(joint_map, [motion])
     joints = joint_map.apply(motion, unit=unit, up=up)
     added = added_frames(joints)
-    own = OwnBvh(data, motion, joint_map, metres(joint_map.unit or unit), up, added)
+    own = OwnBvh(data, motion, joint_map, metres(joint_map.unit or unit), up, added, mark, ends)
     return RecordedClip(str(path), joints[added:], motion.fps, bvh=own)
 
 
@@ -129,6 +138,7 @@ def _read_npz(path: Path) -> RecordedClip:
     with NpzFile(path) as stored:
         joints = stored.numbers("joints")
         face = stored.numbers("face").astype(np.float32) if "face" in stored.names else None
+        posed = [stored.numbers(name) for name in _FIGURE if name in stored.names]
         text = str(stored.array("metadata")) if "metadata" in stored.names else "{}"
     facts = parse_json(text, f"{path}: its metadata")
     if joints.ndim != 3 or joints.shape[1] not in (BODY_JOINTS, 52) or joints.shape[2] != 3:
@@ -137,4 +147,15 @@ def _read_npz(path: Path) -> RecordedClip:
         raise UserError(f"{path}: a face of shape {list(face.shape)}, wanted [{len(joints)}, {FACE_DIMS}]")
     facts = facts if isinstance(facts, dict) else {}
     fps = number(facts.get("fps"), f"{path}: its metadata: fps", 1000, 0.1)
-    return RecordedClip(str(path), joints, fps, face, str(facts.get("caption", "")))
+    figure = _figure_of(joints, *posed) if len(posed) == len(_FIGURE) else None
+    return RecordedClip(str(path), joints, fps, face, str(facts.get("caption", "")), figure=figure)
+
+
+def _figure_of(joints: Floats, rotations: Floats, offsets: Floats, root: Floats) -> RigidMotion | None:
+    """The figure of an npz, if it is the one whose joints these are."""
+    skeleton = Skeleton.named("smpl22" if joints.shape[1] == BODY_JOINTS else "smplx52")
+    shapes = ((*joints.shape, 3), joints.shape[1:], (len(joints), 3))
+    if (rotations.shape, offsets.shape, root.shape) != shapes:
+        return None
+    figure = RigidMotion.posed(with_offsets(skeleton, offsets), rotations, root, joints)
+    return replace(figure, joints=joints) if figure.error.max_mm < _SAME_MM else None

@@ -14,7 +14,7 @@ from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
 from motionloom.datasets.motion.body.landing import eased, landed, reached
 from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
-from motionloom.datasets.motion.bvh.own_file import OwnBvh
+from motionloom.datasets.motion.bvh.own_file import OwnBvh, between_rows, own_rows
 from motionloom.datasets.motion.canonical import facing, ground, retarget
 from motionloom.datasets.motion.features.codec import encode, place
 from motionloom.datasets.motion.features.torch_joints import torch_way
@@ -25,6 +25,7 @@ from motionloom.models.metrics.dance import ANKLES_TOES
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Motion, MotionGenerator
 from motionloom.pipeline.inference.edits.frames import EditFrames, RootPath
+from motionloom.pipeline.inference.edits.recorded import RecordedClip
 
 _REACH_SECONDS = 0.5
 """In which a figure goes to a pin and comes back [ours]."""
@@ -65,10 +66,10 @@ def require_work(frames: EditFrames) -> None:
 
 def finish(
     frames: EditFrames, made: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], RigidMotion, EditReport]:
+) -> tuple[NDArray[np.float32], RigidMotion, NDArray[np.float64]]:
     """Pose the clip's figure by features of body and hands [T, D], as a model made them.
 
-    Returns the features of what came, the figure in the clip's world, and how near it is to the task.
+    Returns the features of what came, the figure in the clip's world, and its headings there [T].
     `UserError` for a pin that it does not reach.
     """
     layout, rooted = frames.layout.without_face(), frames.rooted
@@ -80,17 +81,20 @@ def finish(
     if frames.pins:
         blend = max(2, round(_REACH_SECONDS * layout.fps))
         figure = reached(figure, frames.pins, frames.kept_joints, blend, hold)
-    report, joints = _report(frames, figure, heading), figure.joints
-    far = max(report.pins_cm, key=report.pins_cm.__getitem__, default="")
-    if far and report.pins_cm[far] > 100 * _REACHED:
+    joints, missed = figure.joints, {}
+    for (frame, joint), wanted in frames.pins.items():
+        away = float(np.linalg.norm(joints[frame, joint] - np.asarray(wanted)))
+        missed[f"{figure.skeleton.joints[joint]} at {(frame - frames.lead) / layout.fps:.2f} s"] = away
+    far = max(missed, key=missed.__getitem__, default="")
+    if far and missed[far] > _REACHED:
         raise UserError(
-            f"pins: {far} is out of reach: the figure gets within {report.pins_cm[far]:.1f} cm of it; pin it "
+            f"pins: {far} is out of reach: the figure gets within {100 * missed[far]:.1f} cm of it; pin it "
             f"nearer, keep less around it, or draw a path that leads there"
         )
     if layout.family != "exact":
         # These are made of steps between joints, so there is one frame more of joints.
         joints = np.concatenate([joints, 2 * joints[-1:] - joints[-2:-1]])
-    return encode(joints, layout), frames.to_world(figure), report
+    return encode(joints, layout), frames.to_world(figure), heading + frames.turn
 
 
 def own_bvh(bvh: OwnBvh, frames: EditFrames, figure: RigidMotion) -> OwnBvh:
@@ -99,6 +103,27 @@ def own_bvh(bvh: OwnBvh, frames: EditFrames, figure: RigidMotion) -> OwnBvh:
         raise UserError("the clip was mirrored, retimed or repeated")
     kept = frames.pieces[:, piece_joints(frames.layout)]
     return bvh.edited(figure.joints, frames.layout.fps, frames.lead, kept, frames.task.seconds)
+
+
+def own_figure(clip: RecordedClip, frames: EditFrames, made: RigidMotion) -> RigidMotion:
+    """A figure in the clip's world at the frame rate of the clip's own, with its numbers where it is kept."""
+    from scipy.spatial.transform import Slerp
+
+    own, fps = clip.figure, frames.layout.fps
+    assert own is not None
+    kept = frames.pieces[:, piece_joints(frames.layout)]
+    source, at, kept = own_rows(len(own.root), clip.fps, fps, frames.lead, kept, frames.task.seconds)
+    when = np.arange(len(made.root))
+    turned = [Slerp(when, Rotation.from_matrix(one))(at).as_matrix() for one in made.rotations.swapaxes(0, 1)]
+    rotations = np.stack(turned, axis=1)
+    root = np.stack([np.interp(at, when, axis) for axis in made.root.T], axis=-1)
+    # Rotations of kept joints count where what carries them is kept too.
+    held = kept & kept[:, np.maximum(own.skeleton.parents, 0)]
+    rotations[held], root[kept[:, 0]] = own.rotations[source][held], own.root[source][kept[:, 0]]
+    out = RigidMotion.posed(own.skeleton, rotations, root, between_rows(made.joints, at))
+    whole = kept.all(axis=1)
+    out.joints[whole] = own.joints[source][whole]
+    return out
 
 
 def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, NDArray[np.float64]]:
@@ -155,21 +180,30 @@ def _made_root(frames: EditFrames, made: NDArray[np.float32]) -> RootPath:
     return RootPath(heading - heading[first] + anchor.heading[0], anchor.place[0] + away)
 
 
-def _report(frames: EditFrames, figure: RigidMotion, heading: NDArray[np.float64]) -> EditReport:
-    """How near a figure with its headings [T], seen from the clip's first frame, is to the task."""
-    fps, inside, pieces = frames.layout.fps, frames.inside, piece_joints(frames.layout)
-    joints, clip, rooted = figure.joints, frames.figure.joints, frames.rooted[frames.inside][:, None]
-    names, parents = figure.skeleton.joints, np.maximum(figure.skeleton.parents, 0)
+def report_of(frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[np.float64]) -> EditReport:
+    """How near a result is to its task, by the joints [T, M, 3] of its file, and headings [T], in the clip's
+    world.
+    """
+    fps, inside, count = frames.layout.fps, frames.inside, joints.shape[1]
+    pieces, clip, rooted = piece_joints(frames.layout)[:count], frames.seen, frames.rooted[inside][:, None]
+    names, parents = frames.layout.skeleton.joints, np.maximum(frames.layout.skeleton.parents[:count], 0)
     # Without the legs the figure goes elsewhere, so what is kept of it is compared bone by bone, as the
     # figure sees it; fingers are kept within a hand, which goes with its arm.
     kept = frames.pieces[inside].copy()
     kept[:, 4:6] &= kept[:, 2:4]
     kept = kept[:, pieces] & (rooted | kept[:, pieces][:, parents])
-    back = Rotation.from_euler("y", (frames.clip_root.heading - heading[inside])[:, None]).as_matrix()
+    back = frames.clip_root.heading + frames.turn - heading[inside]
+    back = Rotation.from_euler("y", back[:, None]).as_matrix()
     bones = np.einsum("tij,tnj->tni", back, joints[inside] - joints[inside][:, parents])
     away = np.where(rooted[..., None], joints[inside] - clip, bones - (clip - clip[:, parents]))
     # The way is looked at where the root walks; a figure that stands may face anywhere.
     on_path, root = ~np.isnan(frames.path), ground(joints[:, 0])
+    path = frames.path * np.exp(1j * frames.turn) + frames.origin
+    pins = {}
+    for (frame, joint), pin in zip(frames.pins, frames.task.pins, strict=True):
+        if joint < count:  # not fingers of a file that has none
+            miss = np.linalg.norm(joints[frame, joint] - pin.position - np.array([0, frames.base, 0]))
+            pins[f"{names[joint]} at {(frame - frames.lead) / fps:.2f} s"] = 100 * float(miss)
     way = np.gradient(root) * fps
     walks = on_path & (np.abs(way) > _WALKS)
     aside = np.abs(np.angle(way * np.exp(-1j * facing(joints))))[walks]
@@ -180,12 +214,8 @@ def _report(frames: EditFrames, figure: RigidMotion, heading: NDArray[np.float64
     free = ~frames.rooted
     return EditReport(
         kept_cm=_largest(100 * np.linalg.norm(away, axis=-1)[kept]),
-        path_cm=_largest(100 * np.abs(root - frames.path)[on_path]),
-        pins_cm={
-            f"{names[joint]} at {(frame - frames.lead) / fps:.2f} s": 100
-            * float(np.linalg.norm(joints[frame, joint] - np.asarray(wanted)))
-            for (frame, joint), wanted in frames.pins.items()
-        },
+        path_cm=_largest(100 * np.abs(root - path)[on_path]),
+        pins_cm=pins,
         aside_degrees=float(np.degrees(aside.mean())) if walks.any() else float("nan"),
         seams=_largest(accelerations(joints, fps)[near]),
         inside=_largest(accelerations(clip, fps)),

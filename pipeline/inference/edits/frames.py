@@ -6,7 +6,7 @@ is put back on the clip's bones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
-from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget, runs
+from motionloom.datasets.motion.bvh.own_file import between_rows
+from motionloom.datasets.motion.canonical import (
+    canonicalize,
+    facing,
+    ground,
+    resample,
+    resample_quaternions,
+    retarget,
+    runs,
+)
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.layout import (
@@ -82,6 +91,14 @@ class EditFrames:
     """Where the clip's first root is in the clip's world, z + i x."""
     turn: float
     """The heading of the clip's first root there, in radians."""
+    height: float
+    """Height of the floor there, which is 0 unless the clip is a figure of ours."""
+    drawn: bool
+    """Whether it is one."""
+    seen: NDArray[np.float64]
+    """The clip's joints as its file has them [n, M, 3], in the clip's world."""
+    base: float
+    """Height in that file of what a task calls 0."""
     bare_wrists: tuple[int, ...]
     """Wrists of a clip without fingers, where the model makes these."""
     remarks: tuple[str, ...]
@@ -113,17 +130,14 @@ class EditFrames:
         return kept
 
     def to_world(self, figure: RigidMotion) -> RigidMotion:
-        """A figure in the clip's world, the floor at height 0."""
+        """A figure in the clip's world."""
+        return _moved(figure, self.turn, self.origin, self.height)
 
-        from scipy.spatial.transform import Rotation  # not with every command
-
-        def put(points: NDArray[np.float64]) -> NDArray[np.float64]:
-            plane = ground(points) * np.exp(1j * self.turn) + self.origin
-            return np.stack([plane.imag, points[..., 1], plane.real], axis=-1)
-
-        rotations = figure.rotations.copy()
-        rotations[:, 0] = Rotation.from_euler("y", self.turn).as_matrix() @ rotations[:, 0]
-        return RigidMotion(figure.skeleton, rotations, put(figure.root), put(figure.joints), figure.error)
+    def of_file(self, joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
+        """Joints [R, M, 3] of a file of the result, in the result's frames [T, M, 3]."""
+        first = round(self.lead / self.layout.fps * fps)
+        at = (np.arange(self.frames) - self.lead) / self.layout.fps * fps + first
+        return between_rows(joints, at.round(6).clip(0, len(joints) - 1))
 
     @property
     def model_pins(self) -> list[tuple[float, float, float]]:
@@ -140,7 +154,9 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     remarks = []
     if abs(clip.fps - layout.fps) > 1e-6:
         remarks.append(f"read at {clip.fps:g} frames/s, edited at the model's {layout.fps:g}")
-    joints = resample(clip.joints, clip.fps, layout.fps)
+    drawn = clip.figure if clip.joints.shape[1] == layout.num_joints else None
+    drawn = None if drawn is None else _resampled(drawn, clip.fps, layout.fps)
+    joints = resample(clip.joints, clip.fps, layout.fps) if drawn is None else drawn.joints
     face = None if clip.face is None else resample(clip.face, clip.fps, layout.fps)
     hands = layout.num_joints > BODY_JOINTS
     if not hands:
@@ -149,7 +165,17 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         joints = with_resting_hands(joints)
         remarks.append("the clip has no hands, so the model makes them")
     origin, turn = complex(ground(joints[0, 0])), float(facing(joints[:1])[0])
-    figure = fit_rigid(canonicalize(joints), layout.skeleton)
+    floor, base, seen = float(joints[..., 1].min()), 0.0, joints
+    if drawn is None:
+        figure, height = fit_rigid(canonicalize(joints), layout.skeleton), 0.0
+        seen = seen - np.array([0.0, floor, 0.0])
+    else:
+        figure, height = _moved(drawn, -turn, -origin * np.exp(-1j * turn), -floor), floor
+    if task.changes_clip:
+        seen = _moved(figure, turn, origin, 0.0).joints
+    elif clip.bvh is not None:
+        written = clip.bvh.places()
+        seen, base = resample(written, clip.bvh.motion.fps, layout.fps), float(written[..., 1].min())
     own = figure.joints
     # The features must be of the figure that the model knows; `scale` and `lift` lead back to the clip's.
     retargeted = retarget(own, layout.skeleton)
@@ -175,7 +201,7 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     pieces = timed.pieces(len(features)) & has
     path = timed.path(origin, turn)
     timed.require_free(path, pieces[:, LOWER], clip_root)
-    pins = timed.pins(pieces, origin, turn)
+    pins = timed.pins(pieces, origin, turn, height)
     places, anchor = _known_places(clip_root, lead, pieces[:, LOWER], path, scale)
     return EditFrames(
         task=task,
@@ -194,6 +220,10 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         lift=lift,
         origin=origin,
         turn=turn,
+        height=height,
+        drawn=drawn is not None,
+        seen=seen[rows],
+        base=base,
         bare_wrists=() if clip.has_hands or not hands else tuple(map(layout.skeleton.index, _WRISTS)),
         remarks=tuple(remarks),
     )
@@ -275,7 +305,7 @@ class _TimedTask:
             )
 
     def pins(
-        self, pieces: NDArray[np.bool_], origin: complex, turn: float
+        self, pieces: NDArray[np.bool_], origin: complex, turn: float, height: float
     ) -> dict[tuple[int, int], tuple[float, float, float]]:
         """Pinned joints by frame and joint."""
         out = {}
@@ -292,8 +322,32 @@ class _TimedTask:
                 raise UserError(f"pins: {pin.joint} is pinned twice in the frame at {pin.at:g} s")
             x, y, z = pin.position
             place = (complex(z, x) - origin) * np.exp(-1j * turn)
-            out[frame, joint] = (float(place.imag), y, float(place.real))
+            out[frame, joint] = (float(place.imag), y - height, float(place.real))
         return out
+
+
+def _moved(figure: RigidMotion, turn: float, place: complex, height: float) -> RigidMotion:
+    """The figure turned to the left about the origin, in radians, and then moved."""
+    from scipy.spatial.transform import Rotation  # not with every command
+
+    def put(points: NDArray[np.float64]) -> NDArray[np.float64]:
+        plane = ground(points) * np.exp(1j * turn) + place
+        return np.stack([plane.imag, points[..., 1] + height, plane.real], axis=-1)
+
+    rotations = figure.rotations.copy()
+    rotations[:, 0] = Rotation.from_euler("y", turn).as_matrix() @ rotations[:, 0]
+    return replace(figure, rotations=rotations, root=put(figure.root), joints=put(figure.joints))
+
+
+def _resampled(figure: RigidMotion, fps_in: float, fps_out: float) -> RigidMotion:
+    """The figure at another frame rate."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_matrix(figure.rotations.reshape(-1, 3, 3)).as_quat()
+    turns = resample_quaternions(turns.reshape(*figure.rotations.shape[:2], 4), fps_in, fps_out)
+    rotations = Rotation.from_quat(turns.reshape(-1, 4)).as_matrix().reshape(*turns.shape[:2], 3, 3)
+    root, joints = (resample(one, fps_in, fps_out) for one in (figure.root, figure.joints))
+    return RigidMotion.posed(figure.skeleton, rotations, root, joints)
 
 
 def _known_places(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.layout import BODY_JOINTS
 
@@ -24,6 +25,8 @@ class RecordedClip:
     caption: str = ""
     bvh: OwnBvh | None = None
     """The file, where it is a BVH."""
+    figure: RigidMotion | None = None
+    """The figure whose joints these are, where a file of ours holds it."""
 
     @property
     def has_hands(self) -> bool:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.files import atomic_file
-from motionloom.datasets.motion.body.rigid import RigidMotion, on_one_skeleton
+from motionloom.datasets.motion.body.rigid import RigidMotion, on_one_skeleton, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError, number, parse_json, read_plain
@@ -253,8 +253,8 @@ def _unit(vectors: Values) -> NDArray[np.float32]:
     return out
 
 
-def read_glb(path: Path) -> tuple[NDArray[np.float64], float, str]:
-    """Joints [T, N, 3] in metres, frames a second and the name of a file's first animation.
+def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
+    """The figure, frames a second and the name of a file's first animation.
 
     `UserError` for a file of other figures than those of `write_glb`, and for a damaged one.
     """
@@ -289,7 +289,7 @@ def read_glb(path: Path) -> tuple[NDArray[np.float64], float, str]:
         }
         names = tuple(node.name for node in nodes)
         skeleton = next(one for one in map(Skeleton.named, ("smplx52", "smpl22")) if one.joints == names)
-        offsets = np.array([node.translation for node in nodes], dtype=np.float64)
+        offsets = np.array([[0, 0, 0], *(node.translation for node in nodes[1:])], dtype=np.float64)
         frames = max(len(track) for track in tracks.values())
         turns = np.empty((frames, len(names), 4))
         for joint in range(len(names)):
@@ -303,4 +303,5 @@ def read_glb(path: Path) -> tuple[NDArray[np.float64], float, str]:
             f"{path}: not a GLB file that motionloom wrote ({type(error).__name__}); give its BVH or npz"
         ) from None
     joints, _ = forward_kinematics(rotations, root, offsets, skeleton.parents)
-    return joints, number(stated, f"{path}: fps", 1000, 0.1), str(animation.name or "")
+    figure = RigidMotion.posed(with_offsets(skeleton, offsets), rotations, root, joints)
+    return figure, number(stated, f"{path}: fps", 1000, 0.1), str(animation.name or "")

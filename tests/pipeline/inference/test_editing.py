@@ -76,7 +76,7 @@ def test_kept_frames_are_the_clips_own(walk: Walk, name: str) -> None:
     original, kept = made.original, np.ones(len(made.joints), dtype=bool)
     kept[20:40] = False
     np.testing.assert_allclose(made.joints[kept], original.joints[kept], atol=1e-9)
-    assert made.report.kept_cm < 1e-6
+    assert made.report.kept_cm < 1e-4
     assert np.abs(made.joints - original.joints)[~kept].max() > 0.01
     # In the clip's own world, whose floor is at 0.
     floor = one.joints[..., 1].min()
@@ -108,7 +108,7 @@ def test_parts_are_kept_alone(walk: Walk, keep: dict[str, object], free: set[str
     found = {name for name, one in zip(names, moved, strict=True) if one}
     assert free <= found
     assert not found & {"pelvis", "left_knee", "right_foot"}
-    assert made.report.kept_cm < 1e-6
+    assert made.report.kept_cm < 1e-4
     assert made.face is not None and made.original.face is not None
     face_kept = keep["parts"] == ["all"] and keep.get("but") != ["face"]
     assert np.array_equal(made.face, made.original.face) == face_kept
@@ -119,7 +119,7 @@ def test_a_clip_is_mirrored_retimed_and_repeated_without_a_model(
 ) -> None:
     monkeypatch.setattr(Filling, "__call__", None)
     twice = edit(editor(), clip(walk), mirror=True, speed=2.0, repeat=2)
-    assert len(twice.joints) == 59 and twice.report.kept_cm < 1e-6
+    assert len(twice.joints) == 59 and twice.report.kept_cm < 1e-4
     there = mirror(twice.joints[:30], twice.layout.skeleton) - twice.original.joints[::2]
     assert np.ptp(there - there[0, 0], axis=0).max() < 0.05, "frames of the clip, somewhere else"
     steps = np.linalg.norm(np.diff(twice.joints, axis=0), axis=-1).max(axis=1)
@@ -131,9 +131,9 @@ def test_before_after_and_between(walk: Walk) -> None:
     assert len(made.joints) == 10 + 80
     np.testing.assert_allclose(made.joints[10:70], made.original.joints, atol=1e-9)
     longer = edit(editor(), clip(walk, 6.0), keep=[{"end": 2.5}, {"start": 3.0}])  # windows of 2 s
-    assert longer.report.kept_cm < 1e-6
+    assert longer.report.kept_cm < 1e-4
     legs = edit(editor(), clip(walk), keep=[{"parts": ["upper"]}])
-    assert legs.report.kept_cm < 1e-6 and np.abs(legs.joints - legs.original.joints)[:, 7].max() > 0.01
+    assert legs.report.kept_cm < 1e-4 and np.abs(legs.joints - legs.original.joints)[:, 7].max() > 0.01
 
 
 def test_path_and_pins_are_met(walk: Walk) -> None:
@@ -151,7 +151,7 @@ def test_path_and_pins_are_met(walk: Walk) -> None:
     made = edit(model, one, keep=ENDS, pins=[pin])
     [miss] = made.report.pins_cm.values()
     assert miss < 0.1
-    assert made.report.kept_cm < 1e-6
+    assert made.report.kept_cm < 1e-4
     forearm = np.linalg.norm(made.joints[:, 20] - made.joints[:, 18], axis=-1)
     assert np.ptp(forearm) < 1e-9, "the figure is rigid"
     with pytest.raises(UserError, match=r"left_wrist at 1.50 s is out of reach: .* \d+\.\d cm"):
@@ -180,10 +180,11 @@ def test_a_figure_on_other_bones_stands_where_the_clip_does(walk: Walk) -> None:
         long[:, below] += 0.5 * shin[:, None]
     long[..., 1] -= long[..., 1].min()
     layout = MotionLayout.named("wholebody363", fps=20.0)
-    frames = edit_frames(EditTask.parse({"keep": ENDS}, "task"), RecordedClip("long", long, 20.0), layout)
+    one = RecordedClip("long", long, 20.0)
+    frames = edit_frames(EditTask.parse({"keep": ENDS}, "task"), one, layout)
     assert frames.scale != 1.0
     joints = finish(frames, frames.features[:, layout.part("bodyhand")])[1].joints
-    off = np.linalg.norm(joints[20:40] - original_of(frames, "").joints[20:40], axis=-1)
+    off = np.linalg.norm(joints[20:40] - original_of(frames, one).joints[20:40], axis=-1)
     assert off.max() < 0.02
 
 
@@ -194,10 +195,33 @@ def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:
         assert one.fps == 20 and one.joints.shape == (60, 52, 3)
         np.testing.assert_allclose(one.joints, made.joints, atol=1e-3)
     assert again[0].caption == "a person walks"
+    # A figure of ours comes back with its bones, its rate and the numbers of what is kept.
+    stored = dict(np.load(tmp_path / "clip.npz"))
+    np.savez(tmp_path / "fast.npz", **stored | {"metadata": np.array('{"fps": 30}')})
+    for name, rows in {
+        "clip.npz": np.r_[0:20, 30:60], "clip.glb": np.r_[0:20, 30:60], "fast.npz": np.r_[0:29, 45:60]
+    }.items():  # fmt: skip
+        one = read_clip(tmp_path / name)
+        made_again = edit(editor(), one, keep=[{"end": 1.0}, {"start": 1.5}])
+        path = made_again.save(tmp_path / f"made{Path(name).suffix}")
+        found = read_clip(path)
+        assert found.fps == one.fps and found.figure is not None and one.figure is not None
+        assert len(found.joints) == 60 and np.abs(found.joints - one.joints).max() > 0.01
+        tolerance = 1e-6 if path.suffix == ".glb" else 0.0
+        for field in ("joints", "rotations", "root"):
+            numbers = [getattr(each.figure, field)[rows] for each in (found, one)]
+            np.testing.assert_allclose(*numbers, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(*(each.figure.skeleton.offsets for each in (found, one)), atol=1e-7)
     # A BVH that is read comes back with its own text, also when the result is edited again.
+    text = (tmp_path / "clip.bvh").read_bytes().replace(b"\n", b"\r\n")
+    (tmp_path / "clip.bvh").write_bytes(b"\xef\xbb\xbf" + text)
+    again[1] = read_clip(tmp_path / "clip.bvh")
     made = edit(editor(), again[1], keep=ENDS)
-    rows = [(tmp_path / "clip.bvh").read_text(), made.save(tmp_path / "made.bvh").read_text()]
-    before, after = (text.splitlines() for text in rows)
+    rows = [text, made.save(tmp_path / "made.bvh").read_bytes().removeprefix(b"\xef\xbb\xbf")]
+    before, after = (text.split(b"\r\n")[:-1] for text in rows)
+    assert rows[0] != rows[1] and b"\n" not in b"".join(after)
+    miss = np.abs(made.joints[10:15] - made.original.joints[10:15]).max() + made.report.kept_cm
+    assert miss < 1e-9
     start = len(before) - 60
     assert before[: start + 20] == after[: start + 20] and before[-20:] == after[-20:]
     assert all(one != two for one, two in zip(before[start + 20 : -20], after[start + 20 : -20], strict=True))
