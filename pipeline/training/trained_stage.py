@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from inspect import signature
 from os.path import relpath
 from pathlib import Path
 from pkgutil import resolve_name
@@ -82,8 +83,6 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     trainer: str = ""
     """The `StageModule` that trains the network, as "package.module:Class"; it is imported where a training
     begins, since Lightning takes seconds."""
-    trainer_keys: tuple[str, ...] = ()
-    """Settings of the config that the trainer takes as they are."""
     trains = True
 
     def modules(self, config: C) -> Iterable[str]:
@@ -102,14 +101,15 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         """The untrained network; `UserError` where it does not fit the inputs."""
 
     def module(self, config: C, net: N, inputs: I, seed: int) -> StageModule:
-        """The network with its losses and optimizers."""
+        """The network with its losses and optimizers, and all settings that the trainer takes by name."""
         trainer: Callable[..., StageModule] = resolve_name(self.trainer)
-        settings = self.module_settings(config, net, inputs)
-        return trainer(net, config.optim, seed=seed, max_steps=config.train.steps, **settings)
+        named = type(config).model_fields.keys() & signature(trainer).parameters.keys()
+        settings = {key: getattr(config, key) for key in named} | self.module_settings(config, net, inputs)
+        return trainer(**settings | {"net": net, "seed": seed, "max_steps": config.train.steps})
 
     def module_settings(self, config: C, net: N, inputs: I) -> dict[str, object]:
-        """Return what the trainer takes besides the network, its optimizer, a seed and the steps."""
-        return {key: getattr(config, key) for key in self.trainer_keys}
+        """Return what the trainer takes besides settings of the config, the network, a seed and the steps."""
+        return {}
 
     @abstractmethod
     def batches(self, config: C, net: N, inputs: I, seed: int, log: Log) -> Batches:

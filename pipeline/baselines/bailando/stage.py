@@ -69,7 +69,6 @@ class DanceVqStage(TrainedStage[DanceVqStageConfig, DanceVqInputs, DanceVq]):
     name = "dance_vq"
     summary = "Bailando: codes of upper and lower body"
     trainer = "motionloom.pipeline.baselines.bailando.module:DanceVqModule"
-    trainer_keys = ("root_optim", "root_start")
     config = DanceVqStageConfig
     inputs = DanceVqInputs
     curves = tuple(Curve(name) for name in ("codes_recon_up", "codes_recon_down", "root_loss"))
@@ -243,7 +242,7 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
     def module_settings(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs
     ) -> dict[str, object]:
-        return {"vq": inputs.dance_vq, "fps": inputs.data.layout.fps, "reward": config.reward}
+        return {"vq": inputs.dance_vq, "fps": inputs.data.layout.fps}
 
     def dry_module(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs
@@ -274,7 +273,9 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, batch: int
     ) -> Example:
         tensors, note = super().example(config, net, inputs, batch)
-        return Example({**tensors, "beats": torch.zeros(tensors["motion"].shape[:2], dtype=torch.bool)}, note)
+        rows, frames = tensors["motion"].shape[:2]
+        beats = torch.zeros(rows, frames, dtype=torch.bool)
+        return Example({**tensors, "length": torch.full((rows,), frames), "beats": beats}, note)
 
 
 def gpt_of(facts: ModelFacts) -> CrossGpt:

@@ -72,7 +72,6 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
     name = "captioner"
     summary = "motion tokens to words"
     trainer = "motionloom.pipeline.baselines.tm2t.module:CaptionerModule"
-    trainer_keys = ("loss",)
     config = CaptionerStageConfig
     offers = frozenset({CAPTIONER})
     inputs = CaptionerInputs
@@ -194,7 +193,7 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
         self, config: Seq2SeqStageConfig, net: Seq2Seq, inputs: Seq2SeqInputs
     ) -> dict[str, object]:
         judge = _captioner(config, net, inputs)
-        return {"loss": config.loss, "captioner": None if judge is None else judge.net}
+        return {"captioner": None if judge is None else judge.net}
 
     def batches(
         self, config: Seq2SeqStageConfig, net: Seq2Seq, inputs: Seq2SeqInputs, seed: int, log: Log

@@ -153,7 +153,6 @@ class Tm2tStage(TokenizerStage):
     """A tokenizer and its critic, which take turns."""
 
     trainer = "motionloom.pipeline.baselines.tm2t.module:AdversarialTokenizerModule"
-    trainer_keys = ("critic",)
     curves = tuple(
         Curve(name)
         for name in ("tokenizer_recon", "tokenizer_adversarial", "tokenizer_perplexity", "critic_accuracy")

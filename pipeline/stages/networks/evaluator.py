@@ -60,7 +60,6 @@ class EvaluatorStage(CaptionStage[EvaluatorStageConfig, CaptionInputs, Evaluator
     name = "evaluator"
     summary = "text-motion evaluator"
     trainer = "motionloom.models.evaluator.module:EvaluatorModule"
-    trainer_keys = ("loss", "movement_optim", "movement_steps")
     config = EvaluatorStageConfig
     inputs = CaptionInputs
     curves = (

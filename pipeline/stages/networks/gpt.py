@@ -131,8 +131,8 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     ) -> dict[str, object]:
         """L_align is taken on what the frozen tokenizer and TMA make of its tokens."""
         if not config.aligned or inputs.tma is None:
-            return {"loss": config.loss}
-        return {"loss": config.loss, "tokenizer": inputs.tokenizer.net, "tma": inputs.tma.net}
+            return {}
+        return {"tokenizer": inputs.tokenizer.net, "tma": inputs.tma.net}
 
     def batches(
         self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int, log: Log

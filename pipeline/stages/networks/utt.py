@@ -124,7 +124,7 @@ class UttStage(TrainedStage[UttStageConfig, UttInputs, ConditionedUtt]):
                 f"max_frames {config.max_frames} has {groups}; raise net.block_size, or set max_frames to "
                 f"{net.utt.max_groups * GROUP_FRAMES}"
             )
-        return {"tokenizer": inputs.tokenizer.net, "loss": config.loss}
+        return {"tokenizer": inputs.tokenizer.net}
 
     def dry_module(self, config: UttStageConfig, net: ConditionedUtt, inputs: UttInputs) -> StageModule:
         """With the adversarial term from the first step on."""

@@ -189,3 +189,20 @@ def test_what_does_not_fit_is_told_with_the_stage(
 ) -> None:
     with pytest.raises(UserError, match=f"stage {stage}: .*{says}"):
         estimate(load_recipe(recipe, sets), {stage})
+
+
+def test_a_trainer_has_the_loss_that_its_recipe_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not its default: of every kind that has one."""
+    real, seen = TrainedStage.module, set[str]()
+
+    def module(self: Any, config: Any, *rest: Any, **named: Any) -> Any:
+        made = real(self, config, *rest, **named)
+        if "loss" in type(config).model_fields:
+            assert made.loss_config is config.loss, self.name
+            seen.add(self.name)
+        return made
+
+    monkeypatch.setattr(TrainedStage, "module", module)
+    estimate(load_recipe("baselines-tiny"), {"tma", "gpt", "evaluator", "mld_vae"})
+    estimate(load_recipe("baselines-tiny-ude"), {"utt", "motionclip", "captioner", "seq2seq", "actor_critic"})
+    assert seen == {"tma", "gpt", "evaluator", "motion_vae", "utt", "motionclip", "captioner", "seq2seq"}
