@@ -114,6 +114,12 @@ class _Figure:
         """Whether each is above the next."""
         return all(a != b and a in self.ancestors(b) for a, b in pairwise(joints))
 
+    def below(self, joint: int) -> list[int]:
+        """Joints and End Sites below a joint, without those that lie at its place."""
+        near = _SAME_PLACE * self.extent
+        places = range(joint + 1, len(self.parents))
+        return [one for one in places if self.is_chain(joint, one) and self.length(joint, one) >= near]
+
     def branch(self, *joints: int) -> int:
         """The lowest joint that is above all."""
         return next(a for a in self.ancestors(joints[0]) if all(a in self.ancestors(b) for b in joints))
@@ -200,22 +206,22 @@ def _feet(
     """Rows of both feet, and the End Sites of ankles that are estimated."""
     words = [known.leg[3] for known in CONVENTIONS]
     toes: dict[str, tuple[int, ...]] = {}
-    for side, (_, _, ankle) in zip(_SIDES, legs, strict=True):
+    below = [figure.below(leg[2]) for leg in legs]
+    for side, joints in zip(_SIDES, below, strict=True):
         named = [figure.named.get((side, word), -1) for word in words]
-        if own := [joint for joint in named if joint >= 0 and figure.is_chain(ankle, joint)]:
+        if own := [joint for joint in named if joint in joints]:
             toes[f"{side}_foot"] = (own[0],)
     # An estimate is for figures without any foot joint: of two feet, one open is rather a wrong name.
-    if toes or any(leg[2] in figure.parents[: len(figure.motion.joints)] for leg in legs):
+    if toes or any(joint < len(figure.motion.joints) for joints in below for joint in joints):
         return toes, {}
     hips = [figure.poses[:, leg[0]] for leg in legs]
     found: dict[str, tuple[int, ...]] = {}
     ends: dict[str, tuple[float, float, float]] = {}
-    for side, (_, knee, ankle) in zip(_SIDES, legs, strict=True):
+    for side, (_, knee, ankle), ends_below in zip(_SIDES, legs, below, strict=True):
         bone = figure.poses[:, ankle] - figure.poses[:, knee]
         shin = figure.length(knee, ankle)
         forward = _unit(np.cross(hips[0] - hips[1], -bone))
-        if ankle in figure.parents:  # of its End Site
-            end = figure.parents.index(ankle)
+        for end in ends_below[:1]:
             way = figure.poses[:, end] - figure.poses[:, ankle]
             length = np.median(np.linalg.norm(way, axis=-1)) / shin
             ahead = np.median(np.sum(_unit(way) * forward, axis=-1))

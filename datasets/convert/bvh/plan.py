@@ -302,6 +302,11 @@ def plan_bvh(
         _decide_by_index(config, config.humanml_index, folder, found, draft)
     maps = choose_maps(config, own_maps, draft, settings.maps)
     draft.limit(lambda clip: clip.id)
+    if miscounted := [file.path for file in found if file.miscounted]:
+        draft.notes.append(
+            f"'Frames:' is a row off in {len(miscounted)} of the files (the first: {miscounted[0]}); "
+            "all their rows are read"
+        )
     layout = config.motion_layout()
     draft.finish(
         found=len(names),

@@ -13,7 +13,7 @@ from motionloom.datasets.convert.common.files import read_in_threads, walk_files
 from motionloom.datasets.motion.bvh.asf import FPS, JOINED, frame_marks, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
-from motionloom.datasets.motion.bvh.text import find_motion, load_text, parse_hierarchy, require_all_frames
+from motionloom.datasets.motion.bvh.text import count_frames, find_motion, load_text, parse_hierarchy
 from motionloom.datasets.schema import UserError, read_plain
 from motionloom.datasets.shards.left_out import drop
 
@@ -79,6 +79,8 @@ class FoundFile:
     """The same in files with one hierarchy; empty when it cannot be read."""
     joints: tuple[str, ...] = ()
     """Names of the skeleton's joints."""
+    miscounted: bool = False
+    """Whether its header states another number of frames."""
     problem: str = ""
     """Reason that the file cannot be read; empty when it can."""
 
@@ -104,17 +106,19 @@ def read_motion(data: bytes, label: str) -> BvhMotion:
     return read_amc(asf, amc, name=label) if joined else read_bvh(data, name=label)
 
 
-def _read_header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...]]:
-    """Frames, frame rate, skeleton and its joints; `UserError` when the file cannot be read."""
+def _read_header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...], bool]:
+    """Frames, frame rate, skeleton, its joints, and whether the file states other frames than it has;
+    `UserError` when it cannot be read.
+    """
     asf, joined, amc = data.partition(JOINED)
     if joined:
         found, parents = skeleton_of(asf, label)
-        return len(frame_marks(amc, label)), FPS, skeleton_key(found, parents), found
+        return len(frame_marks(amc, label)), FPS, skeleton_key(found, parents), found, False
     text, where = load_text(data, label)
     section = find_motion(text, where)
-    require_all_frames(text, section, where)
+    frames = count_frames(text, section, where)
     key, names = "", tuple[str, ...]()
     with suppress(UserError):  # a broken hierarchy is reported when the clip is converted
         joints = parse_hierarchy(text[: section.start], where)
         key, names = skeleton_key(joints.names, joints.parents), tuple(joints.names)
-    return section.frames, section.fps, key, names
+    return frames, section.fps, key, names, frames != section.frames

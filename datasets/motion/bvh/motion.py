@@ -81,14 +81,14 @@ class BvhMotion:
     def local_offsets(self) -> Floats:
         """Translation of every joint against its parent [T, N, 3]: OFFSET, replaced by position channels.
 
-        Where those of all joints but the root are zero in every frame, they replace nothing: some writers
-        list six channels on every joint and fill three.
+        Those of a joint below the root that are zero in every frame replace nothing: some writers list six
+        channels on every joint and fill three, or fill all six of a few joints.
         """
         out = np.repeat(self.offsets[None], self.frames, axis=0)
         joints, axes, columns = np.array(channel_columns(self.channels)[0], dtype=int).reshape(-1, 3).T
-        inner = np.array(self.parents)[joints] >= 0
-        if inner.any() and not self.values[:, columns[inner]].any():
-            joints, axes, columns = joints[~inner], axes[~inner], columns[~inner]
+        filled = np.array(self.parents) < 0
+        np.logical_or.at(filled, joints, self.values[:, columns].any(axis=0))
+        joints, axes, columns = joints[filled[joints]], axes[filled[joints]], columns[filled[joints]]
         out[:, joints, axes] = self.values[:, columns]
         return out
 

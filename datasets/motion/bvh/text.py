@@ -24,6 +24,8 @@ MOST_JOINTS, MOST_NAME = 1000, 200
 """Joints of one figure, and characters of a joint's name. The richest rigs have hundreds of joints."""
 LARGEST = 1e7
 """No length in millimetres and no angle in degrees is larger."""
+MISCOUNTED = 1
+"""Rows by which the header may be off: a recorder that was stopped counts the row that it did not write."""
 _CANONICAL = {name.lower(): name for name in CHANNELS}
 _MOTION = re.compile(rb"^[ \t]*MOTION[ \t]*$", re.IGNORECASE | re.MULTILINE)
 _HEADER = re.compile(
@@ -117,7 +119,10 @@ def _frame_rate(text: bytes, where: str) -> float:
 
 
 def read_values(data: bytes, start: int, frames: int, width: int, where: str) -> Floats:
-    """The motion block [frames, width] from byte `start` on; every row must hold `width` finite numbers."""
+    """The motion block [T, width] from byte `start` on; every row must hold `width` finite numbers.
+
+    T is the number of rows, from which the header's `frames` may be `MISCOUNTED` away.
+    """
     body = data[start:].rstrip()
     if not body:
         raise UserError(f"{where}: the header says {frames} frames, 0 found")
@@ -138,16 +143,15 @@ def read_values(data: bytes, start: int, frames: int, width: int, where: str) ->
             f"{where}: line {lines[row]}: frame {row} (from 0) has {counts[row]} numbers, "
             f"the hierarchy declares {width} channels"
         )
-    if len(counts) != frames:
-        raise UserError(f"{where}: the header says {frames} frames, {len(counts)} found")
+    require_frames(len(counts), frames, where)
     with warnings.catch_warnings():
         warnings.simplefilter("error", DeprecationWarning)  # numpy only warns when it stops at a bad word
         try:
             values = np.fromstring(body, dtype=np.float64, sep=" ")
         except (ValueError, DeprecationWarning):
             values = np.empty(0)
-    if len(values) == frames * width and (np.abs(values) <= LARGEST).all():  # false for NaN
-        return values.reshape(frames, width)
+    if len(values) == len(counts) * width and (np.abs(values) <= LARGEST).all():  # false for NaN
+        return values.reshape(-1, width)
     for at, word in enumerate(body.split()):
         if not _NUMBER.fullmatch(word) or not abs(float(word)) <= LARGEST:
             row, column = divmod(at, width)
@@ -175,14 +179,20 @@ def _parse_hierarchy(text: bytes) -> Hierarchy:
     return _HierarchyParser().parse(text)
 
 
-def require_all_frames(data: bytes, section: MotionSection, where: str) -> None:
-    """`UserError` when there are not as many lines of values as the header says; the values are not read."""
+def require_frames(found: int, stated: int, where: str) -> None:
+    """`UserError` when there are not as many rows of values as the header says, give or take `MISCOUNTED`."""
+    if abs(found - stated) > MISCOUNTED or not found:
+        raise UserError(f"{where}: the header says {stated} frames, {found} found")
+
+
+def count_frames(data: bytes, section: MotionSection, where: str) -> int:
+    """Lines of values; `UserError` when they are not those of the header. The values are not read."""
     body = data[section.body :].strip()
     lines = body.count(b"\n") + bool(body)
     if lines != section.frames:  # blank lines count for nothing
         lines = sum(bool(line.strip()) for line in body.split(b"\n"))
-    if lines != section.frames:
-        raise UserError(f"{where}: the header says {section.frames} frames, {lines} found")
+    require_frames(lines, section.frames, where)
+    return lines
 
 
 class _HierarchyParser:

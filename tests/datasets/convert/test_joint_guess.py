@@ -84,14 +84,15 @@ def test_missing_joints_are_means_or_open(tmp_path: Path) -> None:
     assert open_rows(rows_of(*whole, change={"Spine1": "Spine"})) == ["spine1", "spine2"]
 
 
-@pytest.mark.parametrize("end", [None, "on the ankle", "the heel", "the ball"])
+@pytest.mark.parametrize("end", [None, "on the ankle", "the heel", "the ball", "a toe on it"])
 @pytest.mark.parametrize("style", STYLES[:3], ids=str)
 def test_feet_without_a_toe_are_end_sites_or_estimated(
     end: str | None, style: dict[str, Any], tmp_path: Path
 ) -> None:
     spec = BY_TOOL["LAFAN1"]
-    built = build(Foreign("x", spec.trunk, spec.neck, spec.leg[:3], spec.arm))
     truth = build(spec)
+    toed = end == "a toe on it"
+    built = truth if toed else build(Foreign("x", spec.trunk, spec.neck, spec.leg[:3], spec.arm))
     style = {key: value for key, value in style.items() if key != "a_pose"}
     world = write_figure(tmp_path / "whole.bvh", truth, frames=40, **style)
     whole = read_bvh(tmp_path / "whole.bvh")
@@ -100,7 +101,9 @@ def test_feet_without_a_toe_are_end_sites_or_estimated(
     for side in ("Left", "Right"):
         ankle, toe = whole.joints.index(f"{side}Foot"), whole.joints.index(f"{side}Toe")
         places = {"on the ankle": 0.0, "the heel": -0.5, "the ball": 1.0}
-        if end is not None:
+        if toed:
+            whole.offsets[toe] = 0.0
+        elif end is not None:
             ends[joints.index(ankle)] = places[end] * whole.offsets[toe]
     columns = [c for j in joints for c in range(*(np.cumsum([0, *map(len, whole.channels)])[[j, j + 1]]))]
     motion = BvhMotion(

@@ -55,7 +55,8 @@ def test_what_stands_around_the_text_changes_nothing(shared: Path) -> None:
     control, data = read_bvh(folder / "control_ok.bvh"), (folder / "control_ok.bvh").read_bytes()
     assert (control.fps, control.frames, len(control.joints)) == (30.0, 6, 22)
     padded = (data + end for end in (b"\x1a", b"\r\n\x1a", b"\n\0" + bytes(500), b"\0\n"))
-    for text in (folder / "crlf_bom.bvh", *padded):
+    miscounted = (data.replace(b"Frames:\t6", b"Frames: %d" % count) for count in (5, 7))
+    for text in (folder / "crlf_bom.bvh", *padded, *miscounted):
         other = read_bvh(text)
         assert other.joints == control.joints
         np.testing.assert_array_equal(other.values, control.values)
@@ -97,12 +98,12 @@ def test_any_channels_in_any_order() -> None:
     ("written", "expected"), [("0", [1, 2, 3]), ("7", [7, 0, 0])], ids=["filled with zeros", "filled"]
 )
 def test_six_channels_on_every_joint(written: str, expected: list[float]) -> None:
-    """Position channels that no frame fills leave the OFFSET; any that is filled replaces it."""
+    """Position channels of a joint that no frame fills leave its OFFSET, whatever others do."""
     six = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
-    text = TINY.replace("CHANNELS 1 Xrotation", six).replace("CHANNELS 4 Yposition", "CHANNELS 3")
-    rows = "1 2 3 10 20 30 {} 0 0 40 0 0 50 60 70\n-1 -2 -3 -10 -20 -30 {} 0 0 -40 0 0 -50 -60 -70\n"
+    text = TINY.replace("CHANNELS 1 Xrotation", six)
+    rows = "1 2 3 10 20 30 {} 0 0 40 0 0 5 50 60 70\n-1 -2 -3 -10 -20 -30 {} 0 0 -40 0 0 6 -50 -60 -70\n"
     motion = read_bvh(text[: text.index("1 2 3 10")] + rows.format(written, written))
-    assert motion.local_offsets()[:, 1].tolist() == [expected] * 2
+    assert motion.local_offsets()[:, 1:].tolist() == [[expected, [0, 5, 4]], [expected, [0, 6, 4]]]
 
 
 @pytest.mark.parametrize(
@@ -128,6 +129,7 @@ def test_frame_rate_is_what_the_digits_mean(text: str, fps: float) -> None:
         ("0.0333", "nan", "Frame Time: nan"),
         ("0.0333", "soon", "Frame Time: soon"),
         ("Frames: 2", "Frames: 0", "Frames: 0"),
+        ("Frames: 2", "Frames: 4", "4 frames, 2 found"),
         ("Frames: 2", "Frames: 2.5", "Frames: "),
         ("Frames: 2", "Frames: " + "9" * 5000, "Frames: "),
         ("Frames: 2\n", "", "line 21: expected 'Frames"),
