@@ -114,12 +114,15 @@ def _feet(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
         return
     level = float(np.median(balls[..., 1][rests]))
     first = int(rests.any(axis=1).argmax())
-    lowest = np.where(upright, body[..., 1].min(axis=-1), np.inf)
+    bottom = body[..., 1].min(axis=-1)
+    lowest = np.where(upright, bottom, np.inf)
     under = level - float(lowest.min())
+    # Who lies on the floor sinks a little lower than the balls of the feet stand, and that is its height 0.
+    lies = bool((bottom[~upright] < OFF_FLOOR / 2).any())
     if under > OFF_FLOOR:  # then the floor of a clip that was moved to 0 is wrong too
         text = f"goes {under:.2f} m below where its feet rest, not at most {OFF_FLOOR:g} m"
         yield Fault("sinks", text, under / OFF_FLOOR, int(lowest.argmin()))
-    elif abs(level) > OFF_FLOOR:
+    elif level < -OFF_FLOOR or (level > OFF_FLOOR and not lies):
         kind, side = ("floats", "above") if level > 0 else ("sinks", "below")
         text = f"feet rest {abs(level):.2f} m {side} the floor, not at most {OFF_FLOOR:g} m"
         yield Fault(kind, text, abs(level) / OFF_FLOOR, first)

@@ -192,8 +192,8 @@ def clean(
 ) -> None:
     """Suspect clips on a page to watch and decide about; what is left out is listed, and nothing deleted.
 
-    Duplicates, mirrored twins, feet off the floor, jumps, jitter, swapped sides, nobody at all; with --model
-    captions that fit another clip better.
+    Duplicates, mirrored twins, feet off the floor, jumps, flipped limbs, frozen stretches, jitter, swapped
+    sides, nobody at all; with --model captions that fit another clip better.
 
     Example: `motionloom data clean shards -o clean.html`
 

@@ -55,6 +55,14 @@ SHOWING = "showing"
 """Offered by stages that have curves or figures for the report."""
 
 
+class NotThereError(UserError):
+    """The folder that a field of a stage's config names is not there."""
+
+    def __init__(self, message: str, field: str) -> None:
+        super().__init__(message)
+        self.field = field
+
+
 class StageConfig(Config):
     """Base of every stage's config."""
 
@@ -239,7 +247,10 @@ class StageKind(ABC, Generic[C]):
         """Refuse, with a `UserError`, a combination with the recipe's other stages that cannot work."""
 
     def external(self, config: C) -> object:
-        """Facts about files outside the run (names, sizes, checksums) that belong to the fingerprint."""
+        """Facts about files outside the run (names, sizes, checksums) that belong to the fingerprint.
+
+        A `NotThereError` is told with the `--set` that names another folder.
+        """
         return None
 
     def share(self, context: StageContext) -> None:

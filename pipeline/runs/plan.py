@@ -22,7 +22,7 @@ from typing import Literal
 from motionloom.datasets.base.licences import UNKNOWN
 from motionloom.datasets.base.register import code_of
 from motionloom.datasets.schema import UserError
-from motionloom.pipeline.contract.stage import Every, Stage, fingerprint_fields
+from motionloom.pipeline.contract.stage import Every, NotThereError, Stage, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.continuation import Continuation, Started, continuation, training_facts
 from motionloom.pipeline.runs.inputs import require_elsewhere
@@ -148,12 +148,16 @@ def selected(recipe: Recipe, select: Selection) -> set[str]:
 
 def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
     """The facts that a stage's fingerprint is the digest of."""
+    try:
+        external = stage.kind.external(stage.config)
+    except NotThereError as error:
+        raise UserError(f"{error}; name yours with --set {stage.name}.{error.field}=FOLDER") from None
     facts = {
         "kind": stage.kind.name,
         "version": stage.kind.version,
         "seed": recipe.seed,
         "config": json.loads(json.dumps(fingerprint_fields(stage.config), default=str)),
-        "external": stage.kind.external(stage.config),
+        "external": external,
         "inputs": {role: _fingerprint(recipe, name, rows) for role, name in stage.inputs.items()},
     }
     if any(isinstance(role, Every) for role in stage.kind.roles()):

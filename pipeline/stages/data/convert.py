@@ -11,9 +11,8 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter
 from motionloom.datasets.convert.registry import converters, prepare
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.options import Part
-from motionloom.pipeline.contract.stage import StageConfig, StageContext, register
+from motionloom.pipeline.contract.stage import NotThereError, StageConfig, StageContext, register
 from motionloom.pipeline.stages.data.data import DataStage, say_shards
 from motionloom.pipeline.store.data import SHARDS
 
@@ -68,7 +67,7 @@ def source_facts(config: ConvertConfig) -> dict[str, Any]:
     name."""
     source = config.source
     if not source.exists():
-        raise UserError(f"{source}: no such folder (the source; set it with --set data.source=FOLDER)")
+        raise NotThereError(f"{source}: no such folder of a source", "source")
     listed = sorted(source.rglob("*")) if source.is_dir() else [source]
     files = {p.relative_to(source).as_posix(): p.stat().st_size for p in listed if p.is_file()}
     steering: dict[str, str | list[str]] = {}

@@ -24,6 +24,7 @@ from motionloom.pipeline.contract.stage import (
     CompletedStage,
     FunctionStage,
     Inputs,
+    NotThereError,
     StageConfig,
     StageContext,
     register,
@@ -45,7 +46,8 @@ class DataStage(FunctionStage):
         name, fps = getattr(config, "layout", None), getattr(config, "fps", None)
         if name is None:
             raise UserError(
-                "the layout of the data is not known; set data.layout to see what the trainings take"
+                f"the layout of the data is not known; set the layout of a stage of kind {self.name} to see "
+                "what the trainings take"
             )
         return DataPreview(MotionLayout.named(name, fps=fps or 30.0))
 
@@ -109,10 +111,7 @@ class ShardsStageConfig(Reading, StageConfig):
     def manifest(self) -> tuple[Manifest, str]:
         """The manifest, of the layout that is wanted, and its checksum."""
         if not is_url(self.place) and not Path(self.place).is_dir():
-            raise UserError(
-                f"{self.place}: no such folder; set the path of the data stage to a folder of shards, for "
-                f"example with --set data.path=FOLDER"
-            )
+            raise NotThereError(f"{self.place}: no such folder of shards", "path")
         manifest, digest = read_manifest(open_store(self.place, self.cache))
         if self.layout is not None and manifest.layout != self.layout:
             raise UserError(

@@ -119,6 +119,9 @@ PLANTED: list[tuple[str, Callable[[Joints], Joints]]] = [
 def test_nothing_is_wrong_with_people(people: list[Joints]) -> None:
     for joints in people:
         assert [*motion_faults(joints, LAYOUT.fps)] == []
+        lies = joints @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # lower than the feet have stood
+        both = [joints + np.array([0, 0.1, 0]), lies[-1:].repeat(9, 0) - [0, lies[-1, :, 1].min(), 0]]
+        assert "floats" not in {fault.kind for fault in motion_faults(np.concatenate(both), LAYOUT.fps)}
 
 
 @pytest.mark.parametrize(("kind", "spoil"), PLANTED)
