@@ -13,9 +13,16 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from motionloom.datasets.conditions import Condition
 
 GRAPHS = 64
 """Graphs that one function may have: shapes of batches, training and validation, each kind of stage."""
+
+PLACES = 16
+"""Texts of a batch are filled up to a multiple of so many words, since a CUDA graph has one shape: it is then
+not made anew for each length of a batch's longest caption."""
 
 
 class Compiled:
@@ -40,15 +47,20 @@ class Compiled:
         if self.graphs:
             torch.compiler.cudagraph_mark_step_begin()  # type: ignore[no-untyped-call]
         try:
-            return self.compiled(*arguments)
+            filled = map(_of_few_shapes, arguments) if self.graphs else arguments
+            return self.compiled(*filled)
         except (failures, exc.FailOnRecompileLimitHit) as error:
-            reason = getattr(error, "inner_exception", error)
-            first = next(iter(str(reason).strip().splitlines()), type(reason).__name__)
-            warnings.warn(f"torch.compile failed, training goes on without: {first}", stacklevel=2)
-            self.compiled = self.losses
             if self.graphs:  # which may have drawn
                 torch.manual_seed(torch.initial_seed())
+            self.leave(error)
             return self.losses(*arguments)
+
+    def leave(self, error: Exception) -> None:
+        """Compute without from here on, after one warning that says why."""
+        reason = getattr(error, "inner_exception", error)
+        first = next(iter(str(reason).strip().splitlines()), type(reason).__name__)
+        warnings.warn(f"torch.compile failed, training goes on without: {first}", stacklevel=3)
+        self.compiled, self.graphs = self.losses, False
 
     def _compile(self) -> Callable[..., dict[str, Tensor]]:
         from torch._dynamo import config
@@ -66,3 +78,21 @@ class Compiled:
             "deterministic": torch.are_deterministic_algorithms_enabled(),
         }
         return torch.compile(self.losses, fullgraph=True, options=options)
+
+
+def _of_few_shapes(argument: object) -> object:
+    """A batch with its texts filled up to a multiple of `PLACES` words; anything else as it is."""
+    if not isinstance(argument, dict) or not isinstance(argument.get("conditions"), dict):
+        return argument
+    filled = {name: _filled_up(condition) for name, condition in argument["conditions"].items()}
+    return {**argument, "conditions": filled}
+
+
+def _filled_up(condition: Condition) -> Condition:
+    """A condition of words with hidden ones behind them; one that follows the motion's frames as it is."""
+    more = -condition.mask.shape[1] % PLACES
+    if condition.pooled is None or not more:
+        return condition
+    return condition._replace(
+        features=pad(condition.features, (0, 0, 0, more)), mask=pad(condition.mask, (0, more))
+    )

@@ -12,7 +12,7 @@ Codebooks draw by themselves, the same on every rank (`quantize/base.py`).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -216,6 +216,20 @@ class StageModule(L.LightningModule, ABC):
         self.figures.append(StepFigures(self.step + 1, names, figures))
         sums, count = self._sums.get(names, (None, 0))
         self._sums[names] = (figures if sums is None else sums + figures, count + 1)
+
+    def saved_state(self) -> Callable[[], None]:
+        """Return a function that puts buffers (codebooks) and figures back as they are now, for a part of a
+        step that has to be computed again.
+        """
+        buffers = [(buffer, buffer.clone()) for buffer in self.buffers()]
+        figures, sums = list(self.figures), dict(self._sums)
+
+        def put_back() -> None:
+            for buffer, before in buffers:
+                buffer.copy_(before)
+            self.figures, self._sums = figures, sums
+
+        return put_back
 
     def take_row(self) -> dict[str, Tensor]:
         """Means since the last row, "train/NAME" -> scalar; the next row begins."""

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.distributed.device_mesh import DeviceMesh
 
 from motionloom.models.layers.transformer import Block, Transformer
+from motionloom.models.training.compiled import Compiled
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.team import environment
@@ -170,12 +171,32 @@ class Execution:
             # DDP averages gradients with the last part; groups that take turns average them themselves.
             more = number < module.accumulate - 1 or not automatic
             with fabric.no_backward_sync(self.model, enabled=parted and more):
-                with fabric.autocast():
-                    loss = self.model.training_step(batch, number)
-                if automatic and loss is not None:
-                    fabric.backward(loss / module.accumulate)
+                loss = self._take_part(batch, number)
         if automatic:
             module.configure_gradient_clipping(self.optimizers[0])
             self.optimizers[0].step()
         module.step += 1
         return torch.zeros(()) if loss is None else loss.detach()
+
+    def _take_part(self, batch: Batch, number: int) -> Tensor | None:
+        """Loss of a part, whose gradients are added; computed again without CUDA graphs where their backward
+        pass fails as it runs.
+        """
+        losses = self.module.losses
+        if not (isinstance(losses, Compiled) and losses.graphs):
+            return self._add_gradients(batch, number)
+        put_back = self.module.saved_state()
+        try:
+            return self._add_gradients(batch, number)
+        except RuntimeError as error:
+            losses.leave(error)
+            put_back()
+            self.optimizers[0].zero_grad()  # graphs are for steps of one part
+            return self._add_gradients(batch, number)
+
+    def _add_gradients(self, batch: Batch, number: int) -> Tensor | None:
+        with self.fabric.autocast():
+            loss: Tensor | None = self.model.training_step(batch, number)
+        if self.module.automatic_optimization and loss is not None:
+            self.fabric.backward(loss / self.module.accumulate)
+        return loss
