@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.canonical import heading
 from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
 
 Joints = NDArray[np.float64]
@@ -74,18 +75,25 @@ CAPTIONS = {
 }
 
 
+def obeyed(bundle: Bundle, samples: int, sampling: SamplingConfig | None = None) -> dict[str, int]:
+    """Of so many motions for each caption, how many do what it says."""
+    return {
+        caption: sum(
+            BY_CONTENT[content](motion.joints, bundle.layout.fps)
+            for motion in bundle.generate([caption] * samples, seed=0, sampling=sampling)
+        )
+        for caption, content in CAPTIONS.items()
+    }
+
+
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("run", type=Path)
     parser.add_argument("--samples", type=int, default=20)
     args = arguments(parser)
-    bundle, total = Bundle.open(args.run), 0
-    for caption, content in CAPTIONS.items():
-        motions = bundle.generate([caption] * args.samples, seed=0)
-        good = sum(BY_CONTENT[content](motion.joints, bundle.layout.fps) for motion in motions)
-        print(f"{caption} {good}/{args.samples}")
-        total += good
-    print(f"all {total}/{args.samples * len(CAPTIONS)}")
+    good = obeyed(Bundle.open(args.run), args.samples)
+    for caption, count in (good | {"all": sum(good.values())}).items():
+        print(f"{caption} {count}/{args.samples * (len(good) if caption == 'all' else 1)}")
 
 
 if __name__ == "__main__":

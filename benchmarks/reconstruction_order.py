@@ -1,126 +1,350 @@
-"""Tokenizers at an equal training budget: H2VQ, RVQ, VQ, body and hands apart, FSQ (Tables 3 and 7).
+"""H2VQ against RVQ at equal bits, and at equal bits and parameters (HumanTOMATO Tables 3 and 7).
 
-    python benchmarks/reconstruction_order.py WORK [--shards FOLDER] [--seeds 3] [--steps 1600]
-    python benchmarks/reconstruction_order.py WORK --features paper --steps 5000
+    python benchmarks/reconstruction_order.py make SHARDS clips.npz   # once: an array file of 19 MB
+    python benchmarks/reconstruction_order.py train clips.npz WORK --minutes 3.3
+    python benchmarks/reconstruction_order.py train clips.npz WORK --device cpu --width 96 --batch 16
+    python benchmarks/reconstruction_order.py table WORK --record tokenizers_real
 
-Every tokenizer is trained by the same recipe on the same windows with the same widths, one run a seed, and
-measured on the test split: MPJPE in mm of all joints and of the body from the root, of the fingers from their
-wrists (docs/evaluation.md), our pose and the world positions with the path. `--features paper` trains on the
-published features with the published loss: deviations averaged over each kind of column, squared error, no
-velocity term, no gains. Shards without hands leave out tokenizers of body and hands. Killed and started again
-it goes on where it was.
+The bodies are real (SHARDS holds `body133` clips), the hands synthetic: each clip's two hands take a random
+shape each, on the recorded forearms. All three tokenizers of a seed see the same windows. They train side by
+side in one process; on a GPU each step is one CUDA graph on a stream of its own, and where graphs cannot be
+captured every training gets a process. Features, losses and optimizer are the paper's: standard deviations
+averaged over each kind of column, squared error, AdamW, bf16 on a GPU; the rate is constant after a warm-up,
+so that a figure at a step does not depend on how long the training was meant to be. The test windows are
+measured at fixed steps and at the end; each figure is appended to WORK/rows.jsonl at once, so what was
+reached is kept.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from bench import Column, arguments, command_line, kept, report, train
+import numpy as np
+import torch
+from bench import Column, arguments, command_line, report
+from numpy.typing import NDArray
+from torch import Tensor
 
+from motionloom.datasets.actions.hands import HANDS
+from motionloom.datasets.loading.statistics import Moments, from_moments
+from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.canonical import canonicalize
+from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.features.torch_joints import torch_joints_of
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.generate import SynthConfig, synthesize
-from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import StageCache
-from motionloom.pipeline.evaluation.reconstruction import reconstruction_errors
-from motionloom.pipeline.evaluation.truth import truth_of
+from motionloom.datasets.synth.hands_and_face import shape_hand
+from motionloom.models.metrics.reconstruction import mpjpe
+from motionloom.models.tokenizer.body_hand import H2VQConfig
+from motionloom.models.tokenizer.module import TokenizerModule
+from motionloom.models.tokenizer.single import RvqConfig
+from motionloom.models.training.optim import OptimConfig
 
-CODES = {"num_codes": 512, "decay": 0.9, "reset_below": 0.05}
-NETS: dict[str, tuple[str, dict]] = {
-    "VQ": ("vq", CODES),
-    "RVQ, 2 levels": ("rvq", {**CODES, "levels": 2}),
-    "RVQ, 3 levels": ("rvq", {**CODES, "levels": 3}),
-    "apart": ("separate", CODES),
-    "H2VQ": ("h2vq", CODES),
-    "FSQ": ("fsq", {"steps": [8, 8, 8]}),
-}
-"""Title -> stage kind and what differs. RVQ with three levels spends exactly H2VQ's bits."""
-
-COMMON = {
-    "width": 96,
-    "depth": 2,
-    "code_dim": 96,
-    "recon": "smooth_l1",
-    "velocity_weight": 0.5,
-    "root_gain": 5.0,
-    "finger_gain": 4.0,
-}
-PAPER = {"recon": "l2", "velocity_weight": 0.0, "root_gain": 1.0, "finger_gain": 0.0}
-COLUMNS = (
-    Column("bit/s", "bits", 0),
-    Column("MPJPE, mm", "mpjpe"),
-    Column("body", "mpjpe_body"),
-    Column("hands", "mpjpe_hand"),
-    Column("pose", "pose"),
-    Column("world", "world"),
-)
-TRIVIAL = {"nearest training clip": "_nearest_train_clip", "mean pose": "_mean_pose"}
-
-HANDED = ("h2vq", "separate")
-"""Stage kinds that need hands."""
+LAYOUT = MotionLayout.named("wholebody313", fps=20)
+WINDOW = 64
+UNIT = 5e-4
+"""Metres of one step of the stored positions."""
+CLIPS = 1600
+"""Clips of a split that are looked at."""
+ARMS = ("H2VQ", "RVQ, 3 levels", "RVQ, 3 levels, as many parameters")
+MARKS = (625, 1250, 2500, 5000, 10000)
+"""Steps at which the test windows are measured."""
+FINGERS = {"left": (20, range(22, 37)), "right": (21, range(37, 52))}
+"""Wrist and finger joints of each hand."""
+FIGURES = ("mpjpe", "body", "hands", "world")
 
 
-def stages(kind: str, net: dict[str, Any], args: argparse.Namespace) -> dict[str, Any]:
-    """One tokenizer; data, statistics and windows are the same for all."""
-    return {
-        "data": {"kind": "shards", "path": str(args.shards.resolve()), "verify": False},
-        "stats": {"kind": "stats", "group": args.features == "paper"},
-        "tokenizer": {
-            "kind": kind,
-            "net": {**COMMON, **net, **(PAPER if args.features == "paper" else {})},
-            "optim": {"lr": 2.0e-3, "warmup_steps": 30, "schedule": "cosine"},
-            "train": {"steps": args.steps, "batch_size": 16, "checkpoint_every": 200, "validate_every": 0},
-        },
-    }
+def whole_bodies(shards: Path, split: str) -> Iterator[NDArray[np.int16]]:
+    """Joints [T, 52, 3] in `UNIT`s of the clips that hold a window, with synthetic hands."""
+    clips, rng = ShardDataset.open(shards, split), np.random.default_rng(7)
+    for number in range(min(CLIPS, len(clips))):
+        motion = clips.motion(number)
+        if len(motion) < WINDOW:
+            continue
+        t = np.arange(len(motion)) / LAYOUT.fps
+        fingers = [shape_hand(str(rng.choice(HANDS)), t, rng) for _ in FINGERS]
+        joints = canonicalize(with_resting_hands(joints_of(motion, clips.layout), fingers))
+        yield np.round(joints / UNIT).astype(np.int32).astype(np.int16)
 
 
-def measure(run: Path, clips: int) -> dict[str, float]:
-    """Figures of one finished run."""
-    finished, cache = finished_stages(run), StageCache()
-    tokenizer, data = cache.get(finished["tokenizer"]), cache.get(finished["data"])
-    test = data.split("test")
-    truths = [truth_of(test, i) for i in range(min(clips, len(test)))]
-    figures = reconstruction_errors(tokenizer, data.split("train"), truths)
-    return {**figures, "bits": tokenizer.net.bits_per_second}
+def make(args: argparse.Namespace) -> None:
+    """Write the joints of all clips as changes between frames, low and high bytes apart, to pack well."""
+    arrays: dict[str, Any] = {}
+    for split in ("train", "test"):
+        clips = list(whole_bodies(args.shards, split))
+        steps = np.diff(np.concatenate(clips), axis=0, prepend=np.int16(0))
+        arrays[f"{split}_frames"] = [len(clip) for clip in clips]
+        arrays[f"{split}_bytes"] = np.moveaxis(steps.view(np.uint8).reshape(*steps.shape, 2), -1, 0)
+    np.savez_compressed(args.file, **arrays)
+    print(f"{args.file}: {args.file.stat().st_size / 2**20:.1f} MiB")
+
+
+def read(file: Path, split: str) -> list[NDArray[np.float32]]:
+    """Features [T, 313] of each clip."""
+    with np.load(file, allow_pickle=False) as arrays:
+        frames, planes = arrays[f"{split}_frames"], arrays[f"{split}_bytes"]
+    steps = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(np.int16)[..., 0]
+    joints = np.cumsum(steps, axis=0, dtype=np.int16) * UNIT
+    return [encode(clip, LAYOUT) for clip in np.split(joints, np.cumsum(frames)[:-1])]
+
+
+class Data:
+    """Clips on the device, and how a reconstruction of the test windows is measured."""
+
+    def __init__(self, file: Path, device: torch.device) -> None:
+        train, test = (read(file, split) for split in ("train", "test"))
+        moments = Moments.none(LAYOUT.dim)
+        for clip in train:
+            moments = moments.merge(Moments.of(clip))
+        stats = from_moments(moments, LAYOUT, group=True)
+        self.lengths = np.array([len(clip) for clip in train])
+        self.mean, self.std = (torch.from_numpy(a).to(device) for a in (stats.mean, stats.std))
+        self.frames = torch.from_numpy(stats.normalize(np.concatenate(train))).to(device)
+        windows = [clip[i : i + WINDOW] for clip in test for i in range(0, len(clip) - WINDOW + 1, WINDOW)]
+        self.test = torch.from_numpy(stats.normalize(np.stack(windows))).to(device)
+        self.truth = self.joints(self.test)
+        self.steps = torch.arange(WINDOW, device=device)
+
+    def joints(self, motion: Tensor) -> Tensor:
+        """Joints [W, T, 52, 3] in metres of normalised windows [W, T, 313]."""
+        return torch_joints_of(motion * self.std + self.mean, LAYOUT)
+
+    def starts(self, seed: int, steps: int, batch: int) -> Tensor:
+        """First frames [steps, batch] of windows of random clips."""
+        rng = np.random.default_rng(seed)
+        clips = rng.integers(len(self.lengths), size=(steps, batch))
+        first = np.concatenate([[0], np.cumsum(self.lengths)[:-1]])[clips]
+        within = rng.integers(0, self.lengths[clips] - WINDOW + 1)
+        return torch.from_numpy(first + within).to(self.frames.device)
+
+    def errors(self, motion: Tensor) -> dict[str, float]:
+        """Errors in mm: of all joints and of the body from the root, of fingers from their wrists, with the
+        path."""
+        made, true = self.joints(motion), self.truth
+        hands = [
+            mpjpe(*(x[:, :, [wrist, *joints]] for x in (made, true))).mean().item() * 16 / 15
+            for wrist, joints in FINGERS.values()
+        ]
+        return {
+            "mpjpe": mpjpe(made, true).mean().item(),
+            "body": mpjpe(*(x[:, :, :BODY_JOINTS] for x in (made, true))).mean().item(),
+            "hands": statistics.mean(hands),
+            "world": mpjpe(made, true, root=None).mean().item(),
+        }
+
+    def nearest(self) -> Tensor:
+        """The training window nearest to each test window by its joints from the root, of every eighth."""
+        columns = torch.arange(LAYOUT.dim, device=self.std.device)[LAYOUT.slice("positions")]
+        ends = np.cumsum(self.lengths)
+        starts = np.concatenate(
+            [np.arange(end - n, end - WINDOW + 1, 8) for end, n in zip(ends, self.lengths, strict=True)]
+        )
+        at = torch.from_numpy(starts).to(self.std.device)
+        seen = self.steps[::8]
+
+        def flat(windows: Tensor) -> Tensor:
+            return (windows * self.std[columns]).flatten(1)
+
+        pool = flat(self.frames[:, columns][at[:, None] + seen])
+        chosen = torch.cdist(flat(self.test[:, ::8, columns]), pool).argmin(1)
+        return self.frames[at[chosen][:, None] + self.steps]
+
+
+class Training:
+    """One tokenizer of one seed, whose step is a CUDA graph on a GPU."""
+
+    def __init__(self, arm: str, seed: int, data: Data, args: argparse.Namespace) -> None:
+        self.arm, self.seed, self.data, self.args = arm, seed, data, args
+        sizes = {"width": args.width, "depth": args.depth, "code_dim": args.width, "reset_below": 0.05}
+        torch.manual_seed(seed)
+        net = (H2VQConfig(**sizes) if arm == "H2VQ" else rvq(arm, sizes)).build(LAYOUT)
+        self.parameters = parameters_of(net)
+        self.bits = net.bits_per_second
+        optim = OptimConfig(lr=args.lr, warmup_steps=100)
+        self.device = data.frames.device
+        self.module = TokenizerModule(net, optim, seed=seed, max_steps=args.steps).to(self.device).train()
+        self.optimizer = optim.build(list(net.parameters()))
+        self.starts = data.starts(seed, args.steps, args.batch)
+        rates = [args.lr * optim.factor(step, args.steps) for step in range(args.steps)]
+        self.rates = torch.tensor(rates, device=self.device)
+        self.count = torch.zeros(1, dtype=torch.int64, device=self.device)
+        self.rate = torch.zeros((), device=self.device)
+        for group in self.optimizer.param_groups:
+            group |= {"lr": self.rate, "capturable": self.device.type == "cuda"}
+        self.length = torch.full((args.batch,), WINDOW, device=self.device)
+        self.graph: torch.cuda.CUDAGraph | None = None
+        self.stream = torch.cuda.Stream() if self.device.type == "cuda" else None
+
+    def eager(self) -> None:
+        """Take a step; all that changes from step to step is read on the device."""
+        self.rate.copy_(self.rates.index_select(0, self.count)[0])
+        starts = self.starts.index_select(0, self.count)[0]
+        window = self.data.frames[starts[:, None] + self.data.steps]
+        self.count.add_(1)
+        half = self.device.type == "cuda"
+        with torch.autocast("cuda", torch.bfloat16, cache_enabled=False) if half else nullcontext():
+            loss = self.module.losses({"motion": window, "length": self.length, "full": True})["loss"]
+        loss.backward()
+        self.module.clip(list(self.module.net.parameters()), self.module.optim_config.grad_clip)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def capture(self) -> None:
+        """Record the step as a graph, after a few that allocate what it needs."""
+        with torch.cuda.stream(self.stream):
+            for _ in range(3):
+                self.eager()
+        torch.cuda.synchronize()
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, stream=self.stream):
+            self.eager()
+        self.graph = graph
+
+    def step(self) -> None:
+        if self.graph is None:
+            return self.eager()
+        with torch.cuda.stream(self.stream):
+            self.graph.replay()
+
+    @torch.no_grad()
+    def measure(self, seconds: float) -> None:
+        """Append the errors of the test windows to the rows."""
+        net = self.module.net.eval()
+        made = torch.cat([net.decode(net.encode(part)) for part in self.data.test.split(256)])
+        net.train()
+        row = {"arm": self.arm, "seed": self.seed, "step": int(self.count), **self.data.errors(made)}
+        facts = {"parameters": self.parameters, "bits": self.bits, "seconds": seconds}
+        write(self.args, row | facts)
+
+
+def rvq(arm: str, sizes: dict[str, Any]) -> RvqConfig:
+    """RVQ of three levels; wider convolutions give it as many parameters as H2VQ has."""
+    plain = RvqConfig(levels=3, **sizes)
+    if arm == ARMS[1]:
+        return plain
+    wanted = parameters_of(H2VQConfig(**sizes).build(LAYOUT))
+    widths = (plain.model_copy(update={"width": w}) for w in range(plain.width, 2 * plain.width, 4))
+    return min(widths, key=lambda config: abs(parameters_of(config.build(LAYOUT)) - wanted))
+
+
+def parameters_of(net: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in net.parameters())
+
+
+def write(args: argparse.Namespace, row: dict[str, Any]) -> None:
+    """Append a row, with what was asked for."""
+    asked = {key: getattr(args, key) for key in ("batch", "width", "depth", "lr")}
+    device = torch.cuda.get_device_name() if args.device == "cuda" else "CPU"
+    with (args.work / "rows.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps(row | asked | {"device": device}) + "\n")
+    print(json.dumps(row), flush=True)
+
+
+def train(args: argparse.Namespace) -> None:
+    """Train side by side until the steps or the minutes are over."""
+    begin = time.monotonic()
+    args.work.mkdir(parents=True, exist_ok=True)
+    chosen = [(arm, seed) for seed in args.seeds for arm in args.arms]
+    data = Data(args.file, torch.device(args.device))
+    if not args.eager:
+        for title, motion in (("nearest training window", data.nearest()), ("mean pose", 0 * data.test)):
+            write(args, {"arm": title, "seed": 0, "step": 0, **data.errors(motion)})
+    trainings = [Training(arm, seed, data, args) for arm, seed in chosen]
+    if args.device == "cuda" and not args.eager:
+        try:
+            for training in trainings:
+                training.capture()
+        except RuntimeError as error:
+            print(f"no graphs, so a process for each: {error}", flush=True)
+            return apart(args, chosen, begin)
+    while (step := int(trainings[0].count)) < args.steps:
+        border = min(mark for mark in (*MARKS, args.steps) if mark > step)
+        for done in range(step, min(border, args.steps)):
+            for training in trainings:
+                training.step()
+            if done % 20 == 19:
+                if args.device == "cuda":
+                    torch.cuda.synchronize()
+                if time.monotonic() - begin > 60 * args.minutes:
+                    break
+        if args.device == "cuda":
+            torch.cuda.synchronize()
+        seconds = time.monotonic() - begin
+        for training in trainings:
+            training.measure(seconds)
+        if seconds > 60 * args.minutes:
+            break
+
+
+def apart(args: argparse.Namespace, chosen: Iterable[tuple[str, int]], begin: float) -> None:
+    """The same trainings without graphs, a process for each."""
+    command = [sys.executable, *sys.argv, "--eager", "--minutes"]
+    left = str(args.minutes - (time.monotonic() - begin) / 60)
+    started = [
+        subprocess.Popen([*command, left, "--arms", arm, "--seeds", str(seed)]) for arm, seed in chosen
+    ]
+    for process in started:
+        process.wait()
+
+
+def table(args: argparse.Namespace) -> None:
+    """Print the figures at the last mark that all trainings reached, and the course of MPJPE."""
+    lines = (args.work / "rows.jsonl").read_text(encoding="utf-8").splitlines()
+    found: dict[str, dict[int, list[dict[str, Any]]]] = defaultdict(lambda: defaultdict(list))
+    for line in lines:
+        row = json.loads(line)
+        found[row["arm"]][row["step"]].append(row)
+    marks = [m for m in sorted(found[ARMS[0]]) if len({len(found[a][m]) for a in ARMS}) == 1]
+    rows = []
+    for arm, at in found.items():
+        last = at.get(marks[-1]) or at[0]
+        cells = {figure: [row[figure] for row in last] for figure in FIGURES}
+        courses = {m: at.get(m, last) for m in marks if m in at or m == marks[-1]}
+        cells |= {f"mpjpe@{m}": [row["mpjpe"] for row in of_mark] for m, of_mark in courses.items()}
+        if "bits" in last[0]:
+            cells |= {"bits": [last[0]["bits"]], "parameters": [last[0]["parameters"]]}
+        rows.append({"title": arm, "cells": cells, "seeds": [row["seed"] for row in last if row["step"]]})
+    columns = [Column("bit/s", "bits", 0), Column("million parameters", "parameters", 2, 1e-6)]
+    columns += [Column(f"MPJPE after {m:,} steps, mm", f"mpjpe@{m}") for m in marks]
+    columns += [Column(title, title) for title in FIGURES[1:]]
+    report(f"H2VQ and RVQ, {marks[-1]:,} steps", columns, rows, args.record)
 
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("work", type=Path)
-    parser.add_argument("--shards", type=Path, help="whole-body shards; default: synthetic clips")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--steps", type=int, default=1600)
-    parser.add_argument("--features", choices=("ours", "paper"), default="ours")
-    parser.add_argument("--nets", nargs="*", choices=list(NETS), default=list(NETS))
-    parser.add_argument("--made", type=int, default=2000, help="synthetic clips to make")
-    parser.add_argument("--clips", type=int, default=100, help="test clips at most")
+    commands = parser.add_subparsers(required=True)
+    making, training, showing = (commands.add_parser(f.__name__) for f in (make, train, table))
+    making.add_argument("shards", type=Path)
+    training.add_argument("file", type=Path)
+    making.add_argument("file", type=Path)
+    for command in (training, showing):
+        command.add_argument("work", type=Path)
+    showing.add_argument("--record", help="write benchmarks/records/NAME.json")
+    training.add_argument("--minutes", type=float, default=60.0, help="training ends after so many")
+    training.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    training.add_argument("--steps", type=int, default=10_000)
+    training.add_argument("--batch", type=int, default=64)
+    training.add_argument("--width", type=int, default=256)
+    training.add_argument("--depth", type=int, default=2)
+    training.add_argument("--lr", type=float, default=4e-4)
+    training.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
+    training.add_argument("--seeds", type=int, nargs="+", default=[7, 8, 9])
+    training.add_argument("--eager", action="store_true", help="no CUDA graphs")
+    for command, call in ((making, make), (training, train), (showing, table)):
+        command.set_defaults(call=call)
     args = arguments(parser)
-    if args.shards is None:
-        args.shards = args.work / "shards"
-        fields = {"clips": args.made, "fps": 20, "min_seconds": 2.0, "max_seconds": 5.0, "seed": 7}
-        synthesize(SynthConfig.parse(fields, "synthetic clips"), args.shards, workers=2)
-    handed = ShardDataset.open(args.shards, "train").layout.has_part("hand")
-    results: dict[str, list[dict[str, float]]] = {}
-    for seed in range(args.seeds):
-        for title in args.nets:
-            kind, net = NETS[title]
-            if not handed and kind in HANDED:
-                continue
-            net = net if handed else {**net, "part": "body", "finger_gain": 0.0}
-            folder = args.work / args.features / f"{title.replace(' ', '-').replace(',', '')}-{seed}"
-            run = train(folder, stages(kind, net, args), seed=seed)
-            row = kept(run / "figures.json", lambda run=run: measure(run, args.clips))
-            results.setdefault(title, []).append(row)
-    figures = [column.figure for column in COLUMNS]
-    cells = {t: {f: [row[f] for row in rows if f in row] for f in figures} for t, rows in results.items()}
-    first = next(iter(results.values()))[0]
-    cells |= {t: {f: [first[f + end]] for f in figures if f + end in first} for t, end in TRIVIAL.items()}
-    rows = [
-        {"title": title, "cells": {figure: values for figure, values in found.items() if values}}
-        for title, found in cells.items()
-    ]
-    report(f"Tokenizers, {args.steps} steps, {args.features} features", COLUMNS, rows, args.record)
+    args.call(args)
 
 
 if __name__ == "__main__":

@@ -60,13 +60,6 @@ VARIANTS = {
     "GPT, DMD predicts noise": "greedy_epsilon",
     "GPT, DMD predicts motion": "greedy_sample",
 }
-ADVERSARIAL = {
-    "without L_adv": "adv0",
-    "weight 0.02, spectral norm": "adv002sn",
-    "weight 0.02": "adv002",
-    "weight 1, spectral norm": "adv1sn",
-    "weight 1 (the paper)": "adv1",
-}
 
 
 def _evaluated(*methods: str) -> dict[str, str]:
@@ -155,15 +148,6 @@ TABLES = {
     "ude_variants_text": Table("Tables 3 to 5, captions", _of("text_", VARIANTS, ANSWERS), TEXT),
     "ude_variants_music": Table(
         "Tables 3 to 5, music", _of("music_", VARIANTS, {"recorded": RECORDED}), MUSIC
-    ),
-    "ude_adversarial": Table(
-        "L_adv from the first step on, 200 steps",
-        {title: (stage, MODEL) for title, stage in ADVERSARIAL.items()},
-        (
-            Column("cross-entropy", "log:train/tokens_ce", 2),
-            Column("right tokens, %", "log:train/tokens_accuracy_code", 0, 100),
-            Column("critic is right, %", "log:train/critic_accuracy", 0, 100),
-        ),
     ),
 }  # fmt: skip
 COMMANDS = {

@@ -7,6 +7,8 @@ the forearm is long. Positions alone do not show how a forearm is twisted, so ne
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,8 +41,14 @@ def relaxed_fingers() -> NDArray[np.float64]:
     return out
 
 
-def with_resting_hands(joints: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Joints [T, 22, 3] of `smpl22` in metres -> [T, 52, 3] of `smplx52`; the body stays as it is."""
+def with_resting_hands(
+    joints: NDArray[np.floating], fingers: Sequence[NDArray[np.floating]] | None = None
+) -> NDArray[np.float64]:
+    """Joints [T, 22, 3] of `smpl22` in metres -> [T, 52, 3] of `smplx52`; the body stays as it is.
+
+    `fingers` are the left and the right hand's local rotations [T, 15, 3, 3], each as of a left hand; None:
+    both are relaxed.
+    """
     if joints.ndim != 3 or joints.shape[1:] != (len(_BODY), 3):
         raise UserError(f"hands are added to joints [T, {len(_BODY)}, 3], not to {list(joints.shape)}")
     frames = len(joints)
@@ -49,8 +57,8 @@ def with_resting_hands(joints: NDArray[np.floating]) -> NDArray[np.float64]:
     _, world = forward_kinematics(joints_to_rotations(body, _BODY), body[:, 0], _BODY.offsets, _BODY.parents)
     out = np.empty((frames, len(_WHOLE), 3))
     out[:, : len(_BODY)] = body
-    left = relaxed_fingers()
-    for side, fingers, first in (("left", left, 22), ("right", left * _MIRROR, 22 + _FINGERS)):
+    left, right = (relaxed_fingers(),) * 2 if fingers is None else fingers
+    for side, turns, first in (("left", left, 22), ("right", right * _MIRROR, 22 + _FINGERS)):
         wrist, elbow = _WHOLE.index(f"{side}_wrist"), _WHOLE.index(f"{side}_elbow")
         own = list(range(first, first + _FINGERS))
         place = {wrist: 0} | {joint: number for number, joint in enumerate(own, start=1)}
@@ -58,7 +66,7 @@ def with_resting_hands(joints: NDArray[np.floating]) -> NDArray[np.float64]:
         bone = float(np.median(np.linalg.norm(body[:, wrist] - body[:, elbow], axis=-1)))
         size = bone / float(np.linalg.norm(_WHOLE.offsets[wrist]))
         local = np.empty((frames, 1 + _FINGERS, 3, 3))
-        local[:, 0], local[:, 1:] = world[:, wrist], fingers
+        local[:, 0], local[:, 1:] = world[:, wrist], turns
         offsets = np.concatenate([np.zeros((1, 3)), _WHOLE.offsets[own] * size])
         out[:, own] = forward_kinematics(local, body[:, wrist], offsets, parents)[0][:, 1:]
     return out
