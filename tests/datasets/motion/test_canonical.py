@@ -269,6 +269,7 @@ def test_hands_keep_their_bones_and_go_with_their_forearms() -> None:
         assert cosine.min() > 0.9
     flip = np.array([-1.0, 1.0, 1.0])
     left, right = Rotation.random(2 * 15 * len(body), rng=3).as_matrix().reshape(2, -1, 15, 3, 3)
-    for made, fingers in ((made, None), (with_resting_hands(body, (left, right)), (right, left))):
-        other = with_resting_hands(body[:, BODY.mirror] * flip, fingers)
+    for own, swapped in ((None, None), ((left, right), (right, left))):
+        other = with_resting_hands(body[:, BODY.mirror] * flip, swapped)
+        made = with_resting_hands(body, own)
         np.testing.assert_allclose(other, made[:, WHOLE.mirror] * flip, atol=1e-7)
