@@ -12,13 +12,15 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.actions.signals import signals_of, tempo
+from motionloom.datasets.actions.signals import BALLS, signals_of, smooth, tempo
 
 Record = dict[str, Any]
 """Truth of a clip as plain JSON (`ClipMeta.truth`)."""
 Style = Literal["step", "bounce", "sway"]
 STEP_LIFT = 0.03
 """Metres that the ball of a foot is lifted at least by someone who steps, for a seventh of the time."""
+STILL = 0.2
+"""Metres a second below which a foot stands: half of those who step never do for .5 s."""
 _WRIST_HEIGHTS: dict[str, tuple[float, str, str]] = {
     # Mean height of the wrists over the shoulders, in arm lengths: limit, genre below, genre above.
     "step": (-0.1, "house", "disco"),
@@ -48,6 +50,15 @@ def measure_dance(joints: NDArray[np.floating], fps: float) -> MeasuredDance:
     limit, low, high = _WRIST_HEIGHTS[style]
     genre = high if float(signals.wrists[..., 1].mean()) > limit else low
     return MeasuredDance(style, genre, tempo(signals))
+
+
+def longest_stand(joints: NDArray[np.floating], fps: float) -> float:
+    """Longest time in which both feet stand still, seconds; joints [T >= 4, N >= 22, 3] (metres, Y up)."""
+    signals = signals_of(joints, fps)
+    # Smoothed, so that trembling is no step.
+    balls = smooth(signals.joints[:, BALLS], 0.15, fps)
+    speed = np.linalg.norm(np.gradient(balls, axis=0), axis=-1) * fps
+    return signals.longest(speed.max(1) < STILL)
 
 
 def beats_of(truth: Record, seconds: float) -> list[float]:

@@ -201,11 +201,11 @@ def _attributes(s: Signals, action: str) -> Record:
         way = "backward" if backward else "forward"
         if abs(turned) > CIRCLE:
             way = "counterclockwise" if turned > 0 else "clockwise"
-        return {"direction": way, "speed": _speed(_pace(s), *limits)}
+        return {"direction": way, "speed": _speed(_pace(s), *limits), "path": _path(s)}
     if action == "turn":
         return {"direction": "left" if _turned(s) > 0 else "right"}
     if action == "run":
-        return {"direction": "forward" if s.travel[-1] > 0 else "backward"}
+        return {"direction": "forward" if s.travel[-1] > 0 else "backward", "path": _path(s)}
     if action == "jump":
         return {"direction": "forward" if s.travel[-1] > 0.15 else "up", "count": len(_flights(s))}
     if action == "squat":
@@ -287,6 +287,10 @@ def _hops(s: Signals) -> list[int]:
 def _turned(s: Signals) -> float:
     end = max(1, len(s.heading) // 12)
     return float(s.heading[-end:].mean() - s.heading[:end].mean())
+
+
+def _path(s: Signals) -> str:
+    return "a circle" if abs(_turned(s)) > CIRCLE else "none"
 
 
 def _pace(s: Signals) -> float:

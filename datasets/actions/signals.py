@@ -23,7 +23,9 @@ STAND = float(-_REST.rest_joints[10, 1])
 """Root height of the rest pose above the balls of the feet, metres."""
 THIGH, SHIN = (float(np.linalg.norm(_REST.offsets[joint])) for joint in (4, 7))
 """Metres from hip to knee and from knee to ankle."""
-_BALLS, _ANKLES, _SHOULDERS, _WRISTS = (10, 11), (7, 8), (16, 17), (20, 21)
+_STANDING = 25
+"""Percent of the frames, at least, in which runners and jumpers have a foot on the floor."""
+BALLS, _ANKLES, _SHOULDERS, _WRISTS = (10, 11), (7, 8), (16, 17), (20, 21)
 
 
 @dataclass(frozen=True)
@@ -79,17 +81,18 @@ def signals_of(joints: NDArray[np.floating], fps: float) -> Signals:
     # Sizes and the floor are taken from the motion itself, so that thresholds hold for everybody.
     legs = [_length(x, 1 + s, 4 + s) + _length(x, 4 + s, 7 + s) for s in (0, 1)]
     x /= max(float(np.mean(legs)), 1e-3) / (THIGH + SHIN)
-    x[..., 1] -= np.percentile(x[:, _BALLS, 1], 2)
+    # Of the lower ball, since a foot of a generated motion may dip under the floor that the others stand on.
+    x[..., 1] -= np.percentile(x[:, BALLS, 1].min(1), _STANDING)
     # A chest that twists is no turn: the heading is that of the hips.
     hips = x[:, 1] - x[:, 2]
-    heading = _smooth(np.unwrap(np.arctan2(-hips[:, 2], hips[:, 0])), 0.08, fps)
+    heading = smooth(np.unwrap(np.arctan2(-hips[:, 2], hips[:, 0])), 0.08, fps)
     forward = np.stack([np.sin(heading), np.cos(heading)], axis=-1)
     left = np.stack([np.cos(heading), -np.sin(heading)], axis=-1)
-    root, feet = x[:, 0], x[:, _BALLS].mean(1)
+    root, feet = x[:, 0], x[:, BALLS].mean(1)
     # Steps are projected on the heading before they are summed: a circle goes forward all the way.
     step = np.diff(feet[:, [0, 2]], axis=0)
     travel = np.concatenate([[0.0], np.cumsum((step * 0.5 * (forward[1:] + forward[:-1])).sum(-1))])
-    velocity = np.gradient(_smooth(root[:, [0, 2]], 0.15, fps), 1 / fps, axis=0)
+    velocity = np.gradient(smooth(root[:, [0, 2]], 0.15, fps), 1 / fps, axis=0)
     spine = x[:, 12] - root
     arms = []
     for side, sign in ((0, 1.0), (1, -1.0)):
@@ -106,7 +109,7 @@ def signals_of(joints: NDArray[np.floating], fps: float) -> Signals:
         speed=(velocity * forward).sum(-1),
         drop=STAND - root[:, 1],
         behind=(away * forward).sum(-1),
-        balls=x[:, _BALLS, 1].T,
+        balls=x[:, BALLS, 1].T,
         trunk=np.arctan2((spine[:, [0, 2]] * forward).sum(-1), spine[:, 1]),
         aside=np.arctan2((spine[:, [0, 2]] * left).sum(-1), np.linalg.norm(spine[:, 1:], axis=-1)),
         wrists=np.stack(arms),
@@ -154,7 +157,8 @@ def _length(x: Array, a: int, b: int) -> float:
     return float(np.median(np.linalg.norm(x[:, a] - x[:, b], axis=-1)))
 
 
-def _smooth(x: Array, seconds: float, fps: float) -> Array:
+def smooth(x: Array, seconds: float, fps: float) -> Array:
+    """The signal [T, ...] smoothed by a Gaussian of so many seconds."""
     from scipy.ndimage import gaussian_filter1d
 
     return np.asarray(gaussian_filter1d(x, seconds * fps, axis=0, mode="nearest"))

@@ -113,6 +113,8 @@ def attributes_of(text: str, action: str) -> Record:
     directions = [name for name, words in _DIRECTIONS.get(action, {}).items() if _has(plain, words)]
     if len(directions) == 1:
         out["direction"] = directions[0]
+    elif action in ("walk", "run") and _has(text, "circles?|laps?"):
+        out["path"] = "a circle"  # either way round
     count = _count(text, action)
     if count is not None:
         out["count"] = count

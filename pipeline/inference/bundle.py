@@ -27,7 +27,7 @@ from motionloom.pipeline.contract.generation import GenerationRequest, MotionGen
 from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CAPTIONER, CPU, CompletedStage, StageCache
-from motionloom.pipeline.inference.checks import find_mismatches, rounded_lengths, unknown_captions
+from motionloom.pipeline.inference.checks import find_mismatches, rounded_lengths, standing, unknown_captions
 from motionloom.pipeline.inference.generators.idle_pose import blend_to_idle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.requests import (
@@ -270,8 +270,9 @@ class Bundle:
         """Return the notes on prompts, and on motions whose length is not the one asked for (`seconds`)."""
         texts, faces = [prompt.text for prompt in prompts], [prompt.face_text for prompt in prompts]
         remarks = dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark)
-        found: list[Unknown | str] = [*self.unknown_captions(texts, faces, face_model), *remarks]
-        return [*found, *rounded_lengths(self.generator, seconds, motions), *self.find_mismatches(motions)]
+        shown = [*rounded_lengths(self.generator, seconds, motions), *standing(motions)]
+        shown += self.find_mismatches(motions)
+        return [*self.unknown_captions(texts, faces, face_model), *remarks, *shown]
 
     def find_mismatches(self, motions: Iterable[GeneratedMotion]) -> list[str]:
         """Return a sentence for each caption, scripts apart, of which its motions show something else."""

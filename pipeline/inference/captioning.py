@@ -118,27 +118,32 @@ def read_clips(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Droppe
 
 
 def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped]:
-    """Fingers where all skeletons have them; else hands at rest, which count as none."""
+    """Fingers where a skeleton has them; else hands at rest, which count as none."""
     given = {"source": source, "layout": layout.name, "fps": layout.fps, "uncaptioned": "keep"}
-    hands = layout.num_joints > BODY_JOINTS
-    with TemporaryDirectory() as maps:
-        try:
-            conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), out=Path(maps))
-        except UserError:
-            if not hands:
-                raise
-            hands, given["fingers"] = False, "missing"
-            conversion = prepare(BvhConfig.parse({**given, "min_seconds": 0}, str(source)), out=Path(maps))
-        plan, converter = conversion.plan, conversion.converter
-        yield from (*plan.broken, *plan.rejected, *plan.dropped)
-        clips = [clip for _, clip in plan.items]
-        for clip in clips:
+    ways = ("recorded", "missing") if layout.num_joints > BODY_JOINTS else ("recorded",)
+    read, left_out = set[str](), list[Dropped]()
+    for fingers in ways:
+        config = BvhConfig.parse({**given, "min_seconds": 0, "fingers": fingers}, str(source))
+        with TemporaryDirectory() as maps:
             try:
-                sample = converter.convert(clip)
-            except MemoryError:
-                raise
-            except Exception as error:  # whatever a bad file makes of the libraries below
-                yield drop(clip.label(), error)
-                continue
-            assert isinstance(sample, Sample)
-            yield ReadClip(clip.id, clip.found.path, sample.motion, HANDS * hands)
+                conversion = prepare(config, out=Path(maps))
+            except UserError:
+                if fingers == ways[-1] and not read:
+                    raise
+                continue  # none of these skeletons has fingers, or none is a person's
+            plan, converter = conversion.plan, conversion.converter
+            left_out = [*plan.broken, *plan.rejected, *plan.dropped]
+            for clip in (clip for _, clip in plan.items if clip.found.path not in read):
+                try:
+                    sample = converter.convert(clip)
+                except MemoryError:
+                    raise
+                except Exception as error:  # whatever a bad file makes of the libraries below
+                    yield drop(clip.label(), error)
+                    continue
+                assert isinstance(sample, Sample)
+                yield ReadClip(clip.id, clip.found.path, sample.motion, HANDS * (fingers == "recorded"))
+            read.update(clip.found.path for _, clip in plan.items)
+        if not left_out:
+            return
+    yield from (one for one in left_out if one.source not in read)

@@ -14,6 +14,7 @@ from textwrap import shorten
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.actions.dances import longest_stand
 from motionloom.datasets.actions.measure import actions_of, find_mismatch
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.synth.requests import CaptionRequest, parse_actions, parse_requests
@@ -21,6 +22,9 @@ from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.text import TextSource
+
+STANDS = 6.0
+"""Seconds on both feet from which a dance has a note."""
 
 
 def unknown_captions(source: object, captions: Sequence[str], *, face: bool = False) -> list[Unknown]:
@@ -47,6 +51,18 @@ def rounded_lengths(
         f"{wanted:g} s were asked for and {made:g} s are made: this model makes whole {unit / fps:.2g} s"
         for wanted, made in lengths
         if abs(wanted - made) > 0.5 / fps
+    ]
+
+
+def standing(motions: Iterable[GeneratedMotion]) -> list[str]:
+    """Return a sentence for each dance in which both feet stand still for long."""
+    dances = (one for one in motions if one.prompt.sound and not one.prompt.idle and not one.segments)
+    stands = [(one, longest_stand(one.joints, one.fps)) for one in dances if len(one.joints) >= one.fps]
+    return [
+        f"both feet stand still for {still:.0f} s of these {one.seconds:.0f} s: a dance on the spot; other "
+        f"seeds or songs may step"
+        for one, still in stands
+        if still > STANDS
     ]
 
 

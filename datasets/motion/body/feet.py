@@ -35,6 +35,8 @@ HEIGHT = 0.05
 2 percent of the frames left out."""
 SPEED = 0.8
 """Metres a second along the floor below which it may stand; sliding feet of small models reach 0.6."""
+SUNK = 1e-3
+"""Metres under the floor from which a joint comes up to it."""
 _SHORTEST = 0.1
 """Seconds: shorter contacts are none, and shorter gaps between two are closed."""
 _BLEND = 0.15
@@ -91,10 +93,12 @@ def plant_feet(
 
     `unfitted` [T, N, 3] are the joints before any fit, which the result's error is measured against. Frames
     that are `fixed` [T] have no contacts; a foot that stands beside one is pinned where it stands there.
+    Without them, joints under the floor, which is at height 0, come up to it.
     """
     skeleton, balls = motion.skeleton, _balls(motion.skeleton)
     before = _slide(motion.joints[:, balls], contacts, fps)
-    if not contacts.any():
+    sunk = fixed is None and float(motion.joints[..., 1].min()) < -SUNK
+    if not contacts.any() and not sunk:
         return motion, FeetReport(before, before, motion.error)
     targets = motion.joints.copy()
     weights = np.ones(len(skeleton))
@@ -105,6 +109,8 @@ def plant_feet(
         targets[:, [ankle, balls[foot]]] += change[:, None]
         weights[[ankle, balls[foot]]] = _PINNED
         weights[skeleton.index(f"{side}_knee")] = _KNEES
+    if sunk:
+        targets[..., 1] = np.maximum(targets[..., 1], 0)
     if fixed is not None:
         weights[0] = 10 * _PINNED  # the root stays on its way, which leads from one fixed frame to the next
     turned, root = solve_poses(

@@ -196,8 +196,18 @@ def test_feet_stand_where_they_are_low_and_slow_and_without_contacts_nothing_cha
     np.testing.assert_array_equal(contacts, expected)
     assert not foot_contacts(standing_and_sliding(slide=2.0), SKELETON, FPS).any()
     fitted: RigidMotion = fit_rigid(standing_and_sliding(slide=2.0), SKELETON)
-    same, _ = plant_feet(fitted, fitted.joints, np.zeros((60, 2), bool), FPS)
+    none = np.zeros((60, 2), bool)
+    same, _ = plant_feet(fitted, fitted.joints, none, FPS)
     assert same is fitted
+    sunk = fitted.joints.copy()
+    sunk[10:20, [7, 10], 1] -= 0.05
+    figure = fit_rigid(sunk, SKELETON)
+    assert (
+        figure.joints[..., 1].min()
+        < -0.03
+        < -0.01
+        < plant_feet(figure, sunk, none, FPS)[0].joints[..., 1].min()
+    )
 
 
 def test_contact_columns_take_the_place_of_speed_and_short_contacts_are_none() -> None:

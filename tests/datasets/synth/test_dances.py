@@ -7,6 +7,7 @@ from collections import Counter, defaultdict
 import numpy as np
 import pytest
 
+from motionloom.datasets.actions.dances import longest_stand
 from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.audio.features import audio_features, settings_at
 from motionloom.datasets.synth.choreography import choreograph
@@ -43,6 +44,9 @@ def test_motion_and_words_say_the_genre_tempo_hands_and_face(clips: list[Clip]) 
             right[attribute].append(good)
     assert set(right) == {"action", "bpm", "style", "genre", "left_hand", "right_hand", "face"}
     assert {name: np.mean(values) for name, values in right.items() if np.mean(values) < 0.97} == {}
+    stands = [(clip.truth["style"], longest_stand(clip.joints, FPS)) for clip in clips]
+    assert np.median([still for style, still in stands if style == "step"]) < 0.5
+    assert max(still for style, still in stands if style != "step") > 3
     for clip in clips:
         genre = GENRES[clip.truth["genre"]]
         assert clip.truth["style"] == genre.style

@@ -30,6 +30,7 @@ def then(*actions: str) -> dict[str, Any]:
         ("walk and turn right", [{"action": "turn", "direction": "right"}]),
         ("she steps back, taking three steps", [{"action": "walk", "direction": "backward", "count": 3}]),
         ("strolls anti-clockwise", [{"action": "walk", "direction": "counterclockwise"}]),
+        ("he runs in a circle", [{"action": "run", "path": "a circle"}]),
         ("she walks slowly", [{"action": "walk", "speed": "slowly"}]),
         ("point to the left with the right hand", [{"action": "point", "side": "right"}]),
         ("reach up high", [{"action": "reach", "direction": "up"}, {"action": "raise"}]),
@@ -77,6 +78,7 @@ def test_true_requests_are_shown_and_others_are_not() -> None:
     ("action", "asked", "seen"),
     [
         ("walk", {"speed": "quickly"}, ["speed", "quickly"]),
+        ("run", {"path": "a circle"}, ["path", "circle"]),
         ("raise", {"side": "both"}, ["side", "left", "both"]),
         ("raise", {"side": "left"}, []),
     ],

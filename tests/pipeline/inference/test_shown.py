@@ -6,6 +6,7 @@ import base64
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
+from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.body import feet
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.bvh.motion import read_bvh
@@ -23,6 +25,7 @@ from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.checks import STANDS, standing
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import write_motions
 from motionloom.pipeline.inference.shown import FAR_MM, FigureOptions, shown
@@ -132,6 +135,16 @@ def test_faces_are_written_as_arkit_weights_by_the_users_bases(
     assert len(pygltflib.GLTF2().load(paths[0]).meshes[1].primitives[0].targets) == 52
     with pytest.raises(UserError, match="makes no face"):
         write_motions(tmp_path / "no", motions, ["arkit"], title="t")
+
+
+def test_a_dance_on_the_spot_has_a_note(motions: list[GeneratedMotion]) -> None:
+    hum = Sound(np.sin(np.arange(80_000) / 20).astype(np.float32), 10_000)
+    dance = Prompt(text="a person dances", sound=hum)
+    still = np.repeat(motions[0].joints[:1], int(STANDS * LAYOUT.fps) + 9, axis=0)
+    moves = still + np.arange(len(still))[:, None, None] * [0, 0, 0.05]
+    made = [replace(motions[0], prompt=dance, joints=joints) for joints in (still, moves, still[:60])]
+    assert len(standing(made)) == len(standing(made[:1])) == 1
+    assert standing([replace(made[0], prompt=motions[0].prompt)]) == []
 
 
 def test_planted_feet_say_what_they_cost(

@@ -12,6 +12,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from motionloom.datasets.motion.body.rigid import fit_rigid
+from motionloom.datasets.motion.bvh.motion import write_bvh
+from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.evaluation.figures import COMMON_CAPTION, MODEL, NEAREST, OWN_CAPTION, FigureFile
@@ -164,6 +167,8 @@ def test_an_uncaptioned_folder_becomes_a_data_set(
     for number, motion in enumerate(Bundle.open(trained).generate(["a person walks"] * 3, seconds=2.0)):
         motion.save(takes / "walks" / f"w{number}.bvh")
     motion.save(takes / "last.npz")
+    bare = fit_rigid(motion.joints[:, :22], Skeleton.named("smpl22"))
+    write_bvh(takes / "walks" / "w3.bvh", bare.skeleton, bare.rotations, bare.root, 20)
     np.savez(takes / "short.npz", joints=motion.joints[:2], metadata=json.dumps({"fps": 30}))
     nan = np.where(np.arange(52)[:, None] == 3, np.nan, motion.joints)
     np.savez(takes / "nan.npz", joints=nan, metadata=json.dumps({"fps": 30}))
@@ -174,7 +179,7 @@ def test_an_uncaptioned_folder_becomes_a_data_set(
     for says in ("short.npz: 2 frames are no motion", "nan.npz: NaN or infinity", "dog.npz: joints of shape"):
         assert says in done.out
     rows = [json.loads(line) for line in listed.read_text().splitlines()]
-    assert [row["id"] for row in rows] == ["walks/w0", "walks/w1", "walks/w2", "last"]
+    assert [row["id"] for row in rows] == [*(f"walks/w{k}" for k in range(4)), "last"]
     for row in rows:
         assert len(row["probabilities"]) == 2
         assert {one["source"] for one in row["captions"]} == {"captioner"} and len(row["captions"]) == 2
@@ -185,6 +190,7 @@ def test_an_uncaptioned_folder_becomes_a_data_set(
     assert made.seconds == again.seconds and len(made.sentences) == 2
 
     (takes / "last.npz").unlink()
+    (takes / "walks" / "w3.bvh").unlink()
     listed.write_text("".join(f"{json.dumps(row)}\n" for row in rows[:3]))
     done = call(
         "data", "convert", "bvh", takes, tmp_path / "shards", "--captions", listed, "--licence", "own"
