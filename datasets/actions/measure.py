@@ -289,8 +289,8 @@ def _turned(s: Signals) -> float:
     return float(s.heading[-end:].mean() - s.heading[:end].mean())
 
 
-def _path(s: Signals) -> str:
-    return "a circle" if abs(_turned(s)) > CIRCLE else "none"
+def _path(s: Signals) -> str | None:
+    return "a circle" if abs(_turned(s)) > CIRCLE else None
 
 
 def _pace(s: Signals) -> float:

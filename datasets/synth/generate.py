@@ -84,7 +84,7 @@ class SynthConfig(Config):
     """Names of `truth.ACTIONS`, or all of them, or the basic ones: all but pointing, hopping, lying down,
     crawling, stretching and two actions in turn."""
     hand_shapes: list[str] | None = None
-    """Shapes of free hands besides relaxed ones. None = all; otherwise names of `actions.hands.HANDS`."""
+    """Shapes of free hands besides relaxed ones; [relaxed] for no others. None = all of `actions.hands.HANDS`."""
     min_seconds: float = Field(2.0, ge=1.0)
     max_seconds: float = Field(6.0, le=60.0)
     val_fraction: float = Field(0.05, ge=0, lt=1)
@@ -107,7 +107,7 @@ class SynthConfig(Config):
     @field_validator("hand_shapes")
     @classmethod
     def _known_shapes(cls, names: list[str] | None) -> list[str] | None:
-        return require_known(names, HANDS[1:], "hand shape")
+        return require_known(names, HANDS, "hand shape")
 
     @field_validator("hold_out", "hold_out_val")
     @classmethod

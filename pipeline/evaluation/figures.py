@@ -85,6 +85,10 @@ class Metric:
     """"share" is shown in percent."""
 
 
+_NOTHING_SAID = 0.5
+"""Half of an interval of a share from which it may be nearly anything."""
+
+
 @dataclass(frozen=True)
 class Figure:
     """A measured number with its interval, unit and protocol."""
@@ -109,7 +113,10 @@ class Figure:
     def text(self) -> str:
         """The value with its interval, for people."""
         value = number(self.value, self.unit)
-        return value if self.interval is None else f"{value} ± {number(self.interval, self.unit)}"
+        if self.interval is None:
+            return value
+        few = f" (too few {self.over})" if self.unit == "share" and self.interval >= _NOTHING_SAID else ""
+        return f"{value} ± {number(self.interval, self.unit)}{few}"
 
     @property
     def protocol_key(self) -> str:

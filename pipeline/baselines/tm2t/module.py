@@ -63,12 +63,16 @@ class CaptionerModule(StageModule):
         of `Vocabulary.encode`, "known" bool [B, L] (optional: all)}.
         """
         net, tokens, kinds, words = self.net, batch["tokens"], batch["kinds"], batch["text"]
-        visible = tokens >= 0
+        visible, known = tokens >= 0, batch.get("known")
         if self.training and self.loss_config.hide:
             size = len(net.pattern)
             groups = group_counts(tokens, kinds, net.ends, size)
             visible = visible & ~hidden_ends(groups, tokens.shape[1], size, self.loss_config.hide)
-        logits = net(tokens, kinds, words, visible, batch.get("known"))
+        if self.training and self.loss_config.hide_hands and "hand" in net.names:
+            handless = torch.rand(len(tokens), device=tokens.device) < self.loss_config.hide_hands
+            read = (kinds != net.names.index("hand")) | ~handless[:, None]
+            known = read if known is None else known & read
+        logits = net(tokens, kinds, words, visible, known)
         each, counted = word_errors(logits, words), words != PAD
         right = (logits.argmax(-1) == words).float()
         ce = masked_mean(each, counted)

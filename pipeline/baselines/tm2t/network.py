@@ -293,6 +293,9 @@ class CaptionLossConfig(Config):
     hide: float = Field(default=1 / 3, ge=0, le=1)
     """Share of the draws in which the first or the last group of a clip is not seen (TM2T leaves out a
     token at either end)."""
+    hide_hands: float = Field(default=0.0, ge=0, le=1)
+    """Share of the draws that are read as clips without hands, as most recordings are; for captions that say
+    nothing of fingers."""
 
 
 class Seq2SeqLossConfig(Config):

@@ -117,6 +117,8 @@ def test_of_few_repeats_all_pairs_count_whatever_the_seed(seed: int) -> None:
     assert multimodality(torch.tensor([[[0.0], [3.0]], [[1.0], [2.0]]]), seed=seed).item() == 2
     assert multimodality(torch.tensor([[[0.0], [1.0], [5.0]]]), seed=seed).item() == pytest.approx(10 / 3)
     assert diversity(torch.ones(5, 3)).item() == 0
+    with pytest.raises(ValueError, match="1 row"):
+        diversity(torch.ones(1, 3))
 
 
 def commuting(spread: torch.Tensor, other: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, float]:

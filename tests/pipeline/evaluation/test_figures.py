@@ -84,6 +84,9 @@ def test_a_file_comes_back(tmp_path: Path) -> None:
     assert first[1:] == (["", "X, mm"], [["model", "0.1 ± 0.0"], [RECORDED, "2.0"]])
     assert all(words in first[0] for words in ("A", "3 clips", "over clips", "X: few"))
     assert second[2] == [["model", "50 %"]]
+    wide = Figure("b.y", 0.75, 0.8, "share", over="clips")
+    assert wide.text() == "75 % ± 80 % (too few clips)"
+    assert replace(wide, interval=0.1).text() == "75 % ± 10 %"
 
 
 def reach(performance: Performance) -> Row:
