@@ -84,7 +84,7 @@ class SynthConfig(Config):
     """Names of `truth.ACTIONS`, or all of them, or the basic ones: all but pointing, hopping, lying down,
     crawling, stretching and two actions in turn."""
     hand_shapes: list[str] | None = None
-    """Shapes of free hands besides relaxed ones; [relaxed] for no others. None = all of `actions.hands.HANDS`."""
+    """Shapes of free hands besides relaxed ones; [relaxed] for no others. None = all of `HANDS`."""
     min_seconds: float = Field(2.0, ge=1.0)
     max_seconds: float = Field(6.0, le=60.0)
     val_fraction: float = Field(0.05, ge=0, lt=1)
