@@ -33,6 +33,8 @@ from typing import Any, NamedTuple
 import torch
 from bench import Column, arguments, command_line, report
 from rich.console import Console
+from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.models.training.stage_module import Batch, StageModule
@@ -152,7 +154,7 @@ class Benchmark:
         torch.manual_seed(0)
         net = kind.network(kind.facts(config, inputs), inputs)
         module = kind.dry_module(config, net, inputs)
-        batch, _ = kind.example(config, net, inputs, config.train.local_batch(1))
+        batch = with_values(kind.example(config, net, inputs, config.train.local_batch(1)).batch, net)
         card = kind.estimate(config, given, recipe.hardware)
         return Step(stage, module, batch, pass_flops(module, batch), card.memory_bytes)
 
@@ -172,7 +174,6 @@ class Benchmark:
         hardware = self.recipes["humantomato"].hardware.model_copy(update={"deterministic": how != "free"})
         fabric = launch(hardware, train)
         execution = Execution(fabric, module, train)
-        module.on_fit_start()  # frozen networks follow
         batch = fabric.to_device(made.batch)
 
         def timed(count: int) -> float:
@@ -270,6 +271,20 @@ class Benchmark:
         return [stage.name for stage in recipe.stages], run
 
 
+def with_values(batch: Batch, net: Any) -> Batch:
+    """An example, which has shapes only, with values drawn: closed sequences of codes, and noise."""
+
+    def drawn(value: Any) -> Any:
+        return torch.randn_like(value) if isinstance(value, Tensor) and value.is_floating_point() else value
+
+    batch = tree_map(drawn, batch)
+    if "tokens" in batch:
+        shape, last = batch["tokens"].shape, len(net.ends)
+        batch["tokens"] = torch.randint(int(net.ends.min()), shape)
+        batch["tokens"][:, -last:] = net.ends
+    return batch
+
+
 def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cells]]]:
     """Table, title and measurement of each row, in order."""
     built: dict[str, Step] = {}
@@ -306,7 +321,7 @@ def main() -> None:
     parser.add_argument("--size", choices=("paper", "small", "tiny"), default="paper")
     parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
     parser.add_argument("--minutes", type=float, default=10.0, help="after which no row is begun")
-    parser.add_argument("--steps", type=int, default=60, help="of each training")
+    parser.add_argument("--steps", type=int, default=120, help="of each training; from 100 on with workers")
     parser.add_argument("--only", nargs="+", default=[], metavar="ROWS")
     args = arguments(parser)
     args.work.mkdir(parents=True, exist_ok=True)

@@ -201,11 +201,14 @@ class TokenNetwork(nn.Module):
             nn.init.normal_(layer.weight, std=0.02)
 
     def embed(self, tokens: Tensor, kinds: Tensor) -> Tensor:
-        """Token embeddings [B, L, D]; each stream looks up its own table, padding reads as code 0."""
+        """Token embeddings [B, L, D]; each stream looks up its own table, padding reads as any code."""
+        # What is not a stream's own looks up all its rows in turn: a GPU that repeats its bytes adds the
+        # gradients of one row one behind the other, a quarter of a step where all those were row 0.
+        others = torch.arange(tokens.numel(), device=tokens.device).view(tokens.shape)
         out: Tensor | None = None
         for kind, table in enumerate(self.embeddings):
             here = kinds == kind
-            vectors = table(torch.where(here, tokens, 0).clamp(min=0))
+            vectors = table(torch.where(here & (tokens != PAD), tokens, others % table.num_embeddings))
             out = vectors if out is None else torch.where(here[..., None], vectors, out)
         assert out is not None  # a pattern has at least one stream
         return out

@@ -109,7 +109,7 @@ class StageModule(L.LightningModule, ABC):
             self.accumulate = self.trainer.accumulate_grad_batches
 
     def on_fit_start(self) -> None:
-        """Have frozen networks follow this one to the Trainer's device."""
+        """Have frozen networks follow this one to its device."""
         for value in vars(self).values():
             if isinstance(value, Frozen):
                 value.module.to(self.device)

@@ -157,6 +157,7 @@ class Execution:
             module.compile_losses(graphs=graphs)
         self.model = fabric.setup_module(module, move_to_device=not cut)  # whole, it may not fit there
         module.to(fabric.device)
+        module.on_fit_start()  # frozen networks follow
         self.optimizers = [one["optimizer"] for one in module.configure_optimizers()]
 
     def take_step(self, parts: Iterable[Batch]) -> Tensor:

@@ -119,6 +119,7 @@ class Training:
         peak, at_peak = peak_flops(fabric.device, config.precision), 0.0
         if peak is not None:
             with optional(f"MFU of {name}", console):
+                module.on_fit_start()  # frozen networks were loaded to the GPU, and the rest is not there yet
                 at_peak = config.accumulate * pass_flops(module, data.train[0]) / peak
         self.execution = Execution(fabric, module, config)
         self.average = AveragedWeights(module.net, config.ema) if config.ema else None
