@@ -19,7 +19,6 @@ import typer
 import yaml
 from rich.console import Console
 
-from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.inference.script import Script
@@ -36,10 +35,6 @@ DOCUMENTS += sorted((ROOT / "models" / "pretrained").glob("*/README.md"))
 DOCUMENTS += sorted((ROOT / "pipeline" / "baselines").glob("*/README.md"))
 OTHER_PROGRAMS = {".", "diff", "export", "hf", "module", "pip", "python", "pre-commit", "uv"}
 LAUNCHERS = {"srun", "torchrun"}
-OF_SLURM = {
-    "--cpus-per-task", "--dependency", "--gpus-per-task", "--jobs", "--kill-on-bad-exit", "--noheader",
-    "--kill-on-invalid-dep", "--ntasks-per-node", "--parsable", "--requeue",
-}  # fmt: skip
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 
@@ -214,18 +209,6 @@ def test_yaml_example_is_a_recipe_or_a_script(block: Block, tmp_path: Path) -> N
     assert load_recipe(path).name == data["name"]
 
 
-def test_named_recipes_exist() -> None:
-    everything = "".join(document.read_text(encoding="utf-8") for document in DOCUMENTS)
-    family = "(?:humantomato|ude|baselines|bvh|t2m-gpt)"
-    assert set(re.findall(rf"`({family}-[a-z]+[a-z0-9-]*)`", everything)) <= set(shipped_recipes())
-
-
-def test_settings_of_sources_exist() -> None:
-    keys = {key for source in converters() for key in source.config_class.model_fields}
-    text = (ROOT / "docs" / "sources.md").read_text(encoding="utf-8")
-    assert set(re.findall(r"(?:--set |`)([a-z_]+)=", text)) <= keys
-
-
 def test_widths_of_layouts_are_true() -> None:
     data = (ROOT / "docs" / "data.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `(\w+)` \| (\d+) \|", data, re.M)
@@ -339,25 +322,3 @@ def test_skypilot_knows_every_key(name: str) -> None:
     for task in documents(name):
         jsonschema.validate(task, schemas.get_task_schema())
         jsonschema.validate(task.get("resources", {}), schemas.get_resources_schema())
-
-
-def options_of(command: Any) -> set[str]:
-    """Every option of a command and of those below it."""
-    below = [
-        command.get_command(None, name) for name in getattr(command, "list_commands", lambda _: ())(None)
-    ]
-    own = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
-    return own.union(*map(options_of, below))
-
-
-def test_every_option_that_a_sentence_or_the_readme_names_exists() -> None:
-    known = options_of(typer.main.get_command(app)) | OF_SLURM | {"--help"}
-    texts = {ROOT / "README.md": (ROOT / "README.md").read_text(encoding="utf-8")}
-    for room in ("datasets", "models", "pipeline"):
-        for path in (ROOT / room).rglob("*.py"):
-            strings = [node.value for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-                       if isinstance(node, ast.Constant) and isinstance(node.value, str)]  # fmt: skip
-            texts[path] = "\n".join(strings)
-    for path, text in texts.items():
-        named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]+\b", text))
-        assert named <= known, f"{path.relative_to(ROOT)}: {sorted(named - known)}"

@@ -118,7 +118,8 @@ def _exit_with_parent() -> None:
     """End this worker when its parent dies, even by SIGKILL, where it would otherwise wait for ever; and at
     Ctrl-C without a word: its parent says it.
     """
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # a parent in the background is not ended by it
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     parent = multiprocessing.parent_process()
     assert parent is not None

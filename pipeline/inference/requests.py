@@ -92,7 +92,8 @@ def require_driven(generator: MotionGenerator, prompts: Iterable[Prompt]) -> Non
             raise UserError(f"captions[{row}] is empty; say what the person does")
         for name in sorted(prompt.modalities - generator.modalities):
             known = " and ".join(sorted(generator.modalities))
-            raise UserError(f"prompt {row} has {name}, and this model is conditioned on {known} only")
+            other = "; the package's model `dance` takes music" if name == "audio" else ""
+            raise UserError(f"prompt {row} has {name}, and this model is conditioned on {known} only{other}")
 
 
 def require_used(

@@ -87,9 +87,6 @@ def flipped(limb: str, frames: int) -> Callable[[Joints], Joints]:
     return go
 
 
-FLIPPED = ("left_hip", "right_knee", "left_shoulder", "right_elbow")
-
-
 def frozen(joints: Joints) -> Joints:
     joints[-11:] = joints[-11]
     return joints

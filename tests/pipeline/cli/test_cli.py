@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import io
 import json
 import re
@@ -14,22 +13,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from bvh_clips import write_clip, write_map
 from program import commands
 from rich.console import Console
 
-from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.schema import Manifest
 from motionloom.datasets.shards.index import ShardIndex
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.convert import say_manifest
-from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.cli.options import plain
-from motionloom.pipeline.contract.editing import EditTask
-from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.shown import FigureOptions
-from motionloom.pipeline.serve.requests import ServeConfig
 
 Call = Callable[..., Any]
 ROOT = Path(__file__).parents[3]
@@ -40,29 +32,6 @@ COMMANDS = dict(commands())
 
 def text_of(out: str) -> str:
     return re.sub(r"[\s│]+", " ", out)
-
-
-OTHERS = {
-    "sbatch and srun": "cpus-per-task dependency gpus-per-task jobs kill-on-bad-exit kill-on-invalid-dep "
-    "noheader ntasks-per-node parsable requeue",
-    "typer": "help",
-}
-"""Options in our strings that are other programs'."""
-
-
-def test_every_option_and_setting_that_a_string_of_the_sources_names_exists() -> None:
-    known = {f"--{name}" for names in OTHERS.values() for name in names.split()}
-    for command in COMMANDS.values():
-        known |= {option for each in command.params for option in (*each.opts, *each.secondary_opts)}
-    known |= {option for each in typer.main.get_command(app).params for option in each.opts}
-    configs = [kind.config_class for kind in converters()] + [SynthConfig, ServeConfig]
-    configs += [SamplingConfig, FigureOptions, EditTask]
-    settings = {"seed_motion", "face", *(key for config in configs for key in config.model_fields)}
-    for path in (path for top in ("pipeline", "datasets", "models") for path in (ROOT / top).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", node.value)) <= known, path
-                assert set(re.findall(r"--set ([a-z_]+)=", node.value)) <= settings, path
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
