@@ -143,11 +143,6 @@ def test_inline_make_targets_exist() -> None:
             assert set(targets) <= make_targets(), f"{document.name}: make {code}"
 
 
-def test_the_readme_begins_with_the_two_commands() -> None:
-    first = [words for where, words in COMMANDS if where.startswith("README")]
-    assert first[:2] == [["make", "demo"], ["make", "test"]]
-
-
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: p.name)
 def test_links_and_pictures_exist(document: Path) -> None:
     text = re.sub(r"^ *```.*?^ *```$", "", document.read_text(encoding="utf-8"), flags=re.M | re.S)

@@ -207,6 +207,7 @@ class TokenNetwork(nn.Module):
         others = torch.arange(tokens.numel(), device=tokens.device).view(tokens.shape)
         out: Tensor | None = None
         for kind, table in enumerate(self.embeddings):
+            assert isinstance(table, nn.Embedding)
             here = kinds == kind
             vectors = table(torch.where(here & (tokens != PAD), tokens, others % table.num_embeddings))
             out = vectors if out is None else torch.where(here[..., None], vectors, out)
