@@ -230,6 +230,7 @@ def main() -> None:
         "apart": sum(apart(truth, hold_out) for truth in truths),
         "sampling": sampling.model_dump(mode="json", exclude_unset=True),
         "seed": seed,
+        "faults": before.get("faults", ""),
         "right": shares,
         "single draws": single,
         "unknown": {
@@ -347,6 +348,7 @@ def card_of(
         count=figures["clips"],
         apart=figures["apart"],
         seed=figures["seed"],
+        faults=f"{figures['faults']}\n\n" if figures["faults"] else "",
         table=markdown(head, rows_of(shares)),
         chosen=choice(sampling),
         single=single_draws(figures["single draws"]),
