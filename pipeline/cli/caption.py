@@ -13,12 +13,18 @@ from motionloom.pipeline.cli.options import At, Device, ModelFolder
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place
 
+_OURS = "synthetic"
+"""The model of the package that captions."""
+_FILES = (".npz", ".bvh", ".amc", ".glb", ".zip")
+"""Endings of what is no model."""
+
 
 def caption(
     run_folder: ModelFolder,
     clips: Annotated[
-        list[Path], typer.Argument(help="Files (.npz of generate, .bvh, .amc, .glb), archives or folders.")
-    ],
+        list[Path] | None,
+        typer.Argument(help="Files (.npz of generate, .bvh, .amc, .glb), archives or folders."),
+    ] = None,
     count: Annotated[int, typer.Option("--k", min=1, help="Sentences for each clip, likeliest first.")] = 3,
     out: Annotated[
         Path | None,
@@ -27,9 +33,9 @@ def caption(
     at: At = None,
     device: Device = "auto",
 ) -> None:
-    """The likeliest sentences about clips, by a model with a captioner.
+    """The likeliest sentences about clips, by a model with a captioner; without one, by the package's.
 
-    Example: `motionloom caption runs/mine walk.bvh --k 5`
+    Example: `motionloom caption walk.bvh --k 5`
 
     Example: `motionloom caption runs/mine takes -o captions.jsonl --k 1`
     """
@@ -39,12 +45,14 @@ def caption(
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.runs.snapshot import run_at
 
-    console = make_console()
+    console, files = make_console(), list(clips or [])
+    if not files or Path(run_folder).suffix.lower() in _FILES:
+        run_folder, files = _OURS, [Path(run_folder), *files]
     if out is not None:
         require_file_place(out)
     found, left_out = [], []
     with run_at(run_folder, at, CAPTIONER) as folder:
-        for one in captions(MotionModel(folder, device), clips, count):
+        for one in captions(MotionModel(folder, device), files, count):
             if isinstance(one, Dropped):
                 left_out.append(one)
                 say(console, f"left out: {one.source}: {one.reason}")
@@ -55,7 +63,7 @@ def caption(
                 say(console, f"  {sentence.probability:6.1%}  {sentence.text}")
     if not found:
         raise UserError(
-            f"{left_out[0].source}: {left_out[0].reason}" if left_out else f"{clips[0]}: no clip in it"
+            f"{left_out[0].source}: {left_out[0].reason}" if left_out else f"{files[0]}: no clip in it"
         )
     if out is not None:
         write_text(out, "".join(f"{json.dumps(one.record(), ensure_ascii=False)}\n" for one in found))

@@ -108,6 +108,8 @@ def test_the_readmes_first_line_waves_with_the_left_hand(
         return joints[:, number[f"{side}_wrist"], 1] - joints[:, number[f"{side}_elbow"], 1]
 
     assert (lifted("left") > 0.1).mean() > 0.3 and (lifted("right") < 0.1).mean() > 0.9
+    told = call("caption", made.out.split()[0], "--k", 1)  # by the package's captioner
+    assert told.code == 0 and "waves" in told.out and "left" in told.out
 
 
 @pytest.fixture
