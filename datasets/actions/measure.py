@@ -172,7 +172,7 @@ def _arm_action(s: Signals) -> str:
     waves, tops = [_waves(s, side) for side in (0, 1)], s.wrists[:, :, 1].max(1)
     if max(waves) >= 3:
         return "wave"
-    if tops.min() > 0.35 and (np.abs(s.aside).max() > ASIDE or s.drop.min() < -0.03):
+    if tops.min() > 0.35 and (np.abs(s.aside).max() > ASIDE or s.drop.min() < -0.02):
         return "stretch"
     if tops.max() > 0.6:
         hand = int(np.argmax(tops))
