@@ -30,7 +30,7 @@ from motionloom.pipeline.evaluation.figures import (
     RECORDED,
     FigureFile,
 )
-from motionloom.pipeline.store.run_state import finished_records
+from motionloom.pipeline.store.run_state import StageRecord, finished_records
 from motionloom.pipeline.store.yaml import flatten
 
 PAGE = HERE.parent / "docs" / "results.md"
@@ -211,11 +211,19 @@ def row_of(run: Path, table: Table, title: str) -> Record:
                 cells.setdefault(column.figure, []).append(value)
         if found and row == MODEL:
             model = finished_records(run).get(found.about.get("made_by", {}).get("generator", ""))
-            protocol |= {"steps": flatten(model.config if model else {}).get("train.steps", "not recorded")}
+            protocol |= {"steps": steps_of(model)}
             variant = unlike_published(model.kind, model.config) if model else []
     drawn = {k: v for k, v in protocol.items() if k in PROTOCOL or k.startswith("sampling")}
     facts = {"protocol": drawn, "candidates": candidates, "variant": variant}
     return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], **facts}
+
+
+def steps_of(model: StageRecord | None) -> str | int:
+    """Steps of a generator's training, or of those of the networks that it is made of."""
+    parts = {"": model, **model.inputs} if model else {}
+    each = {role: flatten(part.config).get("train.steps") for role, part in parts.items() if part}
+    said = [f"{steps} ({role})" for role, steps in each.items() if role and steps]
+    return each.get("") or " and ".join(said) or "not recorded"
 
 
 def unlike_published(kind: str, config: Mapping[str, object]) -> list[str]:

@@ -1,6 +1,6 @@
 """Speed of what runs often, beside the usual way to do the same: the table "Speed" of docs/results.md.
 
-    python benchmarks/speed.py [--only audio loader batches] [--record speed]
+    python benchmarks/speed.py [--only audio batches] [--record speed]
 
 All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
 turns.
@@ -8,12 +8,11 @@ turns.
 
 from __future__ import annotations
 
-import io
 import itertools
 import tempfile
 import warnings
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -146,42 +145,7 @@ def batches(args: Namespace) -> Record:
     return row("a training batch of 256 at the paper's size", times)
 
 
-def loader(args: Namespace) -> Record:
-    """Normalised windows of 64 x 263, 256 a batch, from the same tar files: ours and webdataset's."""
-    import webdataset
-
-    layout = MotionLayout.named("h3d263")
-    with tempfile.TemporaryDirectory() as folder:
-        dataset, stats = noise(folder, layout, 2048, WINDOW)
-        names = [str(Path(folder) / shard.name) for shard in dataset.manifest.shards]
-
-        batches = WindowBatches(dataset, stats, window=WINDOW, batch_size=BATCH)
-
-        def ours() -> None:
-            for step in range(40):
-                batches[step]["motion"]
-
-        def windows() -> Iterator[NDArray[np.float32]]:
-            for sample in itertools.chain.from_iterable(
-                webdataset.WebDataset(names, shardshuffle=False, empty_check=False) for _ in itertools.count()
-            ):
-                motion = np.load(io.BytesIO(sample["motion.npy"]), allow_pickle=False)
-                start = np.random.randint(0, len(motion) - WINDOW + 1)
-                yield (motion[start : start + WINDOW] - stats.mean) / stats.std
-
-        def theirs() -> None:
-            endless = windows()
-            for _ in range(5):
-                torch.from_numpy(np.stack(list(itertools.islice(endless, BATCH))))
-
-        taken = cpu_seconds({"ours": ours, "webdataset": theirs})
-    rates = {"ours": 40 * BATCH / taken["ours"], "webdataset": 5 * BATCH / taken["webdataset"]}
-    usual = f"{rates['webdataset'] / 1e3:.1f} k/s, webdataset"
-    ratio = rates["ours"] / rates["webdataset"]
-    return row("training windows of 64 × 263 from shards", f"{rates['ours'] / 1e3:.0f} k/s", usual, ratio)
-
-
-CASES = {case.__name__: case for case in (audio, loader, batches)}
+CASES = {case.__name__: case for case in (audio, batches)}
 
 
 def main() -> None:

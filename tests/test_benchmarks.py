@@ -163,8 +163,9 @@ def test_titles_say_what_records_hold(monkeypatch: pytest.MonkeyPatch) -> None:
         for row in record["rows"]:
             asked = {one.figure for one in table.columns if "{candidates}" in one.title} & row["cells"].keys()
             assert asked <= row.get("candidates", {}).keys(), (name, row["title"])
-            if name.startswith("rivals") and row["seeds"]:
+            if name.startswith(("rivals", "mocap")) and row["seeds"]:
                 assert {"steps", "repeats", "clips"} <= row["protocol"].keys(), (name, row["title"])
+                assert row["protocol"]["steps"] != "not recorded", (name, row["title"])
                 assert "lengths" in row["protocol"] or name == "rivals_ude_music"
     column, run = {"title": "R ({candidates})", "figure": "r", "digits": 1, "scale": 1.0}, {"title": "MDM"}
     runs = [
