@@ -180,7 +180,7 @@ def figures_of(
             figures = {"sliding": near.sliding, **obeyed(made.joints, words, fps, gap.start)}
         elif "pins" in task:
             figures["pin"] = float(np.mean(list(near.pins_cm.values())))
-        out.append(figures)
+        out.append({name: value for name, value in figures.items() if np.isfinite(value)})
     return out
 
 
@@ -218,13 +218,11 @@ def rows_of(
     for title, each in found.items():
         done = [draws for draws in each if draws]
         cells = {
-            column.figure: [float(np.nanmean(one)) for one in np.array(values).T]
-            for column in COLUMNS
-            if (
-                values := [
-                    [one[column.figure] for one in draws] for draws in done if column.figure in draws[0]
-                ]
-            )
+            name: [
+                float(np.nanmean([draws[k].get(name, np.nan) for draws in done])) for k in range(len(done[0]))
+            ]
+            for name in (column.figure for column in COLUMNS)
+            if any(name in one for draws in done for one in draws)
         }
         protocol: dict[str, object] = {"clips": len(done)}
         if title == MODEL:

@@ -249,7 +249,7 @@ def edit_clip(
         elif frames.drawn and not task.changes_clip:
             figure, fps = own_figure(clip, frames, figure), clip.fps
         # What is said is of the joints that a file holds.
-        rounded = figure.joints.astype(np.float32)
+        rounded = figure.joints.astype(np.float32) + np.array([0, frames.base, 0])
         joints = frames.of_file(rounded, fps) if bvh is None else frames.of_file(bvh.places(), bvh.motion.fps)
         edited = EditedMotion(
             prompt, features, figure.joints, face, layout, seed=seed, original=original, bvh=bvh,

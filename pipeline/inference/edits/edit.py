@@ -24,7 +24,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.dance import ANKLES_TOES
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Motion, MotionGenerator
-from motionloom.pipeline.inference.edits.frames import EditFrames, RootPath
+from motionloom.pipeline.inference.edits.frames import WALKS, EditFrames, RootPath
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 
 _REACH_SECONDS = 0.5
@@ -33,8 +33,6 @@ _REACHED = 0.01
 """Metres from its pin at which a joint is there."""
 _SEAM_FRAMES = 2
 """Frames on either side of a seam that belong to it."""
-_WALKS = 0.3
-"""Metres a second of the root above which the figure should face where it goes [ours]."""
 _TRUNK_AND_ARMS = (1, 2, 3)
 """Numbers of the `PIECES` that keep their direction where what carries them is made; fingers follow hands."""
 
@@ -139,7 +137,13 @@ def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, 
     heading[inside] = np.where(rooted[inside], frames.clip_root.heading, heading[inside])
     on_path = ~np.isnan(frames.path)
     target[on_path] = frames.path[on_path]
-    shift, turn = eased(target - root.place, rooted | on_path), eased(heading - root.heading, rooted)
+    # Whole turns of a path count for nothing; every half second is enough, so that hips may sway.
+    known = frames.places.heading_known[0].numpy()
+    asked = known & ~rooted
+    heading[asked] = (frames.places.heading[0].numpy() + frames.anchor.heading)[asked]
+    known &= rooted | (np.arange(len(known)) % max(1, round(layout.fps / 2)) == 0)
+    wrapped = np.angle(np.exp(1j * (heading - root.heading)))
+    shift, turn = eased(target - root.place, rooted | on_path), eased(wrapped, known)
     # The bones' directions are the model's, their lengths the clip's.
     targets = retarget(joints, layout.skeleton, own.offsets)
     targets[..., 1] += (joints[:, 0, 1] / frames.scale + frames.lift - targets[:, 0, 1])[:, None]
@@ -184,8 +188,10 @@ def report_of(frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[
     """How near a result is to its task, by the joints [T, M, 3] of its file, and headings [T], in the clip's
     world.
     """
-    fps, inside, count = frames.layout.fps, frames.inside, joints.shape[1]
-    pieces, clip, rooted = piece_joints(frames.layout)[:count], frames.seen, frames.rooted[inside][:, None]
+    fps, inside, count = frames.layout.fps, frames.inside, min(joints.shape[1], frames.seen.shape[1])
+    joints = joints[:, :count]
+    clip, rooted = frames.seen[:, :count], frames.rooted[inside][:, None]
+    pieces = piece_joints(frames.layout)[:count]
     names, parents = frames.layout.skeleton.joints, np.maximum(frames.layout.skeleton.parents[:count], 0)
     # Without the legs the figure goes elsewhere, so what is kept of it is compared bone by bone, as the
     # figure sees it; fingers are kept within a hand, which goes with its arm.
@@ -205,7 +211,7 @@ def report_of(frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[
             miss = np.linalg.norm(joints[frame, joint] - pin.position - np.array([0, frames.base, 0]))
             pins[f"{names[joint]} at {(frame - frames.lead) / fps:.2f} s"] = 100 * float(miss)
     way = np.gradient(root) * fps
-    walks = on_path & (np.abs(way) > _WALKS)
+    walks = on_path & (np.abs(way) > WALKS)
     aside = np.abs(np.angle(way * np.exp(-1j * facing(joints))))[walks]
     body = frames.pieces[:, np.isin(np.arange(len(PIECES)), pieces)]
     # Frames after which it changes what is kept, and the inner frames around them.

@@ -40,6 +40,10 @@ from motionloom.models.diffusion.observed import Places, tangent
 from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 
+WALKS = 0.3
+"""Metres a second of the root above which the figure should face where it goes [ours]."""
+_TURNS = 0.5
+"""Seconds beside kept frames in which it may turn there [ours]."""
 _WRISTS = ("left_wrist", "right_wrist")
 
 
@@ -202,7 +206,9 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     path = timed.path(origin, turn)
     timed.require_free(path, pieces[:, LOWER], clip_root)
     pins = timed.pins(pieces, origin, turn, height)
-    places, anchor = _known_places(clip_root, lead, pieces[:, LOWER], path, scale)
+    places, anchor = _known_places(
+        clip_root, lead, pieces[:, LOWER], path, scale, layout.fps, "backward" in task.caption.lower()
+    )
     return EditFrames(
         task=task,
         layout=layout,
@@ -351,7 +357,13 @@ def _resampled(figure: RigidMotion, fps_in: float, fps_out: float) -> RigidMotio
 
 
 def _known_places(
-    clip: RootPath, lead: int, rooted: NDArray[np.bool_], path: NDArray[np.complex128], scale: float
+    clip: RootPath,
+    lead: int,
+    rooted: NDArray[np.bool_],
+    path: NDArray[np.complex128],
+    scale: float,
+    fps: float,
+    backwards: bool,
 ) -> tuple[Places, RootPath]:
     """Known values of the root, on the model's figure and seen from an anchor; and that anchor's frame, in
     the clip's size.
@@ -365,13 +377,24 @@ def _known_places(
     on_path = ~np.isnan(path)
     place[on_path] = path[on_path]
     heading_known, place_known = rooted.copy(), rooted | on_path
+    # Who walks a drawn path faces where it goes, but not at once where something is kept.
+    at, way = np.flatnonzero(place_known), np.zeros_like(place)
+    if len(at) > 1:
+        way[at] = np.gradient(place[at], at) * fps
+    walks = on_path & (np.abs(way) > WALKS)
+    for frame in np.flatnonzero(rooted):
+        walks[max(0, frame - round(_TURNS * fps)) : frame + round(_TURNS * fps) + 1] = False
+    heading[walks] = np.angle(way[walks]) + np.pi * backwards
+    heading_known |= walks
+    heading[heading_known] = np.unwrap(heading[heading_known])
     if rooted.any():
         first = int(np.flatnonzero(rooted)[0])
     elif on_path.any():
         first = int(np.flatnonzero(on_path)[0])
         points = torch.from_numpy(np.stack([place.real, place.imag], axis=-1))
-        heading[first] = float(tangent(points, torch.from_numpy(on_path)))
-        heading_known[first] = True
+        if not heading_known[first]:
+            heading[first] = float(tangent(points, torch.from_numpy(on_path)))
+            heading_known[first] = True
     else:
         first = lead
         heading_known[first] = place_known[first] = True

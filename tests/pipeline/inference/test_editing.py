@@ -142,7 +142,7 @@ def test_path_and_pins_are_met(walk: Walk) -> None:
     made = edit(model, one, path=path)
     assert made.report.path_cm < 1
     np.testing.assert_allclose(made.joints[30, 0, [0, 2]], [1.5, -1], atol=0.01)
-    assert made.report.aside_degrees > 0
+    assert made.report.aside_degrees < 20, "it faces where it goes"
     start = one.joints[0]
     assert abs(ground(made.joints[0, 0]) - ground(start[0])) < 0.01
 
