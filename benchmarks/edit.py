@@ -1,4 +1,4 @@
-"""How well clips are edited: gaps filled, paths and pins met, beside what needs no model.
+"""How well clips are edited: gaps filled and pins met, beside what needs no model.
 
     python benchmarks/edit.py inbetween work --record edit
     python benchmarks/edit.py inbetween work_real --real clips --record edit_real --card
@@ -6,9 +6,9 @@
 Test clips are made here, from the data settings of the recipe, or are the middle five seconds of BVH files.
 Of each the middle 40 % is taken away and made again: by the model, along straight lines, along splines
 through all that is kept, and as the training clip whose figure is nearest at both ends of the gap, laid
-between them. Then the model fills the same gap with the left wrist pinned in its middle, and goes a bent path
-with nothing kept. And all after the gap's begin does what the words of another test clip say, by the rules
-that judge synthetic clips; beside the clip as it was.
+between them. Then the model fills the same gap with the left wrist pinned in its middle. And all after the
+gap's begin does what the words of another test clip say, by the rules that judge synthetic clips; beside the
+clip as it was.
 
 Intervals of a row are over three draws of one training, differences between rows over clips. What is measured
 is kept in the folder `work`, so that a killed run goes on. `--card` writes the card of a shipped model.
@@ -65,8 +65,6 @@ COLUMNS = (
     Column("acceleration inside, m/s²", "inside"),
     Column("slower foot, cm/s", "sliding"),
     Column("pin missed by, cm", "pin"),
-    Column("path missed by, cm", "path"),
-    Column("faces away from its path, degrees", "aside", 0),
     Column("other action done, %", "action", 0, 100),
     Column("of what the words ask, %", "words", 0, 100),
 )
@@ -128,20 +126,6 @@ def nearest(clip: Joints, gap: slice, fps: float, training: Sequence[Joints]) ->
     return out
 
 
-def tasks_of(clip: Joints, fps: float, gap: slice) -> tuple[dict[str, object], dict[str, object]]:
-    """A pin in the middle of the gap, a hand's breadth from where the wrist was; and a bent path."""
-    keep = [{"end": gap.start / fps}, {"start": gap.stop / fps}]
-    middle, last = (gap.start + gap.stop) // 2, (len(clip) - 1) / fps
-    aim = clip[middle, 20] + [0.05, 0.1, 0.1]
-    pin = {"at": middle / fps, "joint": "left_wrist", "position": [float(value) for value in aim]}
-    start = clip[0, 0]
-    path = [
-        {"at": last * share, "x": float(start[0] + x), "z": float(start[2] + z)}
-        for share, x, z in ((0.0, 0.0, 0.0), (0.5, 0.2, 0.6), (1.0, 0.8, 0.9))
-    ]
-    return {"keep": keep, "pins": [pin]}, {"path": path, "caption": "a person walks forward"}
-
-
 def obeyed(joints: Joints, words: Truth, fps: float, start: int) -> dict[str, float]:
     """Whether the frames from `start` on do the words' action, and which share of all that these ask."""
     found = agrees(words.truth or {}, joints[start:], None, fps)
@@ -150,14 +134,16 @@ def obeyed(joints: Joints, words: Truth, fps: float, start: int) -> dict[str, fl
 
 def asked_of(clip: Joints, fps: float, gap: slice, words: Truth) -> dict[str, dict[str, object]]:
     """The requests to the model, by the row's title."""
-    pin, path = tasks_of(clip, fps, gap)
-    out = {MODEL: {"keep": pin["keep"]}}
+    keep, middle = [{"end": gap.start / fps}, {"start": gap.stop / fps}], (gap.start + gap.stop) // 2
+    aim = clip[middle, 20] + [0.05, 0.1, 0.1]  # a hand's breadth from where the wrist was
+    pin = {"at": middle / fps, "joint": "left_wrist", "position": [float(value) for value in aim]}
+    out: dict[str, dict[str, object]] = {MODEL: {"keep": keep}}
     out[OTHER_WORDS] = {
-        "keep": [{"end": gap.start / fps}],
+        "keep": keep[:1],
         "caption": words.caption,
         "seconds": (gap.start + len(words.joints)) / fps,
     }
-    return out | {"pinned, exact at the end": pin, "on a path, exact at the end": path}
+    return out | {"pinned, exact at the end": {"keep": keep, "pins": [pin]}}
 
 
 def figures_of(
@@ -173,10 +159,7 @@ def figures_of(
         return []
     for made in draws:
         near, figures = made.report, measured(made.joints, clip.joints, fps, gap)
-        if "path" in task:  # nothing is kept, so there is no gap
-            figures = {"inside": figures["inside"], "path": near.path_cm, "aside": near.aside_degrees}
-            figures["sliding"] = near.sliding
-        elif "seconds" in task:
+        if "seconds" in task:
             figures = {"sliding": near.sliding, **obeyed(made.joints, words, fps, gap.start)}
         elif "pins" in task:
             figures["pin"] = float(np.mean(list(near.pins_cm.values())))
