@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.bvh.own_file import between_rows
+from motionloom.datasets.motion.layout import PIECES, piece_joints
 from motionloom.datasets.schema import UserError
 from motionloom.models.layers.seeds import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask
@@ -251,6 +252,11 @@ def edit_clip(
         # What is said is of the joints that a file holds.
         rounded = figure.joints.astype(np.float32) + np.array([0, frames.base, 0])
         joints = frames.of_file(rounded, fps) if bvh is None else frames.of_file(bvh.places(), bvh.motion.fps)
+        if words and frames.pieces[:, : PIECES.index("left_hand")].all():
+            made_anew = ~frames.pieces[frames.inside][:, piece_joints(layout)[: joints.shape[1]]]
+            if joints.shape == frames.seen.shape and made_anew.any():
+                moved = np.linalg.norm(joints - frames.seen, axis=-1)[made_anew].mean()
+                notes.append(f"hands alone are made anew: by {100 * moved:.1f} cm on average")
         edited = EditedMotion(
             prompt, features, figure.joints, face, layout, seed=seed, original=original, bvh=bvh,
             report=report_of(frames, joints, heading), remarks=(*frames.remarks, *notes),

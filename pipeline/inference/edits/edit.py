@@ -155,12 +155,14 @@ def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, 
 
 
 def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMotion) -> RigidMotion:
-    """The figure with the clip's own poses where they are kept."""
+    """The figure with the clip's own poses where they are kept, and its root on its path."""
     clip, inside, pieces = frames.figure, frames.inside, piece_joints(frames.layout)
     rotations, root, rooted = figure.rotations.copy(), figure.root.copy(), frames.rooted[inside]
     kept, own = frames.pieces[inside][:, pieces], rotations[inside]
     own[kept] = clip.rotations[kept]
     root[inside][rooted] = clip.root[rooted]
+    on_path = ~np.isnan(frames.path)
+    root[on_path, 2], root[on_path, 0] = frames.path[on_path].real, frames.path[on_path].imag
     turn = Rotation.from_euler("y", (heading[inside] - frames.clip_root.heading)[:, None]).as_matrix()
     posing = (clip.skeleton.offsets, clip.skeleton.parents)
     _, was = forward_kinematics(clip.rotations, clip.root, *posing)
