@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.chain_solver import solve_poses
-from motionloom.datasets.motion.canonical import retarget
+from motionloom.datasets.motion.canonical import ground, resample, resample_quaternions, retarget
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
@@ -198,3 +198,27 @@ def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
 def with_offsets(skeleton: Skeleton, offsets: NDArray[np.floating]) -> Skeleton:
     """The skeleton with other rest offsets [N, 3]."""
     return replace(skeleton, rest=tuple((float(x), float(y), float(z)) for x, y, z in offsets))
+
+
+def moved(figure: RigidMotion, turn: float, place: complex, height: float) -> RigidMotion:
+    """The figure turned to the left about the origin, in radians, and then moved."""
+    from scipy.spatial.transform import Rotation
+
+    def put(points: Floats) -> Floats:
+        plane = ground(points) * np.exp(1j * turn) + place
+        return np.stack([plane.imag, points[..., 1] + height, plane.real], axis=-1)
+
+    rotations = figure.rotations.copy()
+    rotations[:, 0] = Rotation.from_euler("y", turn).as_matrix() @ rotations[:, 0]
+    return replace(figure, rotations=rotations, root=put(figure.root), joints=put(figure.joints))
+
+
+def at_rate(figure: RigidMotion, fps_in: float, fps_out: float) -> RigidMotion:
+    """The figure at another frame rate."""
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_matrix(figure.rotations.reshape(-1, 3, 3)).as_quat()
+    turns = resample_quaternions(turns.reshape(*figure.rotations.shape[:2], 4), fps_in, fps_out)
+    rotations = Rotation.from_quat(turns.reshape(-1, 4)).as_matrix().reshape(*turns.shape[:2], 3, 3)
+    root, joints = (resample(one, fps_in, fps_out) for one in (figure.root, figure.joints))
+    return RigidMotion.posed(figure.skeleton, rotations, root, joints)

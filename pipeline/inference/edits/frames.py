@@ -6,24 +6,16 @@ is put back on the clip's bones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
-from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
+from motionloom.datasets.motion.body.rigid import RigidMotion, at_rate, fit_rigid, moved
 from motionloom.datasets.motion.bvh.own_file import between_rows
-from motionloom.datasets.motion.canonical import (
-    canonicalize,
-    facing,
-    ground,
-    resample,
-    resample_quaternions,
-    retarget,
-    runs,
-)
+from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget, runs
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.layout import (
@@ -135,7 +127,7 @@ class EditFrames:
 
     def to_world(self, figure: RigidMotion) -> RigidMotion:
         """A figure in the clip's world."""
-        return _moved(figure, self.turn, self.origin, self.height)
+        return moved(figure, self.turn, self.origin, self.height)
 
     def of_file(self, joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
         """Joints [R, M, 3] of a file of the result, in the result's frames [T, M, 3]."""
@@ -159,7 +151,7 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     if abs(clip.fps - layout.fps) > 1e-6:
         remarks.append(f"read at {clip.fps:g} frames/s, edited at the model's {layout.fps:g}")
     drawn = clip.figure if clip.joints.shape[1] == layout.num_joints else None
-    drawn = None if drawn is None else _resampled(drawn, clip.fps, layout.fps)
+    drawn = None if drawn is None else at_rate(drawn, clip.fps, layout.fps)
     joints = resample(clip.joints, clip.fps, layout.fps) if drawn is None else drawn.joints
     face = None if clip.face is None else resample(clip.face, clip.fps, layout.fps)
     hands = layout.num_joints > BODY_JOINTS
@@ -174,9 +166,9 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         figure, height = fit_rigid(canonicalize(joints), layout.skeleton), 0.0
         seen = seen - np.array([0.0, floor, 0.0])
     else:
-        figure, height = _moved(drawn, -turn, -origin * np.exp(-1j * turn), -floor), floor
+        figure, height = moved(drawn, -turn, -origin * np.exp(-1j * turn), -floor), floor
     if task.changes_clip:
-        seen = _moved(figure, turn, origin, 0.0).joints
+        seen = moved(figure, turn, origin, 0.0).joints
     elif clip.bvh is not None:
         written = clip.bvh.places()
         seen, base = resample(written, clip.bvh.motion.fps, layout.fps), float(written[..., 1].min())
@@ -330,30 +322,6 @@ class _TimedTask:
             place = (complex(z, x) - origin) * np.exp(-1j * turn)
             out[frame, joint] = (float(place.imag), y - height, float(place.real))
         return out
-
-
-def _moved(figure: RigidMotion, turn: float, place: complex, height: float) -> RigidMotion:
-    """The figure turned to the left about the origin, in radians, and then moved."""
-    from scipy.spatial.transform import Rotation  # not with every command
-
-    def put(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        plane = ground(points) * np.exp(1j * turn) + place
-        return np.stack([plane.imag, points[..., 1] + height, plane.real], axis=-1)
-
-    rotations = figure.rotations.copy()
-    rotations[:, 0] = Rotation.from_euler("y", turn).as_matrix() @ rotations[:, 0]
-    return replace(figure, rotations=rotations, root=put(figure.root), joints=put(figure.joints))
-
-
-def _resampled(figure: RigidMotion, fps_in: float, fps_out: float) -> RigidMotion:
-    """The figure at another frame rate."""
-    from scipy.spatial.transform import Rotation
-
-    turns = Rotation.from_matrix(figure.rotations.reshape(-1, 3, 3)).as_quat()
-    turns = resample_quaternions(turns.reshape(*figure.rotations.shape[:2], 4), fps_in, fps_out)
-    rotations = Rotation.from_quat(turns.reshape(-1, 4)).as_matrix().reshape(*turns.shape[:2], 3, 3)
-    root, joints = (resample(one, fps_in, fps_out) for one in (figure.root, figure.joints))
-    return RigidMotion.posed(figure.skeleton, rotations, root, joints)
 
 
 def _known_places(
