@@ -37,8 +37,23 @@ REMOVED_FILE = "removed.json"
 """Beside them where clips were removed from the set."""
 
 
+_LONGEST = 2000
+"""Characters of a line of a `UserError`: names and numbers of strangers in it may have any length."""
+
+
 class UserError(Exception):
-    """A mistake the user can fix. The command line prints the sentence alone, never a traceback."""
+    """A mistake the user can fix. The command line prints the sentence alone, never a traceback.
+
+    What a terminal or a log would obey is written out, and the middle of an endless line is left out.
+    """
+
+    def __init__(self, words: str = "") -> None:
+        lines, half = [], _LONGEST // 2
+        for line in words.split("\n"):
+            if not line.isprintable():
+                line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)
+            lines.append(line if len(line) <= _LONGEST else f"{line[:half]} … {line[-half:]}")
+        super().__init__("\n".join(lines))
 
 
 def nearest(name: str, valid: Sequence[str], shown: Sequence[str] | None = None, what: str = "names") -> str:
@@ -127,12 +142,17 @@ def _of_64_bits(text: str) -> int:
     return value
 
 
-def number(value: object, where: str, most: float = 1e9, least: float = 0) -> float:
+MOST = 1e9
+"""No count of frames and no time in seconds is larger."""
+
+
+def number(value: object, where: str, most: float = MOST, least: float = 0) -> float:
     """The number that a field of a table or of JSON says; `UserError` beginning with `where` for anything
     else, and beyond `least` to `most`.
     """
     try:
-        found = float(value) if isinstance(value, str | int | float) else math.nan
+        plain = not isinstance(value, str) or (value.isascii() and "_" not in value)
+        found = float(value) if plain and isinstance(value, str | int | float) else math.nan
     except (ValueError, OverflowError):
         found = math.nan
     if not least <= found <= most:
@@ -140,7 +160,7 @@ def number(value: object, where: str, most: float = 1e9, least: float = 0) -> fl
     return found
 
 
-def whole(value: object, where: str, most: float = 1e9, least: float = 0) -> int:
+def whole(value: object, where: str, most: float = MOST, least: float = 0) -> int:
     """The same of a whole number, such as one of frames."""
     if (found := number(value, where, most, least)) % 1:
         raise UserError(f"{where}: '{value!s:.20}' is no whole number")
@@ -231,7 +251,7 @@ _Written = Annotated[
 ]
 """Bytes of a file's name that are no UTF-8, lone surrogates here, are stored as `\\udc8f`."""
 _End = Annotated[
-    float | None,
+    Annotated[float, Field(le=MOST)] | None,
     BeforeValidator(lambda end: None if end == -1 else end),
     PlainSerializer(lambda end: -1.0 if end is None else end),
 ]
@@ -254,7 +274,7 @@ class Caption(Config):
     """One caption of a clip. `start`/`end` are seconds; `end` None means to the end of the clip."""
 
     text: str
-    start: float = 0.0
+    start: float = Field(0.0, le=MOST)
     end: _End = None
     source: str = ""
     tokens: _Tokens = None

@@ -49,13 +49,11 @@ _ROUNDED = 4096
 
 _OTHER = "wav, flac, ogg and mp3 are read; convert others, as by: ffmpeg -i song.m4a song.wav"
 
-_PART = re.compile(r"(?P<file>.+)@(?P<start>[\d:.]*)(?P<dash>[-\u2013]?)(?P<end>[\d:.]*)", re.DOTALL)
+_PART = re.compile(r"(?P<file>.+)@(?P<start>[\d:.]*+)(?P<dash>[-\u2013]?)(?P<end>[\d:.]*)", re.DOTALL)
 _TIME = re.compile(r"(?:(?:(\d+):)?(\d+):)?(\d+(?:\.\d*)?)")
 
-_LEAST = 0.5
-"""Seconds of the shortest part; `0.10-0.20` is meant as minutes."""
-_BEYOND = 0.5
-"""Seconds that the end may lie after that of the sound."""
+_LEAST, _BEYOND = 0.5, 0.5
+"""Seconds of the shortest part (`0.10-0.20` is meant as minutes), and of what it may ask past the end."""
 
 
 @dataclass(frozen=True)
@@ -177,10 +175,8 @@ def read_sound(
 ) -> tuple[NDArray[np.float32], int]:
     """A sound file -> (mono samples [n] in [-1, 1], rate in Hz): its own rate, or resampled to `rate`.
 
-    A rate above `MAX_RATE` becomes that while it is read, unless `rate` is given.
-    Resampled sound may overshoot a little. `UserError` naming the file for sound that is missing, cut short,
-    empty, not what its name says, without a sample rate, or that holds NaN or infinity. `name` stands for the
-    path in errors.
+    A rate above `MAX_RATE` becomes that, unless `rate` is given; resampled sound may overshoot a little.
+    `UserError` naming the file, or `name`, for sound that is missing, cut, damaged or not finite.
     """
     name = str(path) if name is None else name
     wanted, own_rate = _length(path, name)
@@ -193,17 +189,14 @@ def read_sound(
             wanted = resampled_length(wanted, own_rate, rate)
             resampled = list(_resampled(blocks, own_rate, rate))
     samples = np.concatenate(resampled)
-    # Decoders may lack the last block of a whole file; more than that is a file that was cut.
-    missing = wanted - len(samples)
+    missing = wanted - len(samples)  # the last block of a whole file, but no more
     if missing > _LAST_BLOCK * rate:
         raise UserError(f"{name}: cut short: {len(samples)} samples of {wanted}")
     return np.pad(samples[:wanted], (0, max(0, missing))), rate
 
 
 def sound_seconds(path: Path, name: str | None = None) -> float:
-    """Length of a sound file by its header, or by decoding an MP3 that does not state it; `UserError` where
-    that shows a fault.
-    """
+    """Length of a sound file, by its header or decoded; `UserError` where that shows a fault."""
     samples, rate = _length(path, str(path) if name is None else name)
     return samples / rate
 
@@ -238,7 +231,12 @@ def _mono(file: Any, name: str, count: int) -> Iterator[NDArray[np.float32]]:
     """The first `count` samples as mono blocks [n], checked and clipped; tags after them are not decoded."""
     at, most = 0, max(1, _BLOCK // file.channels)
     while len(block := file.read(min(most, count - at), dtype="float32", always_2d=True)):
-        samples = block.mean(axis=1)
+        if (
+            at % most
+        ):  # libsndfile stops at a hole in an OGG; who reads on has another sound than who does not
+            raise UserError(f"{name}: damaged at sample {at}")
+        with np.errstate(all="ignore"):  # of float sound; it is looked at below
+            samples = block.mean(axis=1)
         finite = np.isfinite(samples)
         if not finite.all():
             raise UserError(f"{name}: NaN or infinity at sample {at + int(np.argmin(finite))}")
@@ -294,7 +292,10 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
                 return
             # Its length is a guess unless the first frame states it: a pipe has none, so libsndfile reads on.
             with _pipe(path) as end, soundfile.SoundFile(end, closefd=False) as piped:
-                yield piped if piped.frames == _UNKNOWN else file
+                unstated = piped.frames == _UNKNOWN
+                yield piped if unstated else file
+                if unstated and not len(piped.read(1)):
+                    _require_no_frames(end, name)
     except (soundfile.SoundFileError, RuntimeError, OSError) as error:
         raise UserError(f"{name}: not readable sound ({_reason(error)})") from None
 
@@ -318,6 +319,17 @@ def _pipe(path: Path) -> Iterator[int]:
     finally:
         os.close(out)
         thread.join()
+
+
+def _require_no_frames(end: int, name: str) -> None:
+    """`UserError` where a decoder has stopped at damage, so that frames are still in the pipe, whose heads
+    stand 1,441 bytes apart at most; a picture behind the sound has hardly any.
+    """
+    with open(end, "rb", closefd=False) as left:
+        rest = left.read()
+    heads = max(rest.count(bytes([0xFF, kind])) for kind in (0xFA, 0xFB, 0xF2, 0xF3, 0xE2, 0xE3))
+    if heads * 2000 > len(rest) > 4000:
+        raise UserError(f"{name}: damaged: its decoder stops {len(rest):,} bytes before the end")
 
 
 def _check_header(path: Path, name: str) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
 from motionloom.datasets.motion.layout import ROOT, Family, MotionLayout
-from motionloom.datasets.schema import UserError, read_plain
+from motionloom.datasets.schema import UserError, number, read_plain
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.tar import npy_from_bytes
 
@@ -80,7 +80,9 @@ class FeatureStats:
         mean, std, frames, about = load_columns(path, stage)
         try:
             family = cast(Family, about["family"])  # a wrong one fits no data set
-            layout = MotionLayout.named(about["layout"], fps=float(about["fps"]), family=family)
+            layout = MotionLayout.named(
+                about["layout"], fps=number(about["fps"], f"{path}: fps", 1000, 0.1), family=family
+            )
         except (KeyError, ValueError) as error:
             raise UserError(f"{path}: not a statistics file ({error}); run {stage} again") from None
         if len(mean) != layout.dim:

@@ -22,7 +22,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from motionloom.datasets.base.files import atomic_file, sorted_header
-from motionloom.datasets.schema import UserError, require_plain
+from motionloom.datasets.schema import UserError, require_plain, whole
 
 if TYPE_CHECKING:
     from motionloom.datasets.conditions import Condition
@@ -44,13 +44,14 @@ def load_columns(path: Path, stage: str) -> tuple[Columns, Columns, int, dict[st
         require_plain(path)
         with safe_open(path, framework="numpy") as stored:
             mean, std, about = stored.get_tensor("mean"), stored.get_tensor("std"), stored.metadata() or {}
-        frames = int(about["frames"])
+        frames = whole(about["frames"], f"{path}: frames")
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; run {stage}") from None
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise UserError(f"{path}: not a statistics file ({error}); run {stage} again") from None
-    if mean.ndim != 1 or mean.shape != std.shape or not (std > 0).all():
-        raise UserError(f"{path}: not columns with positive std; run {stage} again")
+    numbers = mean.ndim == 1 and mean.shape == std.shape and np.isfinite([mean, std]).all()
+    if not numbers or not (std > 0).all():
+        raise UserError(f"{path}: not finite columns with positive std; run {stage} again")
     return mean, std, frames, about
 
 

@@ -7,23 +7,29 @@ though, and a file may state any size, so headers are read first and compared wi
 from __future__ import annotations
 
 import math
+import os
+import sys
+import warnings
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import IO, Any, Literal, Self
 
 import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError, require_plain
+from motionloom.datasets.schema import UserError, open_plain, require_plain
 
 MAX_BYTES = 2**30
 """Largest array read by default: an hour at 200 frames a second of 156 doubles is 0.9 GB."""
 
+
+# numpy warns of each file that Python 2 wrote, which is nothing to do about.
+warnings.filterwarnings("ignore", "Reading `.npy` or `.npz` file required additional header parsing")
 
 _SPARE, _PACKED = 2**25, 5
 """Bytes that any array may take in memory, and more for each of its bytes in the file: motion packs to a half
@@ -67,14 +73,36 @@ def read_npy_header(stream: IO[bytes], where: str, size: int) -> ArrayHeader:
         raise UserError(
             f"{where}: object array (a pickle), which would run code when read; save plain numbers or text"
         )
-    if any(count < 0 for count in shape):
-        raise UserError(f"{where}: the header states a negative size {list(shape)}")
+    if any(type(count) is not int or count < 0 for count in shape):
+        raise UserError(f"{where}: the header states the size {list(shape)}")
     header = ArrayHeader(shape, dtype, stream.tell() - begin, fortran)
     if header.end != size:
         what = "truncated array" if size < header.end else "more data than the header states"
         expected, actual = header.end - header.start, size - header.start
         raise UserError(f"{where}: {what}: {expected} bytes expected for {list(shape)}, {actual} found")
     return header
+
+
+def npy_header(path: Path, where: str, most: float = math.inf) -> ArrayHeader:
+    """Header of a plain .npy file of at most `most` bytes; `UserError` beginning with `where` otherwise."""
+    try:
+        with open_plain(path, where) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size == 0 or size > most:
+                much = f"{size:,} bytes; at most {most:,} are read" if size else "empty file"
+                raise UserError(f"{where}: {much}")
+            return read_npy_header(file, where, size)
+    except OSError as error:
+        raise UserError(f"{where}: cannot be read ({error.strerror or error})") from None
+
+
+def map_npy(path: Path) -> NDArray[Any]:
+    """The array of a plain .npy file, read from the disk where it is looked at; `UserError` for any other."""
+    header = npy_header(path, str(path))
+    if not math.prod(header.shape):  # nothing cannot be mapped
+        return np.empty(header.shape, header.dtype)
+    order: Literal["C", "F"] = "F" if header.fortran else "C"
+    return np.memmap(path, header.dtype, "r", header.start, header.shape, order)
 
 
 class NpzFile:
@@ -123,14 +151,20 @@ class NpzFile:
             )
         # The stream is opened anew: the header has been read off the first one, and zips do not seek cheaply.
         with self._open(name) as stream:
-            return np.asarray(npy_format.read_array(stream, allow_pickle=False))
+            found = np.asarray(npy_format.read_array(stream, allow_pickle=False))
+        if found.dtype.kind == "U" and found.nbytes:  # numpy takes any numbers for letters
+            letters = np.frombuffer(found.tobytes(), np.dtype("u4").newbyteorder(found.dtype.byteorder))
+            if letters.max() > sys.maxunicode:
+                raise UserError(f"{self.label}: array '{name}' is damaged (text of no letters)")
+        return found
 
     def numbers(self, name: str, *, limit: int = MAX_BYTES) -> NDArray[np.float64]:
         """A float or integer array, as native float64; floats stay exact whatever their byte order."""
         kind = self.header(name).dtype
         if kind.kind not in "fiu":
             raise UserError(f"{self.label}: array '{name}' has type {kind}, not numbers")
-        return self.array(name, limit=limit, itemsize=8).astype(np.float64, copy=False)
+        with np.errstate(all="ignore"):  # what is not finite is refused where its meaning is known
+            return self.array(name, limit=limit, itemsize=8).astype(np.float64, copy=False)
 
     @contextmanager
     def _open(self, name: str) -> Iterator[IO[bytes]]:

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import io
 import tarfile
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.register import discover
 from motionloom.datasets.motion.npz import read_npy_header
-from motionloom.datasets.schema import UserError, require_plain
+from motionloom.datasets.schema import UserError, open_plain, require_plain
 from motionloom.datasets.shards.sample import MEMBERS
 
 MOST_CLIPS = 10_000
@@ -39,56 +41,68 @@ def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
     """
     clips: list[TarClip] = []
     seen: set[str] = set()
-    require_plain(path)
-    size, end = path.stat().st_size, 0
+    size, end = require_plain(path), 0
     if size == 0:
         raise UserError(f"{path}: empty file, 0 bytes: an interrupted download or write")
-    try:
-        with tarfile.open(path, mode="r:") as archive:
-            for info in archive:
-                archive.members = []  # type: ignore[attr-defined]  # tarfile keeps every entry
-                # Contents fill whole blocks; behind the last one nothing but zeros may follow (`_check_end`).
-                end = info.offset_data + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
-                key, member = _checked_name(path, info)
-                if info.offset_data + info.size > size:
-                    last = f"the last whole key is '{clips[-1].key}'" if clips else "no key is whole"
-                    raise UserError(f"{path}: truncated inside '{info.name}'; {last}")
-                # A new key ends the clip before it, which must be whole; a key may not come again later.
-                if not clips or clips[-1].key != key:
-                    if clips:
-                        _require_whole(path, clips)
-                    if key in seen:
-                        raise UserError(
-                            f"{path}: duplicate key '{key}': it comes again after others, or its members "
-                            f"do not stand together"
-                        )
-                    if len(clips) >= most:
-                        raise UserError(f"{path}: more than {most} clips, which no shard of ours has")
-                    seen.add(key)
-                    clips.append(TarClip(key))
-                if member in clips[-1].members:
-                    raise UserError(f"{path}: '{info.name}' appears twice: duplicate member")
-                clips[-1].members[member] = (info.offset_data, info.size)
-    except (tarfile.TarError, EOFError, OSError, ValueError) as error:
-        raise UserError(f"{path}: not a readable tar file ({error}); convert the dataset again") from None
+    with open_plain(path) as file:
+        for info in _entries(path, file):
+            # Contents fill whole blocks; behind the last one nothing but zeros may follow (`_check_end`).
+            end = info.offset_data + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+            key, member = _checked_name(path, info)
+            if info.offset_data + info.size > size:
+                last = f"the last whole key is '{clips[-1].key}'" if clips else "no key is whole"
+                raise UserError(f"{path}: truncated inside {info.name!r}; {last}")
+            # A new key ends the clip before it, which must be whole; a key may not come again later.
+            if not clips or clips[-1].key != key:
+                if clips:
+                    _require_whole(path, clips)
+                if key in seen:
+                    raise UserError(
+                        f"{path}: duplicate key {key!r}: it comes again after others, or its members do not "
+                        f"stand together"
+                    )
+                if len(clips) >= most:
+                    raise UserError(f"{path}: more than {most} clips, which no shard of ours has")
+                seen.add(key)
+                clips.append(TarClip(key))
+            if member in clips[-1].members:
+                raise UserError(f"{path}: '{info.name}' appears twice: duplicate member")
+            clips[-1].members[member] = (info.offset_data, info.size)
     if clips:
         _require_whole(path, clips)
     _check_end(path, end)
     return clips
 
 
+def _entries(path: Path, file: BinaryIO) -> Iterator[tarfile.TarInfo]:
+    """The headers of a tar, one block each: `tarfile.open` would read longer ones whole, of any size that
+    they state, and no shard has them.
+    """
+    at = 0
+    while (block := file.read(tarfile.BLOCKSIZE)).strip(b"\0"):
+        try:
+            info = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+        except (tarfile.TarError, ValueError) as error:
+            last = f"in the header at byte {at}: {error}"
+            raise UserError(f"{path}: not a readable tar file ({last}); convert the dataset again") from None
+        info.offset_data = at + tarfile.BLOCKSIZE
+        yield info
+        at = info.offset_data + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+        file.seek(at)
+
+
 def _checked_name(path: Path, info: tarfile.TarInfo) -> tuple[str, str]:
     """(key, member) of one entry, refused when it is anything but a plain file with a harmless name."""
     name = info.name
     if name.startswith(".") or {"/", "\\", ":", "\0"} & set(name):
-        raise UserError(f"{path}: '{name}' is a path (path traversal); shards hold plain names only")
-    if not info.isreg():
-        raise UserError(f"{path}: '{name}' is a link, folder or device; shards hold plain files only")
+        raise UserError(f"{path}: {name!r} is a path (path traversal); shards hold plain names only")
+    if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or info.size < 0:
+        raise UserError(f"{path}: {name!r} is a link, folder or device; shards hold plain files only")
     key, _, member = name.partition(".")
     if member not in MEMBERS:
         discover()  # a worker may not have met the modalities of other packages
     if member not in MEMBERS:
-        raise UserError(f"{path}: '{name}' is not a known member; known: {', '.join(MEMBERS)}")
+        raise UserError(f"{path}: {name!r} is not a known member; known: {', '.join(MEMBERS)}")
     return key, member
 
 

@@ -16,14 +16,14 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.motion.npz import map_npy
+from motionloom.datasets.schema import Config, UserError, parse_json, read_plain
 
 SIMILARITY = "similarity"
 _KEY = np.dtype("S32")
@@ -47,21 +47,22 @@ class TextCache:
         self.encoder = info.encoder
         self.dim = info.dim
         try:
-            self._keys = np.load(folder / "keys.npy", mmap_mode="r", allow_pickle=False)
-            self._sentence = np.load(folder / "sentence.npy", mmap_mode="r", allow_pickle=False)
-            self._offsets = np.load(folder / "offsets.npy", allow_pickle=False)
-            self._tokens = np.load(folder / "tokens.npy", mmap_mode="r", allow_pickle=False)
-        except (OSError, ValueError) as error:
+            self._keys, self._sentence = map_npy(folder / "keys.npy"), map_npy(folder / "sentence.npy")
+            self._tokens, offsets = map_npy(folder / "tokens.npy"), map_npy(folder / "offsets.npy")
+        except UserError as error:
             raise UserError(
                 f"{folder}: the text cache is damaged ({error}); run the text stage again"
             ) from None
         n, dim = info.count, info.dim
-        rows = int(self._offsets[-1]) if self._offsets.shape == (n + 1,) else -1
+        self._offsets = np.array(offsets)
+        rows = int(offsets[-1]) if offsets.shape == (n + 1,) and offsets.dtype == np.int64 else -1
         wanted = {"keys": (n, 32), "sentence": (n, dim), "offsets": (n + 1,), "tokens": (rows, dim)}
-        for name, shape in wanted.items():
-            if getattr(self, f"_{name}").shape != shape:
+        kinds = (np.uint8, np.float32, np.int64, np.float16)
+        for (name, shape), kind in zip(wanted.items(), kinds, strict=True):
+            found = getattr(self, f"_{name}")
+            if found.shape != shape or found.dtype != kind:
                 raise UserError(f"{folder}/{name}.npy: not {list(shape)}; run the text stage again")
-        if (np.diff(self._offsets) < 1).any() or self._offsets[0] != 0:
+        if n < 0 or (np.diff(self._offsets) < 1).any() or self._offsets[0] != 0:
             raise UserError(f"{folder}/offsets.npy: damaged; run the text stage again")
         other = folder / SIMILARITY
         self._other = TextCache(other) if (other / "cache.json").exists() else None
@@ -102,8 +103,13 @@ class TextCache:
         return out, mask
 
     def captions_by_key(self) -> dict[bytes, str]:
-        lines = (self.folder / "captions.jsonl").read_text(encoding="utf-8").splitlines()
-        return {key_of(text): text for text in map(json.loads, lines)}
+        path = self.folder / "captions.jsonl"
+        try:
+            lines = read_plain(path, 2**32).splitlines()
+        except OSError as error:
+            raise UserError(f"{path}: cannot be read ({error.strerror}); run the text stage again") from None
+        texts = [parse_json(line, f"{path}:{number}") for number, line in enumerate(lines, start=1)]
+        return {key_of(text): text for text in texts if isinstance(text, str)}
 
     def lengths(self) -> NDArray[np.int64]:
         return np.asarray(np.diff(self._offsets))
@@ -115,7 +121,7 @@ class TextCache:
     def find(self, captions: Sequence[str]) -> NDArray[np.int64]:
         """Rows [n] of captions, -1 where one is not here."""
         wanted = np.frombuffer(b"".join(map(key_of, captions)), dtype=_KEY)
-        known = self._keys.view(_KEY)[:, 0]
+        known = np.ascontiguousarray(self._keys).view(_KEY)[:, 0]
         rows = np.searchsorted(known, wanted).clip(max=len(known) - 1)
         return np.where(known[rows] == wanted, rows, -1)
 

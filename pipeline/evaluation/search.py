@@ -227,7 +227,7 @@ def _stored(path: Path, made_from: str, shape: tuple[int, int]) -> Vectors | Non
     """The stored embeddings of these clips and weights; None for others, a damaged file, or no file."""
     try:
         with NpzFile(path) as stored:
-            if bytes(stored.array("made_from", limit=4096)) != made_from.encode():
+            if stored.array("made_from", limit=4096).tobytes() != made_from.encode():
                 return None
             vectors = stored.array("vectors", limit=2 * shape[0] * shape[1] + 4096)
     except UserError:

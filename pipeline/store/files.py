@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from motionloom.datasets.base import files
-from motionloom.datasets.schema import UserError, require_local
+from motionloom.datasets.schema import UserError, read_plain, require_local
 
 
 def require_folder(folder: Path) -> None:
@@ -39,7 +39,7 @@ def write_json(path: Path, data: object) -> None:
 def read_record(path: Path) -> dict[str, object]:
     """A JSON object that a run keeps; a `UserError` names the file."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_plain(path))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); run its stage again") from None
     except (ValueError, RecursionError) as error:

@@ -91,12 +91,20 @@ class TokenStore:
             raise UserError(f"{path}: no tokens; run the tokens stage for this split")
         try:
             tensors = load_file(path)
-        except SafetensorError as error:
+            starts, whole = tensors["starts"].numpy(), tensors["whole"].numpy()
+        except (SafetensorError, KeyError, TypeError) as error:
             raise UserError(f"{path}: cannot be read ({error}); run the tokens stage again") from None
         codes = {k.removeprefix("codes."): v.long() for k, v in tensors.items() if k.startswith("codes.")}
         if set(codes) != set(per_group):
             raise UserError(f"{path}: holds streams {sorted(codes)}, the tokenizer has {sorted(per_group)}")
-        return TokenStore(codes, tensors["starts"].numpy(), per_group, tensors["whole"].numpy())
+        # Clips lie one after the other, and together they are all that is there.
+        fits = (starts.dtype, whole.dtype) == (np.int64, np.bool_) and starts.shape == (len(whole) + 1,)
+        fits = fits and starts[0] == 0 and bool((np.diff(starts) > 0).all())
+        for name, flat in codes.items():
+            fits = fits and flat.shape == (starts[-1] * per_group[name],) and bool((flat >= 0).all())
+        if not fits:
+            raise UserError(f"{path}: not the codes of clips one after the other; run the tokens stage again")
+        return TokenStore(codes, starts, per_group, whole)
 
 
 @dataclass(frozen=True)

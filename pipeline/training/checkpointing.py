@@ -36,7 +36,7 @@ from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 
 from motionloom.datasets.base.files import HashingFile, atomic_file, sync_folder
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, require_plain
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Means, StageModule
 from motionloom.pipeline.training.metric_log import LogState
@@ -305,6 +305,7 @@ class _Sink(HashingFile):
 
 
 def _check_seal(path: Path) -> None:
+    require_plain(path)
     with path.open("rb") as file:
         # The seal comes last, so a file that was cut short has none, wherever it was cut.
         size = file.seek(0, 2) - _SEAL_BYTES

@@ -275,9 +275,8 @@ def list_files(source: Path, draft: ConversionPlan[ReleaseClip]) -> list[str]:
     for relative in walk_files(source):
         name = relative.rsplit("/", 1)[-1]
         if name.endswith(SUFFIX) and name != "shape.npz" and not name.endswith("_stagei.npz"):
-            label = relative.encode("utf-8", "backslashreplace").decode()  # names may be any bytes
-            with draft.reading(label):
-                labels.append(check_id(relative, label))
+            with draft.reading(relative):
+                labels.append(check_id(relative, relative))
     if not labels:
         raise UserError(f"{source}: no {SUFFIX} file with motion in it")
     return labels

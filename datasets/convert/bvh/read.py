@@ -13,13 +13,17 @@ from motionloom.datasets.convert.common.files import read_in_threads, walk_files
 from motionloom.datasets.motion.bvh.asf import FPS, JOINED, frame_marks, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import skeleton_key
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
-from motionloom.datasets.motion.bvh.text import count_frames, find_motion, load_text, parse_hierarchy
+from motionloom.datasets.motion.bvh.text import (
+    MAX_FILE_BYTES,
+    count_frames,
+    find_motion,
+    load_text,
+    parse_hierarchy,
+)
 from motionloom.datasets.schema import UserError, read_plain
 from motionloom.datasets.shards.left_out import drop
 
 SUFFIX = (".bvh", ".amc")
-MAX_FILE_BYTES = 1 << 30
-"""A motion file beyond this is refused unread: a few hours of text, or a bomb."""
 MAX_SKELETON_BYTES = 1 << 20
 
 

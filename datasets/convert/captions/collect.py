@@ -32,10 +32,12 @@ class Captions:
     """Absolute paths of the files that hold them."""
     others: list[Path] = field(default_factory=list)
     """Tables in the folders that hold none."""
+    bad: list[str] = field(default_factory=list)
+    """A sentence for each record that cannot be read, with file and line."""
 
     @classmethod
     def read(cls, places: Iterable[Path]) -> Captions:
-        """Read files and folders; `UserError` names file and line of anything malformed."""
+        """Read files and folders; a bad record is none, a file without any good one a `UserError`."""
         captions = cls()
         for place in places:
             path, columns = place_of(place)
@@ -63,21 +65,31 @@ class Captions:
 
     def _add(self, origin: Path, records: Records, files: Iterable[Path]) -> None:
         named: dict[str, str] = {}
+        bad: list[str] = []
         for where, values in records:
-            catalogue = bool(values.pop(CATALOGUE, False))
-            row, is_list = row_of(where, values)
-            row = replace(row, catalogue=catalogue, origin=str(origin))
-            if row.file and named.setdefault(row.file, row.id) != row.id:
-                raise UserError(f"{where}: file '{row.file}' has a record already ('{named[row.file]}')")
-            named.setdefault("", row.id)
-            before = self.rows.get(row.id)
-            # Records of one clip are joined, but two lists of all its captions in one file are a mistake.
-            if before is not None and before.origin == row.origin and is_list and not catalogue:
-                raise UserError(f"{where}: clip id '{row.id}' has a record already ({before.where})")
-            self.rows[row.id] = row if before is None else joined(before, row)
+            try:
+                if isinstance(values, UserError):
+                    raise values
+                self._add_record(where, values, str(origin), named)
+            except UserError as error:
+                bad.append(str(error))
         if not named:
-            raise UserError(f"{origin}: no captions in it")
+            raise UserError(bad[0] if bad else f"{origin}: no captions in it")
+        self.bad.extend(bad)
         self.used.update(str(path.absolute()) for path in files)
+
+    def _add_record(self, where: str, values: dict[str, object], origin: str, named: dict[str, str]) -> None:
+        catalogue = bool(values.pop(CATALOGUE, False))
+        row, is_list = row_of(where, values)
+        row = replace(row, catalogue=catalogue, origin=origin)
+        if row.file and named.get(row.file, row.id) != row.id:
+            raise UserError(f"{where}: file '{row.file}' has a record already ('{named[row.file]}')")
+        before = self.rows.get(row.id)
+        # Records of one clip are joined, but two lists of all its captions in one file are a mistake.
+        if before is not None and before.origin == row.origin and is_list and not catalogue:
+            raise UserError(f"{where}: clip id '{row.id}' has a record already ({before.where})")
+        self.rows[row.id] = row if before is None else joined(before, row)
+        named |= dict.fromkeys(filter(None, (row.file, row.id)), row.id)
 
 
 def caption_files(folder: Path) -> tuple[list[Path], list[Path]]:
@@ -90,6 +102,7 @@ def caption_files(folder: Path) -> tuple[list[Path], list[Path]]:
 def holds_captions(table: Path, columns: dict[str, str]) -> bool:
     """Whether the first record of a file is one of captions."""
     try:
-        return bool(row_of(*next(records_of(table, columns))))
+        where, values = next(records_of(table, columns))
+        return not isinstance(values, UserError) and bool(row_of(where, values))
     except (UserError, StopIteration):
         return False

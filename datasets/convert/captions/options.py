@@ -206,6 +206,9 @@ def unused_files(source: Path, paths: Sequence[str], captions: Captions) -> list
     given and hold none.
     """
     notes = []
+    if captions.bad:
+        count = len(captions.bad)
+        notes.append(f"{count:,} records of captions cannot be read: {'; '.join(captions.bad[:_SHOWN])}")
     if captions.others:
         notes.append(f"no captions in {_some([path.name for path in captions.others])}")
     if source.is_dir():

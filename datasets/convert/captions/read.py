@@ -10,18 +10,21 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, TypeVar
 
 from pydantic import AliasChoices, ConfigDict, Field, FiniteFloat
 
-from motionloom.datasets.convert.captions.humanml_text import parse_caption
+from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.files import check_id, read_text_file
 from motionloom.datasets.convert.common.splits import split_named
 from motionloom.datasets.convert.common.tables import DELIMITERS, table_rows
 from motionloom.datasets.schema import Caption, Config, Split, UserError, nearest, parse_json
+
+T = TypeVar("T")
 
 SOURCE = "captions"
 """`source` of captions that state none."""
@@ -155,8 +158,8 @@ def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
     )
 
 
-Records = Iterator[tuple[str, dict[str, object]]]
-"""(place, values) of every record of a file."""
+Records = Iterator[tuple[str, dict[str, object] | UserError]]
+"""(place, values) of every record of a file, or what is wrong with it."""
 
 
 def records_of(path: Path, columns: dict[str, str]) -> Records:
@@ -168,11 +171,12 @@ def records_of(path: Path, columns: dict[str, str]) -> Records:
     if start == "[" or (start and path.suffix.lower() == ".json" and start != "{"):
         values = _decode(str(path), text)
         listed = enumerate(values if isinstance(values, list) else [values], start=1)
-        return (_record(f"{path}: record {number}", value, columns) for number, value in listed)
+        records = ((f"{path}: record {number}", value) for number, value in listed)
+        return _each(records, columns, lambda _, value: value)
     if start not in ("{", ""):
         return _of_table(path, text, columns)
     places = ((f"{path}:{n}", line) for n, line in enumerate(text.split("\n"), start=1) if line.strip())
-    return (_record(place, _decode(place, line), columns) for place, line in places)
+    return _each(places, columns, _decode)
 
 
 def _word(name: str) -> str:
@@ -187,7 +191,7 @@ def _renamed(names: Iterable[str], columns: dict[str, str]) -> list[str]:
     return [keys.get(_word(name)) or (f"({name})" if name in hidden else name) for name in names]
 
 
-def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | None:
+def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object] | UserError]] | None:
     """The records of one JSON object by the clips' names; None for any other text.
 
     A name has a caption, a list of them (as text, or as `{text, start, end}`), or, as in KIT-ML's annotations
@@ -199,7 +203,7 @@ def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | Non
         return None  # JSON lines; or they will say what is wrong
     if not isinstance(named, dict) or _text_keys(tuple(named)) or {*ID_KEYS, *FILE_KEYS} & named.keys():
         return None
-    records: list[tuple[str, dict[str, object]]] = []
+    records: list[tuple[str, dict[str, object] | UserError]] = []
     for name, value in named.items():
         where, record = f"{path}: '{name}'", {"id": name, CATALOGUE: True}
         if isinstance(value, dict) and {"path", "annotations"} <= value.keys():
@@ -208,7 +212,9 @@ def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | Non
                 continue
             record |= {"id": _AMASS.sub("", place), "file": place}
         if not isinstance(value, str | list):
-            raise UserError(f"{where}: expected a caption, a list of captions, or path and annotations")
+            wanted = "a caption, a list of captions, or path and annotations"
+            records.append((where, UserError(f"{where}: expected {wanted}")))
+            continue
         listed = [value] if isinstance(value, str) else value
         kept = [{k: one[k] for k in ("text", "start", "end") if k in one} if isinstance(one, dict) else one
                 for one in listed]  # fmt: skip
@@ -216,10 +222,19 @@ def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object]]] | Non
     return records
 
 
-def _record(where: str, value: object, columns: dict[str, str]) -> tuple[str, dict[str, object]]:
-    if not isinstance(value, dict):
-        raise UserError(f"{where}: no record; expected the likes of {_RECORD}")
-    return where, dict(zip(_renamed(value, columns), value.values(), strict=True)) if columns else value
+def _each(
+    values: Iterable[tuple[str, T]], columns: dict[str, str], read: Callable[[str, T], object]
+) -> Records:
+    """The records that `read` makes of values, each with its place."""
+    for where, value in values:
+        try:
+            record = read(where, value)
+            if not isinstance(record, dict):
+                raise UserError(f"{where}: no record; expected the likes of {_RECORD}")
+        except UserError as error:
+            yield where, error
+            continue
+        yield where, dict(zip(_renamed(record, columns), record.values(), strict=True)) if columns else record
 
 
 def _decode(where: str, text: str) -> object:
@@ -238,12 +253,22 @@ def text_records(folder: Path, paths: Iterable[Path]) -> Records:
 
     The folder is in HumanML3D's grammar when the first line of any file is: then all lines must be.
     """
-    texts = {path: read_text_file(path).split("\n") for path in paths}
+    texts: dict[Path, list[str]] = {}
+    for path in paths:
+        try:
+            texts[path] = read_text_file(path).split("\n")
+        except UserError as error:
+            yield str(path), error
     firsts = (next((line for line in lines if line.strip()), "") for lines in texts.values())
     humanml = any(map(_is_humanml, firsts))
     for path, lines in texts.items():
         name = path.relative_to(folder).as_posix().removesuffix(".txt")
-        captions = _humanml(path, lines) if humanml else [line for line in lines if line.strip()]
+        captions: list[Any] = [line for line in lines if line.strip()]
+        if humanml:
+            captions, problems = read_humanml_captions(path, seconds=None, source=SOURCE)
+            for problem in problems:
+                where = f"{path}:{problem.removeprefix('line ')}"
+                yield where, UserError(f"{where}; expected caption#tokens#start#end")
         yield f"{path}:1", {"id": name, "captions": captions}
 
 
@@ -253,24 +278,13 @@ def _is_humanml(line: str) -> bool:
     return len(fields) >= 4 and bool(fields[0]) and all(map(_NUMBER.fullmatch, fields[-2:]))
 
 
-def _humanml(path: Path, lines: Iterable[str]) -> list[Caption]:
-    captions = []
-    for number, line in enumerate(lines, start=1):
-        if line.strip():
-            try:
-                captions.append(parse_caption(line, seconds=None, source=SOURCE))
-            except UserError as error:
-                raise UserError(f"{path}:{number}: {error}; expected caption#tokens#start#end") from None
-    return captions
-
-
 def _of_table(path: Path, text: str, columns: dict[str, str]) -> Records:
     """The rows by the names of the header, in lower case."""
     lines = text.split("\n")
     first = next(number for number, line in enumerate(lines) if line.strip())
     delimiter, names = _header(path, lines[first], first + 1, columns)
     for place, row in table_rows(lines[first + 1 :], first + 2, names, delimiter, str(path)):
-        yield place, {**row}
+        yield place, row if isinstance(row, UserError) else {**row}
 
 
 def _header(path: Path, line: str, number: int, columns: dict[str, str]) -> tuple[str, list[str]]:

@@ -8,14 +8,13 @@ missing axes. A transposed array is refused, not turned: [322, 322] could not be
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.npz import MAX_BYTES, ArrayHeader, read_npy_header
-from motionloom.datasets.schema import UserError, open_plain
+from motionloom.datasets.motion.npz import MAX_BYTES, ArrayHeader, npy_header
+from motionloom.datasets.schema import UserError
 
 Limit = float | NDArray[np.float64]
 
@@ -40,16 +39,7 @@ def load_array(
 def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | None = None) -> int:
     """T of a file that `load_array` accepts as far as header and size tell; `UserError` otherwise."""
     label = str(path) if name is None else name
-    try:
-        with open_plain(path, label) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size == 0:
-                raise UserError(f"{label}: empty file")
-            if size > MAX_BYTES:
-                raise UserError(f"{label}: {size:,} bytes; at most {MAX_BYTES:,} are read")
-            header = read_npy_header(file, label, size)
-    except OSError as error:
-        raise UserError(f"{label}: cannot be read ({error.strerror or error})") from None
+    header = npy_header(path, label, MAX_BYTES)
     _check_header(header, width, label)
     return header.shape[0]
 

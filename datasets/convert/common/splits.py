@@ -24,7 +24,7 @@ _LIST = re.compile(r"(?:crossmodal_)?([a-z]+)(?:_ids)?", re.IGNORECASE)
 """Names of split files: AIST++'s are `crossmodal_train.txt`, SnapMoGen's `train_ids.txt`."""
 _FILE = re.compile(r"\.(?:npy|pkl|json)$")
 _MIRRORED = re.compile(r"((?:.*/)?)M(\d+)")
-_HDM05 = re.compile(r"(HDM_[a-z]+)_(.+?)(?:_\d+)*")
+_HDM05 = re.compile(r"(HDM_[a-z]+)_.+")
 """HDM05's `HDM_bd_kickLFront1Reps_003_120`: actor, label, number, frame rate."""
 _TRIAL = re.compile(r"(\d+)_\d+(?:_\w+)?")
 """CMU's `01_02`: subject and trial. AMASS puts subjects in folders."""

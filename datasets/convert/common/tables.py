@@ -42,15 +42,21 @@ def read_csv(path: Path, columns: Iterable[str]) -> list[tuple[str, dict[str, st
         raise UserError(
             f"{path.name}: no column '{missing[0]}'; there are {', '.join(header[:12]) or 'none'}"
         )
-    return list(table_rows(lines[1:], 2, header, ",", path.name))
+    rows = []
+    for place, row in table_rows(lines[1:], 2, header, ",", path.name):
+        if isinstance(row, UserError):
+            raise row
+        rows.append((place, row))
+    return rows
 
 
 def table_rows(
     lines: Sequence[str], first: int, header: Sequence[str], delimiter: str, name: str
-) -> Iterator[tuple[str, dict[str, str]]]:
+) -> Iterator[tuple[str, dict[str, str] | UserError]]:
     """(place, row) of the lines below a header, which begin at line `first`; blank rows say nothing.
 
-    `UserError` names the line on which a row starts that is cut, or a quote that is not closed.
+    In place of a row that is cut stands a `UserError` with its line; a quote that is not closed, behind which
+    no row is known, is the last.
     """
     # The reader wants the newlines back: those inside quotes belong to the text.
     reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter, strict=True)
@@ -60,15 +66,21 @@ def table_rows(
             row = next(reader)
         except StopIteration:
             return
-        except csv.Error:
-            raise UserError(f"{place}: a quote is not closed before the next column") from None
+        except csv.Error as error:
+            reason = "a quote is not closed before the next column"
+            if "field larger" in str(error):
+                reason = f"a column of more than {csv.field_size_limit():,} letters"
+            yield place, UserError(f"{place}: {reason}")
+            return
         if not any(field.strip() for field in row):
             continue
         if len(row) != len(header):
-            raise UserError(
+            problem = (
                 f"{place}: {len(row)} columns, the header has {len(header)} ({', '.join(header[:12])}); put "
                 f"text that holds {DELIMITERS[delimiter]} in quotes"
             )
+            yield place, UserError(problem)
+            continue
         yield place, dict(zip(header, row, strict=True))
 
 

@@ -111,14 +111,13 @@ def find_files(source: Path) -> MotionXFiles:
         place = _place(tuple(parts))
         if place is None or file.startswith(".") or not file.endswith(_KINDS[place.kind][1]):
             continue
-        shown = name.encode("utf-8", "backslashreplace").decode()
         try:
             clip_id = "/".join((*place.rest, file.removesuffix(_KINDS[place.kind][1])))
-            check_id(clip_id, shown)
+            check_id(clip_id, name)
             # A folder may be a link: people keep the parts of a release on different disks.
-            inside(source.joinpath(*parts), file, shown)
+            inside(source.joinpath(*parts), file, name)
         except UserError as error:
-            broken.append(drop(shown, error))
+            broken.append(drop(name, error))
             continue
         placed.append((place, clip_id, name))
     # `motion_data/` beside an inner `smplx_322/` may hold other representations of the same clips.

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from motionloom.datasets.motion.bvh.motion import BvhMotion
-from motionloom.datasets.motion.bvh.text import Floats
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.motion.bvh.text import LARGEST, Floats, is_number, shown
+from motionloom.datasets.schema import UserError, number
 
 INCH = 2.54
 """Centimetres."""
@@ -119,9 +119,9 @@ def _skeleton(text: bytes, where: str) -> _Skeleton:
     units = {line[0]: line[1] for line in sections.get("units", []) if len(line) > 1}
     degree = 1.0 if units.get("angle", "deg").startswith("deg") else 180 / np.pi
     try:
-        unit = INCH / float(units.get("length", "1"))
+        unit = INCH / number(units.get("length", "1"), "length", LARGEST, 1 / LARGEST)
         bones = _bones(sections, unit, degree)
-    except (ValueError, IndexError, KeyError, ZeroDivisionError) as error:
+    except (UserError, ValueError, IndexError, KeyError) as error:
         raise UserError(f"{where}: a bone or unit cannot be read ({error})") from None
     # Bones are numbered in the order of the hierarchy, in which parents must come first.
     parents = {"root": -1}
@@ -133,8 +133,6 @@ def _skeleton(text: bytes, where: str) -> _Skeleton:
                     "bone, has two parents, or comes before its parent"
                 )
             parents[child] = list(parents).index(line[0])
-    if not all(np.isfinite(bones[bone].end).all() for bone in parents):
-        raise UserError(f"{where}: a direction or length is not finite")
     return _Skeleton({bone: bones[bone] for bone in parents}, tuple(parents.values()), unit, degree)
 
 
@@ -154,22 +152,46 @@ def _sections(text: bytes) -> dict[str, list[list[str]]]:
 
 def _bones(sections: dict[str, list[list[str]]], unit: float, degree: float) -> dict[str, _Bone]:
     root = {line[0]: line[1:] for line in sections["root"]}
-    angles = tuple(degree * float(word) for word in root.get("orientation", ["0", "0", "0"]))
-    axis = (root.get("axis", ["XYZ"])[0].lower(), angles)
-    bones = {"root": _Bone(np.zeros(3), axis, tuple(word.lower() for word in root["order"]))}
+    axis = _axis([*root.get("orientation", ["0", "0", "0"]), root.get("axis", ["XYZ"])[0]], degree)
+    bones = {"root": _Bone(np.zeros(3), axis, _freedom(root["order"]))}
+    if not {"tx", "ty", "tz"} <= {*bones["root"].dof}:
+        raise ValueError("the root's order lacks one of TX, TY and TZ")
     fields: dict[str, list[str]] = {}
     # A bone ends where the next one's id begins; one more id ends the last.
     for line in [*sections["bonedata"], ["id"]]:
         if line[0] == "id" and fields:
-            direction = np.array([float(word) for word in fields["direction"][:3]])
-            length = unit * float(fields["length"][0])
-            *turns, order = fields["axis"]
-            dof = tuple(word.lower() for word in fields.get("dof", ()) if word.lower() != "l")
-            axis = (order.lower(), tuple(degree * float(word) for word in turns))
-            bones[fields["name"][0]] = _Bone(length * direction / np.linalg.norm(direction), axis, dof)
+            direction = np.array(_numbers(fields["direction"][:3], 3))
+            if not (far := float(np.linalg.norm(direction))):
+                raise ValueError(f"'{fields['name'][0]}' has no direction")
+            (length,) = _numbers(fields["length"][:1], 1)
+            dof = _freedom([word for word in fields.get("dof", ()) if word.lower() != "l"])
+            end = unit * length * direction / far
+            bones[fields["name"][0]] = _Bone(end, _axis(fields["axis"], degree), dof)
             fields = {}
         fields[line[0]] = line[1:]
     return bones
+
+
+def _numbers(words: list[str], count: int) -> tuple[float, ...]:
+    """So many numbers of words; `ValueError` for others."""
+    if len(words) != count:
+        raise ValueError(f"{count} numbers are expected, not '{' '.join(words):.60}'")
+    return tuple(number(word, "a number", LARGEST, -LARGEST) for word in words)
+
+
+def _axis(words: list[str], degree: float) -> tuple[str, tuple[float, ...]]:
+    """Order and angles in degrees of a bone's own frame, of the words behind `axis`."""
+    if sorted(words[-1].lower()) != ["x", "y", "z"]:
+        raise ValueError(f"'{words[-1]:.40}' is no order of X, Y and Z")
+    return words[-1].lower(), tuple(degree * angle for angle in _numbers(words[:-1], 3))
+
+
+def _freedom(words: list[str]) -> tuple[str, ...]:
+    """Degrees of freedom, each once."""
+    found = tuple(word.lower() for word in words)
+    if len({*found}) < len(found) or not {*found} <= {"rx", "ry", "rz", "tx", "ty", "tz"}:
+        raise ValueError(f"'{' '.join(words):.60}' are no degrees of freedom")
+    return found
 
 
 def _frames(text: bytes, bones: dict[str, _Bone], where: str) -> tuple[dict[str, Floats], int]:
@@ -184,19 +206,23 @@ def _frames(text: bytes, bones: dict[str, _Bone], where: str) -> tuple[dict[str,
     # The first frame says which bones move; all others must name the same, so that columns can be cut out.
     widths = [len(bones[bone].dof) for bone in moved]
     starts = np.cumsum([0, *(1 + width for width in widths)])
-    for number, words in enumerate(frames, 1):
+    for frame, words in enumerate(frames, 1):
         if len(words) != starts[-1] or [words[at] for at in starts[:-1]] != [bone.encode() for bone in moved]:
             raise UserError(
-                f"{where}: frame {number}: other bones or numbers than the first frame and the .asf say"
+                f"{where}: frame {frame}: other bones or numbers than the first frame and the .asf say"
             )
-    try:
-        table = {
-            bone: np.array([words[at + 1 : at + 1 + width] for words in frames], dtype=np.float64)
-            for bone, at, width in zip(moved, starts, widths, strict=False)
-        }
-    except ValueError as error:
-        raise UserError(f"{where}: {error}") from None
-    for bone, numbers in table.items():
-        if not np.isfinite(numbers).all():
-            raise UserError(f"{where}: bone '{bone}' has numbers that are not finite")
+    table: dict[str, Floats] = {}
+    for bone, at, width in zip(moved, starts, widths, strict=False):
+        rows = [words[at + 1 : at + 1 + width] for words in frames]
+        try:
+            table[bone] = np.array(rows, dtype=np.float64)
+        except ValueError:
+            table[bone] = np.array(np.nan)
+        if not (np.abs(table[bone]) <= LARGEST).all():  # false for NaN
+            found = ((frame, word) for frame, row in enumerate(rows, 1) for word in row)
+            frame, word = next((one for one in found if not is_number(one[1])), (1, b""))
+            raise UserError(
+                f"{where}: frame {frame}: bone '{bone}': '{shown(word)}' is not a finite number up to "
+                f"{LARGEST:g}"
+            )
     return table, len(frames)

@@ -15,13 +15,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, read_plain
 
 Floats = NDArray[np.float64]
 
 CHANNELS = ("Xposition", "Yposition", "Zposition", "Xrotation", "Yrotation", "Zrotation")
 MOST_JOINTS, MOST_NAME = 1000, 200
 """Joints of one figure, and characters of a joint's name. The richest rigs have hundreds of joints."""
+MAX_FILE_BYTES = 2**30
+"""A motion file beyond this is refused unread: a few hours of text, or a bomb."""
 LARGEST = 1e7
 """No length in millimetres and no angle in degrees is larger."""
 MISCOUNTED = 1
@@ -65,7 +67,7 @@ def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]
     else:
         where = name or str(source)
         try:
-            data = Path(source).read_bytes()
+            data = read_plain(Path(source), MAX_FILE_BYTES, where)
         except OSError as error:
             raise UserError(f"{where}: cannot read ({error.strerror})") from None
     if b"\r" in data:
@@ -91,7 +93,7 @@ def find_motion(data: bytes, where: str) -> MotionSection:
         )
     frames, fps = header.group(1), _frame_rate(header.group(2), where)
     if not frames.isdigit() or len(frames) > 12:
-        raise UserError(f"{where}: 'Frames: {_shown(frames)}' is not a whole number")
+        raise UserError(f"{where}: 'Frames: {shown(frames)}' is not a whole number")
     if int(frames) == 0:
         raise UserError(f"{where}: 'Frames: 0': the file has no frames")
     return MotionSection(marker.start(), header.end(), int(frames), fps)
@@ -102,10 +104,10 @@ def _frame_rate(text: bytes, where: str) -> float:
     try:
         exact = Decimal(text.decode("ascii", "replace"))
     except InvalidOperation:
-        raise UserError(f"{where}: 'Frame Time: {_shown(text)}' is not a number") from None
+        raise UserError(f"{where}: 'Frame Time: {shown(text)}' is not a number") from None
     if not exact.is_finite() or not Decimal("1e-5") < exact < 60:
         raise UserError(
-            f"{where}: 'Frame Time: {_shown(text)}' must be seconds a frame, above 0.00001 and below 60; "
+            f"{where}: 'Frame Time: {shown(text)}' must be seconds a frame, above 0.00001 and below 60; "
             "the frame rate would be meaningless"
         )
     fps = 1 / float(exact)
@@ -153,16 +155,22 @@ def read_values(data: bytes, start: int, frames: int, width: int, where: str) ->
     if len(values) == len(counts) * width and (np.abs(values) <= LARGEST).all():  # false for NaN
         return values.reshape(-1, width)
     for at, word in enumerate(body.split()):
-        if not _NUMBER.fullmatch(word) or not abs(float(word)) <= LARGEST:
+        if not is_number(word):
             row, column = divmod(at, width)
             raise UserError(
                 f"{where}: line {lines[row]}: frame {row}, channel {column} (from 0): "
-                f"'{_shown(word)}' is not a finite number up to {LARGEST:g}"
+                f"'{shown(word)}' is not a finite number up to {LARGEST:g}"
             )
     raise UserError(f"{where}: the motion block holds characters that are not numbers")
 
 
-def _shown(text: bytes) -> str:
+def is_number(word: bytes) -> bool:
+    """Whether a word of a file is a finite number up to `LARGEST`."""
+    return _NUMBER.fullmatch(word) is not None and abs(float(word)) <= LARGEST
+
+
+def shown(text: bytes) -> str:
+    """The beginning of a word, for messages."""
     return text[:40].decode("utf-8", "backslashreplace")
 
 
@@ -213,7 +221,7 @@ class _HierarchyParser:
                 line = raw.decode("utf-8")
             except UnicodeDecodeError as error:
                 raise self._error(
-                    f"'{_shown(raw.strip())}' is not UTF-8 text (byte {error.start + 1} of the line); "
+                    f"'{shown(raw.strip())}' is not UTF-8 text (byte {error.start + 1} of the line); "
                     "rename the joint or save the file as UTF-8"
                 ) from None
             for piece in re.findall(r"[{}]|[^{}]+", line):
@@ -284,11 +292,8 @@ class _HierarchyParser:
         return len(self.out.names) - 1
 
     def _offset(self, words: list[str]) -> list[float]:
-        try:
-            values = [float(word) for word in words[1:]]
-        except ValueError:
-            values = []
-        if len(values) != 3 or not (np.abs(values) <= LARGEST).all():
+        values = [float(word) for word in words[1:] if is_number(word.encode())]
+        if len(values) != 3 or len(words) != 4:
             raise self._error(f"'{' '.join(words)[:60]}' must be OFFSET and three finite numbers")
         return values
 
@@ -302,7 +307,9 @@ class _HierarchyParser:
                 f"joint '{joint}' declares CHANNELS {words[1]} but lists {len(names)} channel names"
             )
         if "" in names:
-            raise self._error(f"unknown channel '{words[2 + names.index('')]}'; known: {', '.join(CHANNELS)}")
+            raise self._error(
+                f"unknown channel '{words[2 + names.index('')][:40]}'; known: {', '.join(CHANNELS)}"
+            )
         if len(set(names)) != len(names):
             raise self._error(f"joint '{joint}' lists a channel twice")
         return tuple(names)

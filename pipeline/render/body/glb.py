@@ -273,13 +273,15 @@ def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
         animation = gltf.animations[0]
         stated = animation.extras["fps"]
 
-        def values(number: int) -> NDArray[np.float64]:
-            accessor = gltf.accessors[number]
+        def values(place: int) -> NDArray[np.float64]:
+            accessor = gltf.accessors[place]
             if accessor.componentType != _FLOAT:
                 raise ValueError("an animation of whole numbers")
             view = gltf.bufferViews[accessor.bufferView]
             start, width = (view.byteOffset or 0) + (accessor.byteOffset or 0), _WIDTHS[accessor.type]
             flat = np.frombuffer(blob, "<f4", accessor.count * width, start)
+            if not np.isfinite(flat).all():
+                raise ValueError("numbers that are not finite")
             return flat.reshape(-1, width).astype(np.float64)
 
         tracks = {

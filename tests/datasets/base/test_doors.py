@@ -13,6 +13,7 @@ import re
 import re._constants as sre
 import re._parser as sre_parser
 from collections.abc import Callable, Iterator
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -141,15 +142,15 @@ def test_text_becomes_a_number_at_the_door(folder: str) -> None:
             assert not bare or ast.unparse(node) in KNOWN, where
 
 
+REPEATS = (sre.MAX_REPEAT, sre.MIN_REPEAT, sre.POSSESSIVE_REPEAT)
+
+
 def slow_parts(pattern: str | bytes, flags: int, *, searched: bool) -> int:
     """Parts of a pattern that may look at the letters of a line once for each letter: a repeat at the start
     of one that is searched for, at any letter, and further repeats that take what the first one does.
     """
     parts = list(flat(sre_parser.parse(pattern, flags)))
-    endless = [
-        op in (sre.MAX_REPEAT, sre.MIN_REPEAT, sre.POSSESSIVE_REPEAT) and arg[1] is sre.MAXREPEAT
-        for op, arg in parts
-    ]
+    endless = [op in REPEATS and arg[1] is sre.MAXREPEAT for op, arg in parts]
     wide = 0
     for at, (_, arg) in enumerate(parts):
         if endless[at]:
@@ -157,6 +158,12 @@ def slow_parts(pattern: str | bytes, flags: int, *, searched: bool) -> int:
             after = parts[at + 1 : at + 2]
             any_but_one = kind is sre.NOT_LITERAL and after == [(sre.LITERAL, taken)]
             most = kind is sre.ANY or (kind is sre.IN and taken[0] == (sre.CATEGORY, sre.CATEGORY_NOT_SPACE))
+            # What one repeat may leave to the next, with nothing certain between them.
+            rest = list(takewhile(lambda part: part[0] in REPEATS and not part[1][0], parts[at + 1 :]))
+            shared = [
+                part for part in rest if part[1][1] is sre.MAXREPEAT and (most or [*part[1][2]] == [*arg[2]])
+            ]
+            wide += 2 * bool(shared and parts[at][0] is not sre.POSSESSIVE_REPEAT)
             wide += most or (kind is sre.NOT_LITERAL and not any_but_one)
     return (searched and endless[0] and len(parts) > 1) + max(0, wide - 1)
 
@@ -168,10 +175,10 @@ def flat(parsed: Any) -> Iterator[tuple[Any, Any]]:
 
 def test_no_pattern_looks_at_long_lines_once_for_each_letter() -> None:
     """By their form, without a clock: `_PLACE` is of words of the command line, `_HEADER` of two lines."""
-    for slow in (r".*[:|/]", r"\s+and", r"[^#].*#.*#\d", r"\S*/\S*"):
+    for slow in (r".*[:|/]", r"\s+and", r"[^#].*#.*#\d", r"\S*/\S*", r"@\d*-?\d*", r"_.+?(?:_\d+)*"):
         assert slow_parts(slow, 0, searched=True)
     seen = 0
-    for folder in ("convert", "motion", "text"):
+    for folder in ("audio", "convert", "motion", "text"):
         room = importlib.import_module(f"motionloom.datasets.{folder}")
         for found in pkgutil.walk_packages(room.__path__, f"{room.__name__}."):
             module = importlib.import_module(found.name)

@@ -26,10 +26,11 @@ from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.amass.smpl_npz import read_motion
 from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.convert.common.arrays import check_array_header
+from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
-from motionloom.datasets.motion.npz import NpzFile
+from motionloom.datasets.motion.npz import NpzFile, map_npy
 from motionloom.datasets.schema import Manifest, ShardInfo, UserError
 from motionloom.datasets.shards.index import read_index
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
@@ -74,6 +75,14 @@ def tar_of(path: Path, clips: int) -> Path:
     return path
 
 
+def long_name(path: Path, size: int) -> Path:
+    info = tarfile.TarInfo()
+    info.type, info.size = tarfile.GNUTYPE_LONGNAME, size
+    path.write_bytes(info.tobuf(tarfile.GNU_FORMAT))
+    os.truncate(path, 2 * size)
+    return path
+
+
 def device(folder: Path) -> Path:
     (folder / "manifest.json").symlink_to("/dev/zero")
     return folder
@@ -83,7 +92,7 @@ ONE = [ShardInfo(name="x-train-000000.tar", split="train", samples=1, frames=9, 
 PIPED: tuple[Callable[[Path], object], ...] = (
     Manifest.load_json, JointMap.load, scan_tar, NpzFile, read_clip, read_sound,
     lambda path: BodyModel.load(path, "smpl22"), lambda path: Captions.read([path]).rows,
-    lambda path: check_array_header(path, width=1),
+    lambda path: check_array_header(path, width=1), read_bvh, map_npy, FeatureStats.load,
 )  # fmt: skip
 HOSTILE: dict[str, Callable[[Path], object]] = {
     "an index that declares 64 MiB for one clip": lambda f: read_index(index_of((2**24,)), "i", "train", ONE),
@@ -91,6 +100,7 @@ HOSTILE: dict[str, Callable[[Path], object]] = {
     **{f"a pipe {number}": lambda f, read=read: read(pipe(f / "x")) for number, read in enumerate(PIPED)},
     "a manifest of a terabyte": lambda f: load_manifest(huge(f / "manifest.json").parent),
     "captions that are a device": lambda f: Captions.read([Path("/dev/zero")]).rows,
+    "a shard whose next name takes 8 GiB": lambda f: scan_tar(long_name(f / "x.tar", 2**33)),
     "a shard of too many clips": lambda f: scan_tar(tar_of(f / "x.tar", MOST_CLIPS + 1)),
     "a shard of more clips than its manifest has": lambda f: scan_tar(tar_of(f / "x.tar", 9), most=8),
     "3,000 nested joints": lambda f: read_bvh(nested(3_000)),
