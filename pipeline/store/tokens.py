@@ -98,7 +98,7 @@ class TokenStore:
         if set(codes) != set(per_group):
             raise UserError(f"{path}: holds streams {sorted(codes)}, the tokenizer has {sorted(per_group)}")
         # Clips lie one after the other, and together they are all that is there.
-        fits = (starts.dtype, whole.dtype) == (np.int64, np.bool_) and starts.shape == (len(whole) + 1,)
+        fits = starts.dtype == np.int64 and whole.dtype == np.bool_ and starts.shape == (len(whole) + 1,)
         fits = fits and starts[0] == 0 and bool((np.diff(starts) > 0).all())
         for name, flat in codes.items():
             fits = fits and flat.shape == (starts[-1] * per_group[name],) and bool((flat >= 0).all())
