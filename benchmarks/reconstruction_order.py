@@ -1,18 +1,16 @@
 """H2VQ against RVQ at equal bits, and at equal bits and parameters (HumanTOMATO Tables 3 and 7).
 
-    python benchmarks/reconstruction_order.py make SHARDS clips.npz   # once: an array file of 19 MB
-    python benchmarks/reconstruction_order.py train clips.npz WORK --minutes 3.3
-    python benchmarks/reconstruction_order.py train clips.npz WORK --device cpu --width 96 --batch 16
-    python benchmarks/reconstruction_order.py table WORK --record tokenizers_real
+    python benchmarks/reconstruction_order.py clips.npz WORK --shards SHARDS --device cpu
+    python benchmarks/reconstruction_order.py clips.npz WORK --minutes 3.3
 
-The bodies are real (SHARDS holds `body133` clips), the hands synthetic: each clip's two hands take a random
-shape each, on the recorded forearms. All three tokenizers of a seed see the same windows. They train side by
-side in one process; on a GPU each step is one CUDA graph on a stream of its own, and where graphs cannot be
-captured every training gets a process. Features, losses and optimizer are the paper's: standard deviations
-averaged over each kind of column, squared error, AdamW, bf16 on a GPU; the rate is constant after a warm-up,
-so that a figure at a step does not depend on how long the training was meant to be. The test windows are
-measured at fixed steps and at the end; each figure is appended to WORK/rows.jsonl at once, so what was
-reached is kept.
+`--shards` makes clips.npz, an array file of 19 MB, where it is missing. The bodies are real (SHARDS holds
+`body133` clips), the hands synthetic: each clip's two hands take a random shape each, on the recorded
+forearms. All three tokenizers of a seed see the same windows. They train side by side in one process; on a
+GPU each step is a CUDA graph on a stream of its own. Features, losses and optimizer are the paper's: standard
+deviations averaged over each kind of column, squared error, AdamW, bf16 on a GPU. The rate is constant after
+a warm-up, so that a figure at a step does not depend on how long the training was meant to be. The test
+windows are measured at fixed steps and at the end; each figure is appended to WORK/rows.jsonl at once, so
+what was reached is kept.
 """
 
 from __future__ import annotations
@@ -20,11 +18,9 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import subprocess
-import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -78,16 +74,15 @@ def whole_bodies(shards: Path, split: str) -> Iterator[NDArray[np.int16]]:
         yield np.round(joints / UNIT).astype(np.int32).astype(np.int16)
 
 
-def make(args: argparse.Namespace) -> None:
+def make(shards: Path, file: Path) -> None:
     """Write the joints of all clips as changes between frames, low and high bytes apart, to pack well."""
     arrays: dict[str, Any] = {}
     for split in ("train", "test"):
-        clips = list(whole_bodies(args.shards, split))
+        clips = list(whole_bodies(shards, split))
         steps = np.diff(np.concatenate(clips), axis=0, prepend=np.int16(0))
         arrays[f"{split}_frames"] = [len(clip) for clip in clips]
         arrays[f"{split}_bytes"] = np.moveaxis(steps.view(np.uint8).reshape(*steps.shape, 2), -1, 0)
-    np.savez_compressed(args.file, **arrays)
-    print(f"{args.file}: {args.file.stat().st_size / 2**20:.1f} MiB")
+    np.savez_compressed(file, **arrays)
 
 
 def read(file: Path, split: str) -> list[NDArray[np.float32]]:
@@ -255,19 +250,13 @@ def train(args: argparse.Namespace) -> None:
     """Train side by side until the steps or the minutes are over."""
     begin = time.monotonic()
     args.work.mkdir(parents=True, exist_ok=True)
-    chosen = [(arm, seed) for seed in args.seeds for arm in args.arms]
     data = Data(args.file, torch.device(args.device))
-    if not args.eager:
-        for title, motion in (("nearest training window", data.nearest()), ("mean pose", 0 * data.test)):
-            write(args, {"arm": title, "seed": 0, "step": 0, **data.errors(motion)})
-    trainings = [Training(arm, seed, data, args) for arm, seed in chosen]
-    if args.device == "cuda" and not args.eager:
-        try:
-            for training in trainings:
-                training.capture()
-        except RuntimeError as error:
-            print(f"no graphs, so a process for each: {error}", flush=True)
-            return apart(args, chosen, begin)
+    for title, motion in (("nearest training window", data.nearest()), ("mean pose", 0 * data.test)):
+        write(args, {"arm": title, "seed": 0, "step": 0, **data.errors(motion)})
+    trainings = [Training(arm, seed, data, args) for seed in args.seeds for arm in ARMS]
+    if args.device == "cuda":
+        for training in trainings:
+            training.capture()
     while (step := int(trainings[0].count)) < args.steps:
         border = min(mark for mark in (*MARKS, args.steps) if mark > step)
         for done in range(step, min(border, args.steps)):
@@ -285,17 +274,6 @@ def train(args: argparse.Namespace) -> None:
             training.measure(seconds)
         if seconds > 60 * args.minutes:
             break
-
-
-def apart(args: argparse.Namespace, chosen: Iterable[tuple[str, int]], begin: float) -> None:
-    """The same trainings without graphs, a process for each."""
-    command = [sys.executable, *sys.argv, "--eager", "--minutes"]
-    left = str(args.minutes - (time.monotonic() - begin) / 60)
-    started = [
-        subprocess.Popen([*command, left, "--arms", arm, "--seeds", str(seed)]) for arm, seed in chosen
-    ]
-    for process in started:
-        process.wait()
 
 
 def table(args: argparse.Namespace) -> None:
@@ -323,28 +301,22 @@ def table(args: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = command_line(__doc__)
-    commands = parser.add_subparsers(required=True)
-    making, training, showing = (commands.add_parser(f.__name__) for f in (make, train, table))
-    making.add_argument("shards", type=Path)
-    training.add_argument("file", type=Path)
-    making.add_argument("file", type=Path)
-    for command in (training, showing):
-        command.add_argument("work", type=Path)
-    showing.add_argument("--record", help="write benchmarks/records/NAME.json")
-    training.add_argument("--minutes", type=float, default=60.0, help="training ends after so many")
-    training.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
-    training.add_argument("--steps", type=int, default=10_000)
-    training.add_argument("--batch", type=int, default=64)
-    training.add_argument("--width", type=int, default=256)
-    training.add_argument("--depth", type=int, default=2)
-    training.add_argument("--lr", type=float, default=4e-4)
-    training.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS))
-    training.add_argument("--seeds", type=int, nargs="+", default=[7, 8, 9])
-    training.add_argument("--eager", action="store_true", help="no CUDA graphs")
-    for command, call in ((making, make), (training, train), (showing, table)):
-        command.set_defaults(call=call)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--shards", type=Path, help="make the file of these clips, if it is missing")
+    parser.add_argument("--minutes", type=float, default=60.0, help="training ends after so many")
+    parser.add_argument("--device", choices=("cuda", "cpu"), default="cuda")
+    parser.add_argument("--steps", type=int, default=10_000, help="0 prints the table of what was measured")
+    for name, value in (("--batch", 64), ("--width", 256), ("--depth", 2)):
+        parser.add_argument(name, type=int, default=value)
+    parser.add_argument("--lr", type=float, default=4e-4)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[7, 8, 9])
     args = arguments(parser)
-    args.call(args)
+    if args.shards is not None and not args.file.is_file():
+        make(args.shards, args.file)
+    if args.steps:
+        train(args)
+    table(args)
 
 
 if __name__ == "__main__":
