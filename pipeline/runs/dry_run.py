@@ -197,7 +197,7 @@ def say_estimate(
                 console.print(str(error), markup=False)
             return
     cards = estimate(recipe, trained, todo or (), measure=measure)
-    if unknown := [name for name in trained if name not in cards]:
+    if todo is not None and (unknown := [name for name in trained if name not in cards]):
         console.print(f"not measured yet: {', '.join(unknown)}; --sizes says what they take", markup=False)
     if not cards:
         return
@@ -225,7 +225,7 @@ class Replaced:
     why: str
     trained: bool
     seconds: float | None
-    """From its `timing.json`, None where none was noted; of an unfinished training by its telemetry."""
+    """From its `timing.json`, of a training by its telemetry too; None where none was noted."""
     goes_on: str = ""
     """How it would go on with `--go-on`, in words; "" where it cannot."""
 
@@ -245,6 +245,8 @@ def replaced_stages(run: Path, plan: Sequence[PlannedStage]) -> list[Replaced]:
             continue
         if Artifact.find(folder) is not None:
             seconds = _seconds(folder)
+            if trained and (whole := seconds_trained(folder)):  # the noted time is of the last process alone
+                seconds = max(seconds or 0.0, whole)
             guarded = trained or (seconds or 0.0) >= LONG_SECONDS
         else:
             seconds = seconds_trained(folder)

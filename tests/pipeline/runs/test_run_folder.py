@@ -193,6 +193,9 @@ def test_ten_minutes_of_a_training_that_is_not_finished_are_guarded(go: Go, tmp_
         go("gpt.add=5")
     assert files(tmp_path / "run") == before
     assert "3 of 9 " in go("gpt.add=5", replace=True)
+    write_text(tmp_path / "run/stages/gpt/flight/rank_0.jsonl", row + "\n")
+    with pytest.raises(UserError, match="1 stage, 10 min"):  # finished, and the last process was short
+        go("gpt.add=6")
 
 
 def test_options_that_contradict_each_other_and_that_do_not(go: Go) -> None:
