@@ -11,7 +11,8 @@ import time
 import pytest
 
 PROGRAM = """
-import time
+import signal, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the tests run in the background
 from motionloom.datasets.base.pool import Workers
 if __name__ == "__main__":
     with Workers(2) as workers:
