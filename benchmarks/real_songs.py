@@ -2,6 +2,7 @@
 
     python benchmarks/real_songs.py MODEL song.ogg another.mp3 third.wav
     python benchmarks/real_songs.py MODEL songs... --train SHARDS --record real_songs
+    python benchmarks/real_songs.py MODEL songs... --measures --record song_measures
 
 Stretches of every song are danced to, from several seeds. The beats are those of a file beside the song
 (`song.beats`, a line of seconds each) or librosa's of the whole song, whatever the model itself hears, and no
@@ -18,6 +19,9 @@ the nearest of the dance's), at 60 frames a second.
   recorded dances that are chosen at random (1 is as varied as a medley of them).
 - *skating*: share of steps in which a foot slides.
 
+With `--measures` the dances are judged by another measure too (librosa's beats as they are, minima of the
+speed at 20 frames a second without smoothing, shifts by any time), one change at a time.
+
 Rivals: a recorded training dance stretched to the tempo of our tracker with its beats on the song's and
 repeated, a random training dance, and standing still.
 """
@@ -32,6 +36,7 @@ from pathlib import Path
 import numpy as np
 from bench import Column, arguments, command_line, report
 from numpy.typing import NDArray
+from scipy.signal import argrelextrema
 from scipy.stats import spearmanr
 
 from motionloom.datasets.audio.features import beats as librosa_beats
@@ -209,24 +214,74 @@ def figures(
     return out
 
 
+MEASURES: dict[str, dict[str, float]] = {
+    "ours": {},
+    "20 frames a second": {"fps": 20.0},
+    "speed not smoothed, 20 frames a second": {"fps": 20.0, "smoothed": 0.0},
+    "librosa's beats as they are": {"late": LATE},
+    "shifts by any time, 200": {"room": 30.0, "shifts": 200},
+    "beats that the model hears": {"heard": 1.0},
+    "the other measure": {"fps": 20.0, "smoothed": 0.0, "late": LATE, "room": 30.0, "shifts": 200},
+}
+"""Changes of our measure: the dance's frames a second, its speed smoothed or not, seconds that the beats are
+later, the range of the shifts (of one beat where none is named) and their number, and whose beats."""
+
+
+def measured(
+    parts: Sequence[Stretch], dances: Sequence[Array], danced_at: float, seed: int, **how: float
+) -> float:
+    """The score over that of shifted beats by a changed measure."""
+    rng, own, moved = np.random.default_rng(seed), list[float](), list[float]()
+    for part, dance in zip(parts, dances, strict=True):
+        rate = how.get("fps", RATE)
+        joints = resample(dance[:, :BODY_JOINTS], danced_at, rate)
+        danced = motion_beats(joints, rate)
+        if how.get("smoothed") == 0:
+            speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).mean(1)
+            danced = argrelextrema(speed, np.less)[0] / rate
+        beats = (part.heard if "heard" in how else part.beats) + how.get("late", 0.0)
+        moves = rng.uniform(0, how.get("room", part.beat), int(how.get("shifts", SHIFTS)))
+        own.append(score(beats, danced, False))
+        later = [np.sort((beats + move) % part.sound.seconds) for move in moves]
+        moved.append(float(np.mean([score(one, danced, False) for one in later])))
+    return float(np.mean(own) / np.mean(moved))
+
+
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("model", help="a run, an export, or a model of the package")
     parser.add_argument("songs", type=Path, nargs="+")
-    parser.add_argument("--train", type=Path, required=True, help="shards of dances that it was trained on")
+    parser.add_argument("--train", type=Path, help="shards of dances that it was trained on")
+    parser.add_argument("--measures", action="store_true", help="compare measures on its dances")
     parser.add_argument("--stretches", type=int, default=4, help="of each song, at most")
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--late", type=float, default=LATE, help="seconds that librosa's beats are late")
     parser.add_argument("--seeds", type=int, default=3)
     args = arguments(parser)
     model = MotionModel.from_pretrained(args.model)
-    training = Training(ShardDataset.open(args.train, "train"))
     parts = [part for song in args.songs for part in stretches(song, args.stretches, args.seconds, args.late)]
     sounds = [part.sound for part in parts]
 
     def generated(seed: int) -> list[Array]:
         made = model.generate(sounds=sounds, seconds=[sound.seconds for sound in sounds], seed=seed)
         return [np.asarray(motion.joints, np.float64) for motion in made]
+
+    if args.measures:
+        made = [generated(seed) for seed in range(args.seeds)]
+        rows_of = {"all": parts} | {
+            song.stem: [p for p in parts if p.song == song.name] for song in args.songs
+        }
+        found = []
+        for title, how in MEASURES.items():
+            cells: dict[str, list[float]] = {}
+            for name, some in rows_of.items():
+                for seed, dances in enumerate(made):
+                    own = [dance for part, dance in zip(parts, dances, strict=True) if part in some]
+                    cells.setdefault(name, []).append(measured(some, own, model.fps, seed, **how))
+            found.append({"title": title, "cells": cells, "seeds": list(range(args.seeds))})
+        report("Own over shifted, by two measures", [Column(n, n, 2) for n in rows_of], found, args.record)
+        return
+    training = Training(ShardDataset.open(args.train, "train"))
 
     def rival(make: Callable[[Stretch, np.random.Generator], Array]) -> Callable[[int], list[Array]]:
         return lambda seed: [make(part, np.random.default_rng([seed, k])) for k, part in enumerate(parts)]
