@@ -54,7 +54,7 @@ UNIT = 5e-4
 CLIPS = 1600
 """Clips of a split that are looked at."""
 ARMS = ("H2VQ", "RVQ, 3 levels", "RVQ, 3 levels, as many parameters")
-MARKS = (625, 1250, 2500, 5000, 10000)
+MARKS = (2500, 5000, 10000)
 """Steps at which the test windows are measured."""
 FINGERS = {"left": (20, range(22, 37)), "right": (21, range(37, 52))}
 """Wrist and finger joints of each hand."""
@@ -283,7 +283,7 @@ def table(args: argparse.Namespace) -> None:
     for line in lines:
         row = json.loads(line)
         found[row["arm"]][row["step"]].append(row)
-    marks = [m for m in sorted(found[ARMS[0]]) if len({len(found[a][m]) for a in ARMS}) == 1]
+    marks = [m for m in sorted(found[ARMS[0]]) if m in MARKS and len({len(found[a][m]) for a in ARMS}) == 1]
     rows = []
     for arm, at in found.items():
         last = at.get(marks[-1]) or at[0]

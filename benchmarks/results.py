@@ -25,8 +25,6 @@ from motionloom.pipeline.evaluation.figures import (
     MODEL,
     NEAREST_MUSIC,
     NEAREST_WORDS,
-    OTHER_MUSIC,
-    RANDOM_DANCE,
     RECORDED,
     FigureFile,
 )
@@ -78,14 +76,6 @@ def _of(prefix: str, stages: Mapping[str, str], answers: Mapping[str, str]) -> d
     return rows | {title: (first, row) for title, row in answers.items()}
 
 
-DANCES = {
-    "recorded dances": RECORDED,
-    "**generated from its music**": MODEL,
-    "the same under other music": OTHER_MUSIC,
-    "dance to the nearest training music": NEAREST_MUSIC,
-    "random training dance": RANDOM_DANCE,
-}
-
 TABLES = {
     "rivals": Table(
         "Captions, whole bodies: Table 1",
@@ -106,29 +96,6 @@ TABLES = {
         _of("", RIVALS_MUSIC, {"recorded": RECORDED, "nearest training music": NEAREST_MUSIC}),
         MUSIC,
     ),
-    "dances": Table(
-        "Dances to unheard played songs",
-        {title: ("evaluate_dances", row) for title, row in DANCES.items()},
-        (
-            Column("Beat Align (UDE)", "beat_align.bailando", 3),
-            Column("tempo within five percent", "recognition.tempo", 2),
-            Column("genre", "recognition.genre", 2),
-            Column("skating", "feet.skating", 3),
-            *TEXT[1:3],
-        ),
-    ),
-    "mocap_cmu": Table(
-        "CMU's clips and words: UDE",
-        _of("", {"generated": "evaluate"}, ANSWERS),
-        (
-            Column("R@1 among {candidates}, text to motion", "tma.t2m_r1", 2),
-            Column("Matching", "tma.matching_score", 2),
-            Column("FID (TMA)", "tma.fid", 0),
-            Column("FID_k", "movement.fid_k", 0),
-            Column("skating, %", "physics.skating", 1, 100),
-            Column("jitter", "physics.jitter", 1),
-        ),
-    ),
     "ude_codebook": Table(
         "Codebooks of 512 codes, 1,000 steps of 32 windows",
         {
@@ -146,13 +113,8 @@ TABLES = {
         ),
     ),
     "ude_variants_text": Table("Tables 3 to 5, captions", _of("text_", VARIANTS, ANSWERS), TEXT),
-    "ude_variants_music": Table(
-        "Tables 3 to 5, music", _of("music_", VARIANTS, {"recorded": RECORDED}), MUSIC
-    ),
 }  # fmt: skip
 COMMANDS = {
-    "dances": "motionloom run ude-dance",
-    "mocap_cmu": "motionloom run mocap-cmu",
     "rivals": "motionloom run baselines-tiny",
     **dict.fromkeys(("rivals_ude_text", "rivals_ude_music"), "motionloom run baselines-tiny-ude"),
 }

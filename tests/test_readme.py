@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jsonschema
 import pytest
 import typer
 import yaml
@@ -285,35 +284,3 @@ def said(script: str, environment: dict[str, str]) -> list[str]:
     )
     shown = subprocess.run(["sh", "-c", echo], env=environment, capture_output=True, text=True, check=True)
     return shown.stdout.split()
-
-
-def test_kubernetes_knows_every_key() -> None:
-    """By the types of its Python client, which are made of the published schema."""
-    client = pytest.importorskip("kubernetes.client")
-
-    def check(value: Any, kind: str) -> Any:
-        if inner := re.fullmatch(r"[Ll]ist\[(.+)\]", kind):
-            return [check(one, inner[1]) for one in value]
-        if inner := re.fullmatch(r"[Dd]ict[\[(]str, (.+)[\])]", kind):
-            return {key: check(one, inner[1]) for key, one in value.items()}
-        model = getattr(client, kind, None)
-        if model is None:
-            assert type(value).__name__ == kind or kind == "object", (value, kind)
-            return value
-        names = {key: name for name, key in model.attribute_map.items()}
-        return model(
-            **{names[key]: check(one, model.openapi_types[names[key]]) for key, one in value.items()}
-        )
-
-    for job in documents("convert-job"):
-        assert check(job, "V1Job").spec.template.spec.volumes
-    with pytest.raises(KeyError):
-        check({"spec": {"completion": 8}}, "V1Job")
-
-
-@pytest.mark.parametrize("name", ["convert-sky", "skypilot"])
-def test_skypilot_knows_every_key(name: str) -> None:
-    schemas = pytest.importorskip("sky.utils.schemas")
-    for task in documents(name):
-        jsonschema.validate(task, schemas.get_task_schema())
-        jsonschema.validate(task.get("resources", {}), schemas.get_resources_schema())

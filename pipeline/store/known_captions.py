@@ -35,7 +35,7 @@ FALSE_ALARMS = 0.01
 
 COUNT = 1024
 """Number of representative captions of each kind, of bodies and of faces. 384 of 48,834 captions lay too far
-apart: of 100 motions that did as was said 21 had a note, with these 13 (`benchmarks/known_words.py`)."""
+apart: of 100 motions that did as was said 21 had a note, with these 13."""
 
 _ROUNDING = 1e-3
 """Cosine distance that a caption may have from itself: embeddings are kept in half precision. Where every
