@@ -71,7 +71,8 @@ def test_what_a_text_names_can_be_given(path: Path) -> None:
     keys += re.findall(r"(?<![\w./-])(?:hardware|train|optim)\.[a-z_]+\b(?!\.)(?<!\.txt)(?<!\.frames)", text)
     for code in (" ".join(code.split()) for code in re.findall(r"(?<!`)`([^`]+)`(?!`)", text)):
         if script := re.search(r"benchmarks/\w+\.py", code):
-            known |= set(re.findall(r'"(--[a-z-]+)"', (ROOT / script[0]).read_text(encoding="utf-8")))
+            code = "".join((ROOT / one).read_text() for one in (script[0], "benchmarks/bench.py"))
+            known |= set(re.findall(r'"(--[a-z-]+)"', code))
             continue
         named = re.sub(r"convert ((?=--)|[A-Z…][A-Z…-]*)", "convert bvh ", code.removeprefix("motionloom "))
         own = [options for words, options in COMMANDS.items() if f"{named} ".startswith(f"{words} ")]
