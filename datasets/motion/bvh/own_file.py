@@ -153,7 +153,7 @@ def own_rows(
     count = clip_rows if seconds is None else max(1, round(seconds * rate))
     row = np.arange(-round(lead / fps * rate), count)
     at = np.clip((row / rate * fps + lead).round(6), 0, len(kept) - 1)
-    kept = kept[np.floor(at).astype(int)] & kept[np.ceil(at).astype(int)]
+    kept = kept[np.floor(at).astype(int)]  # a frame stands for the time until the next one
     return np.clip(row, 0, clip_rows - 1), at, kept & ((row >= 0) & (row < clip_rows))[:, None]
 
 
