@@ -21,7 +21,8 @@ from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.schema import UserError
 
 _FADE = 0.25
-"""Seconds in which made joints leave the file's, from which the model's figure is millimetres away."""
+"""Seconds in which made joints leave the file's, from which the model's figure is millimetres away; more
+between frames, where kept rows go on for part of one."""
 _HELD, _LOOSE, _PRIOR = 1e3, 1e-4, 1e-6
 """Weights of joints that stay, of those that the map does not name, and of no turn against the bones."""
 _FRAMES = re.compile(rb"(Frames[ \t]*:[ \t]*)\S+", re.IGNORECASE)

@@ -134,7 +134,6 @@ LINE = '{"id": "a", "captions": ["x"]}'
 BROKEN = [  # (file, content, line or record, and key)
     ("c.jsonl", LINE + '\n{"id": "b" "caption": "x"}', ":2:"),
     ("c.jsonl", '{"id": "a", "caption": "x", "start": 3, "end": 2}', ":1: 'caption'"),
-    ("c.json", '{"id": "a", "caption": "y", "id": "z"}', ":1:"),
     ("c.csv", 'name,caption\na,x\nb,"he walks\nc,z\n', ":3:"),
     ("c/a.txt", "walks#a/DET#0.0#0.0\njumps#a/DET#0.0", ":2: 3 of the 4"),
     ("c.jsonl", "é walks\r\nà l".encode() + b"\xe9ger", ":2:"),
