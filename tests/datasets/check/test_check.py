@@ -24,6 +24,7 @@ from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards import sample as sample_module
+from motionloom.datasets.shards import tar as shards
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.tar import scan_tar
@@ -101,16 +102,14 @@ def test_the_same_motion_twice(tmp_path: Path) -> None:
 def test_many_recordings_in_two_splits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A shard's directory is read once for its clips and once for its index, whatever is compared; and many
-    findings are one sentence that shows the first of them.
-    """
+    """A shard's headers are read for its clips and its index; many findings are one sentence on the first."""
     motions = [features(seed) * np.float32(1 + 1e-6 * copy) for copy in range(2) for seed in range(7)]
     halves: list[Split] = ["train"] * 7 + ["test"] * 7
     pairs = enumerate(zip(halves, motions, strict=True))
     made = [Made(f"c{at:02d}", split, motion) for at, (split, motion) in pairs]
     report_on(tmp_path, *made)
-    read, whole = Counter[str](), tarfile.open
-    monkeypatch.setattr(tarfile, "open", lambda p, **how: (read.update([Path(p).name]), whole(p, **how))[1])
+    read, whole = Counter[str](), shards._entries
+    monkeypatch.setattr(shards, "_entries", lambda *of: (read.update([of[0].name]), whole(*of))[1])
     assert app(["data", "check", str(tmp_path)], standalone_mode=False) == 1
     assert set(read.values()) == {2} and len(read) == 2
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "same recording" in line]
@@ -252,7 +251,7 @@ def test_cut_joined_and_packed_shards(tmp_path: Path) -> None:
     for content, word in (
         (b"", "0 bytes"),
         (whole + whole, "two archives"),
-        (whole[:header] + b"damage" * 20 + whole[header + 120 :], "are no tar entries"),
+        (whole[:header] + b"damage" * 20 + whole[header + 120 :], "in the header at byte"),
         (gzip.compress(whole), "not a readable tar"),
         (whole[: header + 700], "the last whole key is 'a'"),
     ):

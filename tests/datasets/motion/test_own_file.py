@@ -63,7 +63,7 @@ def test_kept_rows_stay_text_and_made_rows_pose_the_joints(seed: int, up: str, a
     assert np.flatnonzero(~np.array(same)).tolist() == list(range(added + 51, added + 96))
     found = made.joint_map.apply(made.motion, unit=own.unit, up=own.up)[added::3]
     away = np.linalg.norm(found - joints, axis=-1).max(axis=1)
-    assert np.delete(away, slice(17, 22)).max() < 0.003 and away.max() < 0.1, "behind kept rows"
+    assert np.delete(away, slice(17, 22)).max() < 0.003 and away.max() < 0.2, "behind kept rows"
     # Kept legs keep their numbers in every row, where they are the file's.
     legs = kept | np.isin(np.arange(22), [0, 1, 2, 4, 5, 7, 8, 10, 11])
     legs_made = own.edited(joints, 20.0, 0, legs, None).motion
