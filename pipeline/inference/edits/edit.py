@@ -211,7 +211,7 @@ def report_of(frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[
     for (frame, joint), pin in zip(frames.pins, frames.task.pins, strict=True):
         if joint < count:  # not fingers of a file that has none
             miss = np.linalg.norm(joints[frame, joint] - pin.position - np.array([0, frames.base, 0]))
-            pins[f"{names[joint]} at {(frame - frames.lead) / fps:.2f} s"] = 100 * float(miss)
+            pins[f"{names[joint]} at {(frame - frames.lead) / fps:.2f} s"] = 100 * miss.item()
     way = np.gradient(root) * fps
     walks = on_path & (np.abs(way) > WALKS)
     aside = np.abs(np.angle(way * np.exp(-1j * facing(joints))))[walks]
