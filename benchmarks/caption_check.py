@@ -76,7 +76,7 @@ CAPTIONS = {
 
 
 def obeyed(bundle: Bundle, samples: int, sampling: SamplingConfig | None = None) -> dict[str, int]:
-    """Of so many motions for each caption, how many do what it says."""
+    """Return how many of so many motions for each caption do what it says."""
     return {
         caption: sum(
             BY_CONTENT[content](motion.joints, bundle.layout.fps)

@@ -1,4 +1,4 @@
-"""What a page, a message or a help text names can be given: options, commands, settings, recipes, memory."""
+"""Options, commands, settings, recipes and memory that a page, a message or a help text names are there."""
 
 from __future__ import annotations
 

@@ -45,9 +45,9 @@ class OwnBvh:
     added: int
     """Frames in front that are no motion."""
     mark: bytes = b""
-    """What stands in front of the text: a byte order mark."""
+    """Bytes in front of the text: a byte order mark or none."""
     ends: bytes = b"\n"
-    """What its lines end with."""
+    """Line end."""
 
     @property
     def file(self) -> bytes:
@@ -145,8 +145,8 @@ class OwnBvh:
 def own_rows(
     clip_rows: int, rate: float, fps: float, lead: int, kept: Mask, seconds: float | None
 ) -> tuple[Rows, Floats, Mask]:
-    """Of each row of a result at a file's rate: the file's row that it comes from, its place among the frames
-    of the result, and which joints are kept in it [R, N].
+    """Return, for each row of a result at a file's rate, the file's row that it comes from, its place among
+    the frames of the result, and which joints are kept in it [R, N].
 
     Args:
         kept: Joints that are kept in each frame [T, N], at `fps`.
