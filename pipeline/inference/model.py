@@ -251,7 +251,8 @@ def edit_clip(
             figure, fps = own_figure(clip, frames, figure), clip.fps
         # What is said is of the joints that a file holds.
         rounded = figure.joints.astype(np.float32) + np.array([0, frames.base, 0])
-        joints = frames.of_file(rounded, fps) if bvh is None else frames.of_file(bvh.places(), bvh.motion.fps)
+        rate = fps if bvh is None else bvh.motion.fps
+        joints = frames.of_file(rounded if bvh is None else bvh.places(), rate)
         if words and frames.pieces[:, : PIECES.index("left_hand")].all():
             made_anew = ~frames.pieces[frames.inside][:, piece_joints(layout)[: joints.shape[1]]]
             if joints.shape == frames.seen.shape and made_anew.any():
@@ -259,7 +260,7 @@ def edit_clip(
                 notes.append(f"hands alone are made anew: by {100 * moved:.1f} cm on average")
         edited = EditedMotion(
             prompt, features, figure.joints, face, layout, seed=seed, original=original, bvh=bvh,
-            report=report_of(frames, joints, heading), remarks=(*frames.remarks, *notes),
+            report=report_of(frames, joints, heading, rate), remarks=(*frames.remarks, *notes),
         )  # fmt: skip
         out.append(_drawn(edited, figure, fps))
     return out

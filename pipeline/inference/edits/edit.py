@@ -186,9 +186,11 @@ def _made_root(frames: EditFrames, made: NDArray[np.float32]) -> RootPath:
     return RootPath(heading - heading[first] + anchor.heading[0], anchor.place[0] + away)
 
 
-def report_of(frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[np.float64]) -> EditReport:
-    """How near a result is to its task, by the joints [T, M, 3] of its file, and headings [T], in the clip's
-    world.
+def report_of(
+    frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[np.float64], rate: float
+) -> EditReport:
+    """How near a result is to its task, by the joints [T, M, 3] of its file of some `rate`, and headings [T],
+    in the clip's world.
     """
     fps, inside, count = frames.layout.fps, frames.inside, min(joints.shape[1], frames.seen.shape[1])
     joints = joints[:, :count]
@@ -200,6 +202,8 @@ def report_of(frames: EditFrames, joints: NDArray[np.float64], heading: NDArray[
     kept = frames.pieces[inside].copy()
     kept[:, 4:6] &= kept[:, 2:4]
     kept = kept[:, pieces] & (rooted | kept[:, pieces][:, parents])
+    # A frame that lies between two rows of the file is the clip's where the one before it is kept, too.
+    kept[1:] &= kept[:-1] | (frames.rows(rate)[inside] % 1 == 0)[1:, None]
     back = frames.clip_root.heading + frames.turn - heading[inside]
     back = Rotation.from_euler("y", back[:, None]).as_matrix()
     bones = np.einsum("tij,tnj->tni", back, joints[inside] - joints[inside][:, parents])

@@ -129,11 +129,15 @@ class EditFrames:
         """A figure in the clip's world."""
         return moved(figure, self.turn, self.origin, self.height)
 
-    def of_file(self, joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
-        """Joints [R, M, 3] of a file of the result, in the result's frames [T, M, 3]."""
+    def rows(self, fps: float) -> NDArray[np.float64]:
+        """Places [T] of the result's frames among the rows of a file of it."""
         first = round(self.lead / self.layout.fps * fps)
         at = (np.arange(self.frames) - self.lead) / self.layout.fps * fps + first
-        return between_rows(joints, at.round(6).clip(0, len(joints) - 1))
+        return np.asarray(at.round(6))
+
+    def of_file(self, joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
+        """Joints [R, M, 3] of a file of the result, in the result's frames [T, M, 3]."""
+        return between_rows(joints, self.rows(fps).clip(0, len(joints) - 1))
 
     @property
     def model_pins(self) -> list[tuple[float, float, float]]:
@@ -172,6 +176,8 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     elif clip.bvh is not None:
         written = clip.bvh.places()
         seen, base = resample(written, clip.bvh.motion.fps, layout.fps), float(written[..., 1].min())
+    elif drawn is not None and clip.figure is not None:
+        seen = resample(clip.figure.joints, clip.fps, layout.fps)
     own = figure.joints
     # The features must be of the figure that the model knows; `scale` and `lift` lead back to the clip's.
     retargeted = retarget(own, layout.skeleton)

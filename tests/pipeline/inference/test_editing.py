@@ -206,6 +206,7 @@ def test_motions_and_their_files_are_clips(walk: Walk, tmp_path: Path) -> None:
         path = made_again.save(tmp_path / f"made{Path(name).suffix}")
         found = read_clip(path)
         assert found.fps == one.fps and found.figure is not None and one.figure is not None
+        assert made_again.report.kept_cm < 1e-3
         assert len(found.joints) == 60 and np.abs(found.joints - one.joints).max() > 0.01
         tolerance = 1e-6 if path.suffix == ".glb" else 0.0
         for field in ("joints", "rotations", "root"):
