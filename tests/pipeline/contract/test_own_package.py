@@ -73,7 +73,7 @@ def test_the_command_line_knows_the_converter_and_the_format(site: Path, source:
 
 
 def test_it_is_planned_and_counted(site: Path, command: list[object]) -> None:
-    said = program(site, *command, "--dry-run", "--out", site / "nothing")
+    said = program(site, *command, "--sizes", "--out", site / "nothing")
     row = re.search(r"│ sway +│ ([\d.]+) k +│ 8 +│ 30 +│", said)
     # A sentence of 384 numbers, 4 of noise and 8 waves to 8, and those to 133 columns, with biases.
     assert row and float(row[1]) == pytest.approx(((384 + 4 + 8) * 8 + 8 + 8 * 133 + 133) / 1e3, abs=0.1)
