@@ -22,10 +22,9 @@ from motionloom.pipeline.contract.units import WORK
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.team import Team
-from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.dry_run import explain_replacements, plan_table, replaced_stages, say_estimate
 from motionloom.pipeline.runs.execute import context_of, execute, perform
-from motionloom.pipeline.runs.plan import Selection, make_plan, require_fit, selected
+from motionloom.pipeline.runs.plan import Selection, doubts, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.snapshot import run_at
 from motionloom.pipeline.store.artifact import require_consistent, require_unchanged

@@ -18,8 +18,7 @@ from motionloom.pipeline.launch.console import say
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.continuation import Started
-from motionloom.pipeline.runs.doubts import doubts
-from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, require_fit, terms_of
+from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, doubts, require_fit, terms_of
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.runs.verify_shards import verify_shards
 from motionloom.pipeline.store.artifact import Artifact, InputStage

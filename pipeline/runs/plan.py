@@ -14,7 +14,7 @@ selection until all of them are done, so that the same command after a kill goes
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -33,6 +33,7 @@ from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.files import fingerprint_of, read_record
 from motionloom.pipeline.store.run_folder import identity_of, stage_folder
 from motionloom.pipeline.store.yaml import flatten
+from motionloom.pipeline.training.config import TrainedStageConfig
 
 REQUEST_FILE = ".again.json"
 """In the run folder, while stages are run again: the selection that names them."""
@@ -260,3 +261,29 @@ def terms_of(stage: Stage, folder: Path, inputs: Iterable[InputStage]) -> Terms:
     if brought or getattr(stage.config, "published", None) is not None:
         own = Terms(licences=(UNKNOWN,))
     return Terms.union([own, Terms.of(sources)])
+
+
+def doubts(recipe: Recipe, run: Path, stages: Iterable[Stage]) -> list[str]:
+    """Return a sentence on each setting of these stages that runs, and will hardly do what is meant.
+
+    How many clips there are is known where the stage that makes them is finished.
+    """
+    trained = [stage for stage in stages if isinstance(stage.config, TrainedStageConfig)]
+    return [f"{stage.name}: {doubt}" for stage in trained for doubt in _doubts(recipe, run, stage)]
+
+
+def _doubts(recipe: Recipe, run: Path, stage: Stage) -> Iterator[str]:
+    yield from stage.config.doubts()
+    batch, steps = stage.config.train.batch_size, stage.config.train.steps
+    for name in dict.fromkeys(stage.inputs.values()):
+        outside = recipe.outside.get(name)
+        source = outside or recipe.stage(name)
+        folder = stage_folder(run, name) if outside is None else outside.folder
+        if "data" not in source.kind.gives(source.config) or Artifact.find(folder) is None:
+            continue
+        clips = Data(folder).clips("train")
+        if 0 < clips < batch:
+            yield (
+                f"{name} has {clips:,} training clips and a batch {batch:,}, so each of {steps:,} steps "
+                f"sees every clip {batch / clips:.1f} times; set train.batch_size"
+            )

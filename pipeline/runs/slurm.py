@@ -31,7 +31,6 @@ from motionloom.datasets.base.progress import duration
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.console import say
 from motionloom.pipeline.launch.process import SAVED
-from motionloom.pipeline.runs.doubts import doubts
 from motionloom.pipeline.runs.dry_run import (
     explain_replacements,
     replaced_stages,
@@ -45,7 +44,7 @@ from motionloom.pipeline.runs.launch_plan import (
     SlurmOptions,
     make_launch_plan,
 )
-from motionloom.pipeline.runs.plan import PlannedStage, make_plan
+from motionloom.pipeline.runs.plan import PlannedStage, doubts, make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.files import require_folder
 from motionloom.pipeline.store.run_folder import require_own
