@@ -129,19 +129,9 @@ BESIDE = (".ci", "benchmarks", "docs", "tests")
 TOP = ("__init__.py", "__init__.pyi", "py.typed")
 """Files of the package itself, beside its folders."""
 ALONE = (
-    *TOP,
-    ".gitignore",
-    ".pre-commit-config.yaml",
-    "CHANGELOG.md",
-    "CONTRIBUTING.md",
-    "LICENSE",
-    "MANIFEST.in",
-    "Makefile",
-    "README.md",
-    "constraints.txt",
-    "pyproject.toml",
-    "setup.py",
-)
+    *TOP, ".gitignore", ".pre-commit-config.yaml", "CHANGELOG.md", "CONTRIBUTING.md", "LICENSE",
+    "MANIFEST.in", "Makefile", "README.md", "constraints.txt", "pyproject.toml", "setup.py",
+)  # fmt: skip
 
 
 def files_of(*folders: str) -> set[str]:

@@ -94,17 +94,6 @@ def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_p
             assert abs(len(dataset.motion(i)) - row["frames"] * 20 / 30) < 1.5
 
 
-def test_a_finished_conversion_converts_nothing_again(
-    copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    given = config(copy, unit="cm", up="y")  # what is said need not be settled by the first clips
-    first = convert(given, tmp_path / "out")
-    before = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")}
-    monkeypatch.setattr(BvhClip, "read", pytest.fail)
-    assert convert(given, tmp_path / "out") == first
-    assert {path.name: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.tar")} == before
-
-
 def test_ten_files_later_only_what_changed_is_converted(
     copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -172,18 +172,7 @@ def test_one_damaged_or_misnamed_file_leaves_the_others(
 def is_clip(path: Path) -> bool:
     """Whether a file is of a single clip: its motion, words, labels or sound."""
     lists = ("train", "val", "test", "all_caption", "ignore_list", "seed_metadata")
-    own = path.suffix in (
-        ".bvh",
-        ".amc",
-        ".npy",
-        ".npz",
-        ".pkl",
-        ".wav",
-        ".TextGrid",
-        ".txt",
-        ".json",
-        ".asf",
-    )
+    own = path.suffix[1:] in ("bvh", "amc", "asf", "npy", "npz", "pkl", "wav", "TextGrid", "txt", "json")
     return own and not any(word in path.name for word in lists) and "golden" not in str(path)
 
 

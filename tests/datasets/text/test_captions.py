@@ -28,47 +28,24 @@ def test_clean_caption(raw: str, clean: str) -> None:
     assert clean_caption(clean) == clean
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "a person walks forward.",
-        "jump",
-        "neutral",
-        "Dance_Break_Back_Cc_clip_2",
-        "Walking_001",
-        "walk/run",
-        "StandCasualChat",
-        "ein Mann läuft",
-        "человек идёт",
-        "the person takes 3 steps",
-    ],
-)
+WORDS = (
+    "a person walks forward.", "jump", "neutral", "Dance_Break_Back_Cc_clip_2", "Walking_001", "walk/run",
+    "StandCasualChat", "ein Mann läuft", "человек идёт", "the person takes 3 steps",
+)  # fmt: skip
+NAMES = (
+    "", "   ", "...", "42", "M007482", "007482", "clip_2", "subset_0001", "body_idx_0",
+    "recording_20210918_S05_S06_04", "gBR_sBM_cAll_d04_mBR0_ch01", "idea400/subset_0001/Some_Name_clip_2",
+    "walk.npy", "Dance_Break.mp4", "nan", "None",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", WORDS)
 def test_words_are_usable(text: str) -> None:
     assert usable_caption(text)
     assert usable_caption(clean_caption(text))
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "   ",
-        "...",
-        "42",
-        "M007482",
-        "007482",
-        "clip_2",
-        "subset_0001",
-        "body_idx_0",
-        "recording_20210918_S05_S06_04",
-        "gBR_sBM_cAll_d04_mBR0_ch01",
-        "idea400/subset_0001/Some_Name_clip_2",
-        "walk.npy",
-        "Dance_Break.mp4",
-        "nan",
-        "None",
-    ],
-)
+@pytest.mark.parametrize("text", NAMES)
 def test_names_and_ids_are_not(text: str) -> None:
     assert not usable_caption(text)
 

@@ -15,9 +15,10 @@ import torch
 from rich.console import Console
 
 from motionloom.datasets.motion.layout import WRISTS
+from motionloom.models.metrics import retrieval
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
-from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, STILL, TRAINING, FigureFile
+from motionloom.pipeline.evaluation.figures import CHANCE, MODEL, RECORDED, STILL, TRAINING, FigureFile
 from motionloom.pipeline.evaluation.latent_metrics import Latents, judged_figures
 from motionloom.pipeline.evaluation.reconstruction import FINGERS, published_errors
 from motionloom.pipeline.evaluation.truth import drawn, truth_of
@@ -164,3 +165,29 @@ def test_distribution_by_hand() -> None:
     assert found["diversity"].value == pytest.approx(wide, rel=0.15)
     apart = [float((made[a] - made[b]).norm(dim=-1).mean()) for a, b in ((0, 1), (0, 2), (1, 2))]
     assert 0 < found["multimodality"].value <= max(apart)
+
+
+@pytest.mark.parametrize("size", [32, 256])
+def test_matching_is_that_of_the_public_code(
+    size: int, shared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The golden batches are in row order, so the draw of batches is taken out."""
+    monkeypatch.setattr(retrieval.torch, "randperm", lambda count, **_: torch.arange(count))  # type: ignore[attr-defined]
+    with np.load(shared / "golden" / "t6_metrics_A.npz", allow_pickle=False) as data:
+        golden = {key: torch.from_numpy(np.asarray(data[key])) for key in data.files}
+    text, real, made = (golden[name] for name in ("text", "gt", "pred"))
+    still = real.mean(0).expand_as(real)
+    latents = Latents(text=text, real=real, made=[made], others=made[:300], still=still)
+    words = [str(row) for row in range(len(text))]
+    figures = judged_figures("evaluator", "it", latents, words, {}, size=size, among=2, seed=0)
+    found = {(one.row, one.name.removeprefix("evaluator.")): one.value for one in figures}
+    for name, row in (("pred", MODEL), ("gt", RECORDED)):
+        tops = [found[row, f"top-{k}"] for k in (1, 2, 3)]
+        assert tops == pytest.approx(golden[f"rprec_{name}_B{size}"].tolist(), rel=1e-5)
+        assert found[row, "matching_score"] == pytest.approx(golden[f"match_{name}_B{size}"].item(), rel=1e-5)
+    assert [found[CHANCE, f"top-{k}"] for k in (1, 2, 3)] == [k / size for k in (1, 2, 3)]
+    # Motions that are all alike share all places, so none is among the first.
+    assert found[STILL, "top-1"] == 0 and found[STILL, "matching_score"] > 0
+    assert found[MODEL, "fid"] == pytest.approx(golden["fid_pred_gt_float64"].item(), rel=1e-5)
+    rows = {row for row, name in found if name == "fid"}
+    assert rows == {MODEL, TRAINING, STILL}, "recorded motion has no distance to itself"
