@@ -25,7 +25,7 @@ from motionloom.datasets.motion.canonical import runs
 from motionloom.datasets.schema import UserError
 
 CIRCLE = 4.0
-"""Net turn (radians) of a walk from which it is a circle."""
+"""Net turn (radians) of a walk or a run from which it is a circle."""
 TURN = 0.6
 LYING = 0.62
 """Metres that the root falls of somebody who lies down, at least."""
@@ -153,6 +153,9 @@ def _action(s: Signals) -> str:
         return "turn" if TURN < turned < CIRCLE else "walk"
     if turned > TURN:
         return "turn"
+    # Who is seated all the time may use the hands.
+    if s.drop.min() > 0.3 and s.wrists[..., 1].max() > -0.3:
+        return _arm_action(s)
     # Whoever sinks reaches down where a hand is near the floor, and sits where the hips are behind the feet.
     if s.drop.max() > 0.23:
         low = int(np.argmax(s.drop))
@@ -194,18 +197,17 @@ def _reach_or_point(s: Signals) -> str:
 
 def _attributes(s: Signals, action: str) -> Record:
     """Return direction, side, count, speed or tempo as `action` defines them."""
-    if action == "walk":
-        backward = s.travel[-1] < 0
-        limits = (0.57, 0.98) if backward else (0.78, 1.38)
-        turned = _turned(s)
+    if action in ("walk", "run"):
+        backward, turned = s.travel[-1] < 0, _turned(s)
         way = "backward" if backward else "forward"
         if abs(turned) > CIRCLE:
             way = "counterclockwise" if turned > 0 else "clockwise"
-        return {"direction": way, "speed": _speed(_pace(s), *limits), "path": _path(s)}
+        found = {"direction": way, "path": _path(s)}
+        if action == "walk":
+            found["speed"] = _speed(_pace(s), *((0.57, 0.98) if backward else (0.78, 1.38)))
+        return found
     if action == "turn":
         return {"direction": "left" if _turned(s) > 0 else "right"}
-    if action == "run":
-        return {"direction": "forward" if s.travel[-1] > 0 else "backward", "path": _path(s)}
     if action == "jump":
         return {"direction": "forward" if s.travel[-1] > 0.15 else "up", "count": len(_flights(s))}
     if action == "squat":

@@ -7,7 +7,7 @@ on its neighbours. `synthesize` writes them through the shard writer like any ot
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -32,14 +32,14 @@ from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.actions import arms, floor, legs, locomotion
 from motionloom.datasets.synth.actions.maths import Array, ease
 from motionloom.datasets.synth.actions.pose import OVERLAP, Track, joined
-from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, Span, Truth, draw, require_known
+from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, SEATED, Span, Truth, draw, require_known
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
 from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
 from motionloom.datasets.synth.dances import Dance, DanceConfig, DanceTruth, dance, plan_dance
 from motionloom.datasets.synth.hands_and_face import express, grip_hand, shape_hand
 from motionloom.datasets.synth.music.recording import render_song, song_features
 
-CONVERTER_VERSION = 2  # the face's words are about the body's person
+CONVERTER_VERSION = 3  # runs in a circle, four jumps, who sits and then waves
 LICENCE = "CC0-1.0"
 SIZE_SPREAD = 0.02
 """Standard deviation of body size, as a fraction; `smpl75` holds no shape."""
@@ -229,19 +229,24 @@ def animate(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> T
     if truth.parts is None:
         return ANIMATORS[truth.action](truth, span, fps, rng)
     # Each is as long as half of the span allows; the second begins where the first has ended.
+    before, after = truth.parts
     half = Span(1.9, 0.5 * (span.high + OVERLAP), returns=True)
-    first, second = (animate(part, half, fps, rng) for part in truth.parts)
+    seated = before.action == "sit" and after.action in SEATED
+    first = animate(before, replace(half, returns=not seated), fps, rng)
+    second = animate(after, replace(half, returns=after.action != "sit"), fps, rng)
+    if seated:
+        second.hold_lower_body(first)
     track = joined(first, second)
     change = len(first.t) / fps - 0.5 * OVERLAP
     for side in (0, 1):
         # The same noise on both sides of the change, where the hand is relaxed.
         seed = int(rng.integers(2**32))
         grips = (ease((change - track.t) / 0.3), ease((track.t - change) / 0.3))
-        before, after = (
+        closed, opened = (
             grip_hand(part.hand(side), track.t, grip, np.random.default_rng(seed))
             for part, grip in zip(truth.parts, grips, strict=True)
         )
-        track.fingers[side] = np.where((track.t < change)[:, None, None, None], before, after)
+        track.fingers[side] = np.where((track.t < change)[:, None, None, None], closed, opened)
     return track
 
 

@@ -232,7 +232,6 @@ def reach(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     track = Track.standing(seconds, fps, rng, width=rng.uniform(0.02, 0.06))
     go = keys(track.t, [begin, begin + out, max(back, begin + out), seconds], [0.0, 1.0, 1.0, 0.0])
     reached = rng.uniform(0.95, 0.98)
-    low: Vec = (0.2, -0.5, 0.85)
     via: list[Hold] = []
     if truth.direction == "forward":
         to, bend = (rng.uniform(-0.2, 0.0), rng.uniform(-0.15, 0.12), 1.0), (0.0, 1.0, 0.0)
@@ -251,9 +250,9 @@ def reach(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     elif truth.direction == "down":
         to, bend = (rng.uniform(-0.05, 0.1), rng.uniform(-0.35, -0.1), 1.0), (0.0, 0.6, 0.4)
         deep = rng.uniform(0.9, 1.1)
-        track.root[:, 1] -= 0.38 * deep * go
+        track.root[:, 1] -= 0.4 * deep * go
         track.root[:, 2] -= 0.16 * go
-        track.pelvis[:, 0] += 0.75 * deep * go
+        track.pelvis[:, 0] += 0.8 * deep * go
         track.spine[:, 0] += 0.45 * deep * go
         track.spine[:, 1] -= sign * 0.15 * go
         track.head[:, 0] -= 0.2 * go
@@ -268,8 +267,8 @@ def reach(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     play(track, hand, holds)
     track.arms[hand].roll += 0.5 * go
     if truth.direction == "down":
-        other = 1 - hand
-        knee: Hold = (begin + out, low, 0.72, (-0.5, 0.2, 1.0))
-        play(track, other, [holds[0], knee, (max(back, begin + out + 0.01), *knee[1:]), holds[-1]])
+        # The other arm goes back for balance: what differs from side to side is plain to see, and to learn.
+        behind: Hold = (begin + out, (0.35, -0.5, -0.7), 0.93, (0.0, 0.3, 1.0))
+        play(track, 1 - hand, [holds[0], behind, (max(back, begin + out + 0.01), *behind[1:]), holds[-1]])
     track.lower_to_reach()
     return track

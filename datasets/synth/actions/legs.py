@@ -20,7 +20,7 @@ def jump(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     A hop is lower, and the leg of the other side stays up from before the first to after the last.
     """
     count, hops = truth.count or 1, truth.action == "hop"
-    height = rng.uniform(0.14, 0.3) * (0.8 if count == 3 else 1.0) * (0.5 if hops else 1.0)
+    height = rng.uniform(0.14, 0.3) * (0.8 if count >= 3 else 1.0) * (0.5 if hops else 1.0)
     flight = 2 * math.sqrt(2 * height / GRAVITY)
     dip, rise, absorb, rest = 0.32, 0.2, 0.2, 0.34
     period = dip + rise + flight + absorb + rest
@@ -131,7 +131,7 @@ def sit(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track
     down = rng.uniform(0.8, 1.3) * min(1.0, seconds / 3)
     begin = rng.uniform(0.1, 0.2 * seconds)
     track = Track.standing(seconds, fps, rng)
-    up_again = seconds > 4.2 and rng.random() < 0.4
+    up_again = span.returns or (seconds > 4.2 and rng.random() < 0.4)
     end = seconds - 0.2 if up_again else seconds + 10
     up_at = end - down
     seated = keys(track.t, [begin, begin + down, up_at, end], [0.0, 1.0, 1.0, 0.0])

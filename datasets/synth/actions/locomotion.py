@@ -30,9 +30,13 @@ def walk(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
         # A whole circle in the time there is: a slow walker takes a small one.
         speed *= 0.92
         seconds = span.pick(rng, at_least=min(5.0, span.high))
-        angle = rng.uniform(1.5, 1.95) * np.pi * (-1 if truth.direction == "clockwise" else 1)
-        return _walk(rng, fps, seconds, speed, angle, backward=False)
+        return _walk(rng, fps, seconds, speed, _circle(truth, rng), backward=False)
     return _walk(rng, fps, span.pick(rng), speed, 0.0, backward=backward, stands=span.returns)
+
+
+def _circle(truth: Truth, rng: np.random.Generator) -> float:
+    """Radians of a walk or a run around a circle, positive to the left."""
+    return rng.uniform(1.5, 1.95) * np.pi * (-1 if truth.direction == "clockwise" else 1)
 
 
 def turn(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
@@ -71,8 +75,9 @@ def turn(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
 
 
 def run(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
-    """Run forward, each step with a flight."""
-    seconds = span.pick(rng)
+    """Run straight ahead or around a circle, each step with a flight."""
+    circles = truth.direction in ("clockwise", "counterclockwise")
+    seconds = span.pick(rng, at_least=min(5.0, span.high) if circles else 0.0)
     speed = rng.uniform(2.3, 3.1)
     step = rng.uniform(0.33, 0.37)
     stride = Stride(
@@ -89,7 +94,8 @@ def run(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track
         toe_out=0.06,
         width=-0.04,
     )
-    return _along(rng, fps, seconds, stride, speed, 0.0, lead_in=0.0, corner=False)
+    angle = _circle(truth, rng) if circles else 0.0
+    return _along(rng, fps, seconds, stride, speed, angle, lead_in=0.0, corner=False)
 
 
 def _walk(
@@ -135,6 +141,7 @@ def _along(
     """Steps along an arc of `angle`; without a lead-in the clip starts and ends within full stride."""
     warm = 0.0 if lead_in else 2.6 * stride.step_seconds
     total = seconds + 2 * warm
+    angle *= total / seconds  # what is cut off turns as well
     begin = lead_in if lead_in else 0.0
     count = max(3, int((total - begin - 0.2) / stride.step_seconds) - 1)
     # The middle of the feet cuts the corners of the stations: longer steps keep the speed on an arc.

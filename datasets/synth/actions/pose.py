@@ -118,6 +118,13 @@ class Track:
         out.arms = (left, right)
         return out
 
+    def hold_lower_body(self, before: Track) -> None:
+        """Leave root, pelvis and feet as they are where a track ends, so that only the upper body moves."""
+        for name in ("root", "yaw", "pelvis"):
+            getattr(self, name)[:] = getattr(before, name)[-1]
+        for name in FEET:
+            getattr(self, name)[:] = getattr(before, name)[:, -1:]
+
     def lower_to_reach(self, seconds: float = 0.1) -> None:
         """Lower the root smoothly where a standing leg would be too short, so that feet stay in place."""
         hips = np.stack([self._pelvis_rotation() @ OFFSETS[1 + side] for side in (0, 1)])
@@ -212,7 +219,8 @@ class Track:
 
 
 def joined(first: Track, second: Track) -> Track:
-    """One track of two that begin and end standing; the feet are set one after the other into new places."""
+    """One track of two, where the second begins in the pose in which the first ends; the feet are set one
+    after the other into new places."""
     fps = first.fps
     shared = round(OVERLAP * fps)
     start, frames = len(first.t) - shared, len(first.t) - shared + len(second.t)

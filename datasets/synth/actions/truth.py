@@ -30,7 +30,7 @@ class Action:
     hand: str | None = None
     """Shape of the hands that take part, which captions need not state."""
     chains: tuple[str, ...] | None = None
-    """Directions as one of two actions in turn, for those that begin and end standing."""
+    """Directions as one of two actions in turn, for those that can begin and end standing."""
 
 
 OWN = "own"
@@ -43,10 +43,10 @@ ACTIONS = {
         chains=("forward", "backward"),
     ),
     "turn": Action(direction=SIDES, style=("place", "around", "walking"), chains=SIDES),
-    "run": Action(direction=("forward",)),
-    "jump": Action(direction=("up", "up", "forward"), most=3, chains=("up", "forward")),
+    "run": Action(direction=("forward", "forward", "clockwise", "counterclockwise")),
+    "jump": Action(direction=("up", "up", "forward"), most=4, chains=("up", "forward")),
     "squat": Action(speed=_PACES, most=3, chains=()),
-    "sit": Action(),
+    "sit": Action(chains=()),
     "kick": Action(side=SIDES, most=2, chains=()),
     "punch": Action(side=SIDES, most=3, hand="fist", chains=()),
     "wave": Action(side=(*SIDES, *SIDES, "both"), hand="spread", chains=()),
@@ -58,12 +58,14 @@ ACTIONS = {
     "point": Action(
         side=SIDES, direction=("forward", "up", OWN), hand="point", chains=("forward", "up", OWN)
     ),
-    "hop": Action(side=SIDES, most=3, chains=()),
+    "hop": Action(side=SIDES, most=4, chains=()),
     "lie": Action(),
     "crawl": Action(direction=("forward",), hand="relaxed"),
     "stretch": Action(direction=("up", *SIDES), chains=("up", *SIDES)),
     "then": Action(hand="relaxed"),
 }
+SEATED = ("punch", "wave", "clap", "raise", "point")
+"""What somebody who sat down before does without getting up."""
 BASIC = tuple(ACTIONS)[:14]
 """The actions of a config that asks for none; the others are for models that shall know more."""
 
@@ -153,7 +155,7 @@ def draw(action: str, rng: np.random.Generator, hand_shapes: Sequence[str] = HAN
 
 
 def _chain(rng: np.random.Generator) -> tuple[Truth, Truth]:
-    """Two different actions that begin and end standing, each once and at its usual pace."""
+    """Two different actions, each once and at its usual pace; between them one stands or sits."""
     able = [name for name, kind in ACTIONS.items() if kind.chains is not None]
     first, second = (_link(able[int(k)], rng) for k in rng.permutation(len(able))[:2])
     return first, second

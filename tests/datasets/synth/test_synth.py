@@ -13,7 +13,7 @@ from motionloom.datasets.actions.measure import action_of, agrees
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, draw
+from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, SEATED, draw
 from motionloom.datasets.synth.generate import (
     Clip,
     SynthConfig,
@@ -31,7 +31,7 @@ CLIPS = 280
 
 @pytest.fixture(scope="module")
 def clips() -> list[Clip]:
-    return [make_clip(index, CONFIG) for index in range(CLIPS)]
+    return [make_clip(index, CONFIG) for index in (*range(CLIPS), 2001)]  # 2001 sits down and then waves
 
 
 @pytest.fixture(scope="module")
@@ -107,26 +107,41 @@ def test_lies_are_found_out(clips: list[Clip]) -> None:
     assert believed == 0
 
 
-def test_circles_and_turns_by_plain_geometry(clips: list[Clip]) -> None:
+def test_directions_sides_and_counts_by_plain_geometry(clips: list[Clip]) -> None:
     """Seen from above, X points right and Z down the page; clockwise means turning to one's right."""
-    seen = 0
+    seen = Counter[str]()
     for clip in clips:
-        direction, root = clip.truth["direction"], clip.joints[:, 0]
-        if clip.truth["action"] == "walk" and direction in ("forward", "backward"):
-            seen += 1
-            assert (root[-1, 2] - root[0, 2] > 0) == (direction == "forward")
-        if clip.truth["action"] == "walk" and direction in ("clockwise", "counterclockwise"):
-            seen += 1
+        action, direction, side, count = (clip.truth[key] for key in ("action", "direction", "side", "count"))
+        root, wrists, balls = clip.joints[:, 0], clip.joints[:, 20:22], clip.joints[:, 10:12]
+        mine = 0 if side == "left" else 1
+        seen[f"{action} {direction}" if action in ("walk", "run", "reach") else action] += 1
+        if direction in ("clockwise", "counterclockwise"):
             # The person starts off towards +Z; their left is +X, and the circle lies on the side of the turn.
             middle = 0.5 * (root[:, 0].max() + root[:, 0].min())
             assert (middle > 0) == (direction == "counterclockwise")
-        if clip.truth["action"] == "turn":
-            seen += 1
+            path = np.linalg.norm(np.diff(root[:, [0, 2]], axis=0), axis=-1).sum()
+            assert np.linalg.norm(root[-1] - root[0]) < 0.45 * path
+        elif action in ("walk", "run"):
+            assert (root[-1, 2] - root[0, 2] > 0) == (direction != "backward")
+        elif action == "turn" and clip.truth["style"] != "around":
             hips = clip.joints[-1, 1] - clip.joints[-1, 2]
-            facing_x = -hips[2] if clip.truth["style"] != "around" else None
-            if facing_x is not None:
-                assert (facing_x > 0) == (direction == "left")
-    assert seen >= 25
+            assert (-hips[2] > 0) == (direction == "left")
+        elif action in ("jump", "hop"):
+            air = (balls[:, :, 1].min(1) > 0.04).astype(int)
+            assert (np.diff(air) > 0).sum() == count
+        elif action == "kick":
+            assert balls[:, mine, 1].max() > balls[:, 1 - mine, 1].max() + 0.3
+        elif action == "punch":
+            assert wrists[:, mine, 2].max() > wrists[:, 1 - mine, 2].max() + 0.15
+        elif action in ("reach", "point") and direction == "down":
+            low = int(np.argmin(wrists[:, mine, 1]))
+            assert wrists[low, mine, 1] < 0.4 < wrists[low, 1 - mine, 1] - 0.3
+        elif action in ("reach", "point") and direction == "up":
+            assert wrists[:, mine, 1].max() > wrists[:, 1 - mine, 1].max() + 0.5
+        elif actions_of(clip)[0] == "sit" and action == "then":
+            seen["seated"] += actions_of(clip)[1] in SEATED
+            assert (root[-1, 1] < 0.7) == (actions_of(clip)[1] in SEATED)
+    assert len(seen) == 30 and seen["seated"]
 
 
 def test_feet_stay_where_they_stand(clips: list[Clip]) -> None:
