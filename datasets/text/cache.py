@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -94,12 +95,12 @@ class TextCache:
 
         rows = self._rows(captions)
         begin, length = self._offsets[rows], self._offsets[rows + 1] - self._offsets[rows]
-        mask = np.arange(length.max(initial=0))[None] < length[:, None]
-        out = np.zeros((*mask.shape, self.dim), dtype=np.float32)
-        # Tokens of all captions one after the other, which is the order of the mask's true places too.
-        before = np.cumsum(length) - length
-        found = self._tokens[np.repeat(begin - before, length) + np.arange(length.sum())]
-        out[mask] = torch.from_numpy(found).float().numpy()  # four times as fast as numpy's
+        position = np.arange(length.max(initial=0))[None]
+        mask = position < length[:, None]
+        # Padding repeats the last token, then becomes 0: one gather is cheaper than filling by the mask.
+        found = np.asarray(self._tokens)[begin[:, None] + np.minimum(position, length[:, None] - 1)]
+        out = torch.from_numpy(found).float().numpy()  # four times as fast as numpy's
+        out[~mask] = 0.0
         return out, mask
 
     def captions_by_key(self) -> dict[bytes, str]:
@@ -141,6 +142,7 @@ class TextCache:
         TextCache.__init__(self, folder)
 
 
+@lru_cache(2**16)  # a training asks for the same captions three times a batch, epoch after epoch
 def key_of(caption: str) -> bytes:
     """sha256 of a caption's UTF-8 bytes, exactly as written."""
     return hashlib.sha256(caption.encode()).digest()

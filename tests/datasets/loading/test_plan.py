@@ -51,16 +51,6 @@ def test_an_epoch_is_a_permutation_cut_into_whole_batches(
     assert drawn.min() >= 0 and drawn.max() < items
 
 
-def test_any_order_of_questions_gives_the_same_answers() -> None:
-    forward = BatchPlan(50, 7, seed=1)
-    want = [forward.batch(k)[1] for k in range(40)]
-    asked = pickle.loads(pickle.dumps(forward))
-    for k in np.random.default_rng(0).permutation(40):
-        np.testing.assert_array_equal(asked.batch(int(k))[1], want[k])
-    assert not np.array_equal(want[0], BatchPlan(50, 7, seed=2).batch(0)[1])
-    assert not np.array_equal(want[0], want[7]), "epochs must differ"
-
-
 def test_the_order_is_fixed_for_ever() -> None:
     """A changed order would break every running experiment's resume: these numbers may never change."""
     assert permutation(10, 3, 4).tolist() == [3, 2, 6, 1, 4, 9, 5, 7, 8, 0]
@@ -233,7 +223,7 @@ def test_clips_are_numbered_through(mix: MixedDataset, roots: tuple[Path, Path])
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.tuples(st.integers(1, 60), st.integers(1, 9)), min_size=2, max_size=5),
+    st.lists(st.tuples(st.integers(1, 60), st.integers(1, 9)), min_size=1, max_size=5),
     st.integers(1, 16),
     st.integers(0, 50),
 )
@@ -249,7 +239,8 @@ def test_any_mix_is_exact_and_asked_in_any_order(parts: list[tuple[int, int]], b
         return
     got = shares(sources, used)
     assert sum(got) == used and all(abs(g - w) < 1 for g, w in zip(got, wanted, strict=True))
-    plan, other = (BatchPlan(first, batch, 1, sources=sources) for _ in range(2))
+    plan = BatchPlan(first, batch, 1, sources=sources)
+    other = pickle.loads(pickle.dumps(plan))
     other.batch(k + 7)
     assert all(np.array_equal(a, b) for a, b in zip(plan.batch(k), other.batch(k), strict=True))
     epoch = k // plan.batches_per_epoch * plan.batches_per_epoch
