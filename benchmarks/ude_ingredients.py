@@ -14,25 +14,40 @@ an arm of every question for every seed. Killed and started again it goes on whe
 
 `--adversarial` asks the question of L_adv in a run of its own, on the captioned clips alone: its weights from
 the first step on, likeliest and drawn tokens, by figures and by geometry. What has finished is printed.
+`--decoders` asks what DMD predicts once more, at the paper's size: recorded test clips are decoded from their
+own tokens.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
 import yaml
 from bench import HERE, Column, arguments, command_line, kept, report, train
 from caption_check import CAPTIONS, obeyed
+from numpy.typing import NDArray
 from results import logged
 
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.models.diffusion.sampling import decode_motions
+from motionloom.models.diffusion.schedule import Sampler
+from motionloom.models.layers.seeds import sample_seeds
+from motionloom.models.metrics.reconstruction import mpjpe
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage, StageCache
 from motionloom.pipeline.evaluation.figures import FILE_NAME, MODEL, NEAREST_WORDS, RECORDED, FigureFile
+from motionloom.pipeline.evaluation.movement import all_features, distances
+from motionloom.pipeline.evaluation.truth import Truth, truth_at
 from motionloom.pipeline.inference.bundle import Bundle
 
+Joints = NDArray[np.float64]
 QUESTIONS = ("codebooks", "decoders", "tokens_of_seed_7", "tokens", "gru")
 ADVERSARIAL = {"adv0": 0.0, "adv01": 0.1, "adv1": 1.0}
 """Weights of L_adv: none, the public code's, the paper's."""
@@ -40,6 +55,14 @@ WAYS = {
     "likeliest tokens": ("greedy", SamplingConfig(temperature=0.0)),
     "drawn": ("drawn", SamplingConfig(temperature=1.0, top_p=1.0)),
 }
+DECODED = 120
+"""Test clips whose tokens are decoded."""
+SAMPLERS: dict[Sampler, int] = {"dpm++": 20, "ddpm": 100}
+DECODER_COLUMNS = (
+    Column("MPJPE, mm", "mpjpe"),
+    Column("FID_k", "movement.fid_k"),
+    Column("FID_m", "movement.fid_m"),
+)
 DRAWS = 20
 """Motions of each caption whose geometry is checked."""
 COLUMNS = (
@@ -86,6 +109,48 @@ def adversarial(args: argparse.Namespace) -> None:
     report(f"L_adv from the first of {args.steps} steps on", COLUMNS, rows, args.record)
 
 
+def decoders(args: argparse.Namespace) -> None:
+    """Train diffusion decoders of the paper's size, and measure what they make of recorded clips' tokens."""
+    stages = stages_of("captions", args.clips)
+    for seed in args.seeds:
+        stages |= stages_of("paper_decoders", args.clips, seed, STEPS=args.steps)
+    finished = finished_stages(train(args.work / "decoders", stages, until=args.until, seed=7))
+    cache = StageCache()
+    tokenizer, dataset = cache.get(finished["ema_7"]), cache.get(finished["data"]).split("test")
+    chosen = np.random.default_rng(0).permutation(len(dataset))[:DECODED]
+    truths = [truth_at(dataset, k, min(int(dataset.frames[k]), 160) // 4 * 4) for k in chosen.tolist()]
+    codes = tokenizer.encode([truth.features for truth in truths])
+
+    def measured(stage: str, sampler: Sampler, steps: int) -> dict[str, float]:
+        net, seeds = cache.get(finished[stage]).net, sample_seeds(0, DECODED)
+        made = decode_motions(net, codes, seeds=seeds, sampler=sampler, steps=steps)
+        return decoder_figures(
+            [joints_of(tokenizer.of_coordinates(x), tokenizer.layout) for x in made], truths
+        )
+
+    rows = []
+    for kind, title in {"epsilon": "noise", "sample": "motion"}.items():
+        for sampler, steps in SAMPLERS.items():
+            found = []
+            for name in (f"{kind}_{seed}" for seed in args.seeds):
+                call = partial(measured, name, sampler, steps)
+                found.append(kept(args.work / f"{name}-{sampler}.json", call))
+            cells = {key: [one[key] for one in found] for key in found[0]}
+            protocol = {"split": "test", "clips": DECODED, "steps": args.steps, "batch": 64}
+            row = {"title": f"predicts {title}, {sampler} in {steps} steps", "cells": cells}
+            rows.append({**row, "seeds": args.seeds, "protocol": protocol})
+    report("DMD of the paper's size", DECODER_COLUMNS, rows, args.record)
+
+
+def decoder_figures(made: list[Joints], truths: Sequence[Truth]) -> dict[str, float]:
+    """How near decoded motions are to the recorded ones, each and in distribution."""
+    recorded = [truth.joints for truth in truths]
+    pairs = zip(made, recorded, strict=True)
+    errors = [mpjpe(torch.as_tensor(a), torch.as_tensor(b)).mean().item() for a, b in pairs]
+    features = [all_features(motions, 20.0) for motions in (recorded, made)]
+    return {"mpjpe": float(np.mean(errors))} | distances(*features)
+
+
 def row_of(
     args: argparse.Namespace, run: Path, title: str, done: dict[int, CompletedStage], sampling: SamplingConfig
 ) -> dict[str, Any]:
@@ -120,10 +185,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[7, 8, 9])
     parser.add_argument("--until", help="stages, with commas between them")
     parser.add_argument("--adversarial", action="store_true", help="the question of L_adv")
-    parser.add_argument("--steps", type=int, default=4000, help="of the arms of L_adv")
+    parser.add_argument("--decoders", action="store_true", help="the question of DMD at the paper's size")
+    parser.add_argument("--steps", type=int, default=4000, help="of the arms of L_adv, and of these decoders")
     args = arguments(parser)
-    if args.adversarial:
-        return adversarial(args)
+    if args.adversarial or args.decoders:
+        return adversarial(args) if args.adversarial else decoders(args)
     stages = stages_of("base", args.clips)
     for question in QUESTIONS:
         for seed in args.seeds:

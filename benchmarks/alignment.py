@@ -1,0 +1,162 @@
+"""Does L_align help (HumanTOMATO 3.6)? One GPT, and three ways to go on from it for as many steps.
+
+    motionloom run humantomato-synthetic --until data --set data.wordings=few
+    python benchmarks/alignment.py runs/humantomato-synthetic/stages/data WORK
+
+Tokenizer, statistics and TMA are those of the package's model `synthetic`. A GPT of its size is trained on
+tokens alone, then trained on for every seed: on the tokens, with L_align on what is predicted after the true
+tokens (the paper's), and on samples. Killed and started again it goes on where it was.
+
+One motion is drawn for the caption of each validation clip, with the same seeds for all trainings, and judged
+on its joints (`motionloom.datasets.actions.measure`), which no network saw: `every` is the share of right
+attributes, `whole` that of motions with all right. TMA's recall is beside it, although L_align trains with
+TMA. Differences are paired: captions and seeds are drawn anew together (bootstrap, 95 %).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from bench import Column, Record, arguments, command_line, kept, report, train
+from numpy.typing import NDArray
+
+from motionloom.datasets.actions.measure import agrees
+from motionloom.datasets.motion.canonical import canonicalize
+from motionloom.datasets.motion.features.codec import encode
+from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.judges import Judge
+from motionloom.pipeline.evaluation.latent_metrics import LatentRow, recalls
+from motionloom.pipeline.evaluation.reference_baselines import by_nearest_caption
+from motionloom.pipeline.evaluation.truth import perform, truth_of
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.store.evaluator import embed_motions
+
+Joints = NDArray[np.float64]
+Counts = NDArray[np.float64]
+"""Right attributes, attributes and whether all are right, [..., clips, 3]."""
+
+ARMS: dict[str, dict[str, Any]] = {
+    "tokens": {"align_weight": 0.0},
+    "predictions": {"align_weight": 0.1, "threshold": None},
+    "samples": {"align_on": "samples", "align_weight": 2.0, "threshold": None},
+}
+WAYS = {
+    "drawn": SamplingConfig(top_p=1.0),
+    "as the model recommends": SamplingConfig(top_p=0.8, cfg_scale=1.25),
+}
+SEEDS, BATCH, CLIPS, SIZE, DRAWS = (1, 2, 3), 16, 600, 32, 10_000
+"""Of the continuations; clips of a step; judged clips; candidates of TMA's recall; draws of the bootstrap."""
+COLUMNS = (
+    Column("every, %", "every"),
+    Column("less `tokens`", "every_gain"),
+    Column("whole, %", "whole"),
+    Column("less `tokens`", "whole_gain"),
+    Column(f"TMA R@1 among {SIZE}, %", "tma", 1, 100),
+)
+
+
+def stages_of(data: str, base: int, more: int) -> dict[str, Any]:
+    """Tokens, the GPT that all go on from, and each arm for each seed; the rest is the model's own."""
+
+    def gpt(lr: float, warmup: int, steps: int, seed: int, loss: object, **start: str) -> dict[str, Any]:
+        net = {"layers": 4, "dim": 192, "heads": 6, "ff": 768, "dropout": 0.1, "attention_dropout": 0.0}
+        optim = {"lr": lr, "warmup_steps": warmup, "schedule": "cosine", "weight_decay": 0.01}
+        every = {"checkpoint_every": 250, "validate_every": steps}
+        length = {"steps": steps, "batch_size": BATCH, "seed": seed, **every}
+        own = {"net": net, "loss": loss, "optim": optim, "train": length}
+        return {"kind": "gpt", "inputs": {"data": data, **start}, **own}
+
+    stages = {kind: {"kind": kind, "inputs": {"data": data}} for kind in ("text", "tokens")}
+    stages["base"] = gpt(1.0e-3, 200, base, 7, ARMS["tokens"])
+    for seed in SEEDS:
+        for arm, loss in ARMS.items():
+            stages[f"{arm}_{seed}"] = gpt(2.0e-4, 50, more, seed, loss, start="base")
+    return stages
+
+
+def figures(counts: Counts) -> NDArray[np.float64]:
+    """`every` and `whole`, in percent."""
+    right, asked, whole = counts.reshape(-1, 3).mean(0)
+    return 100 * np.array([right / asked, whole])
+
+
+def gains(arm: Counts, tokens: Counts) -> list[str]:
+    """Differences of both figures with their intervals; counts have seeds first."""
+    rng, (seeds, clips), drawn = np.random.default_rng(0), arm.shape[:2], []
+    for _ in range(DRAWS):
+        some = np.ix_(rng.integers(seeds, size=seeds), rng.integers(clips, size=clips))
+        drawn.append(figures(arm[some]) - figures(tokens[some]))
+    ends = np.percentile(drawn, [2.5, 97.5], axis=0)
+    rows = zip(figures(arm) - figures(tokens), *ends, strict=True)
+    return [f"{found:+.1f} ({low:+.1f} to {high:+.1f})" for found, low, high in rows]
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("data", type=Path, help="folder of the stage of clips")
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--base", type=int, default=12_000, help="steps of the GPT that all go on from")
+    parser.add_argument("--more", type=int, default=1_500, help="steps of each continuation")
+    args = arguments(parser)
+    stages = stages_of(str(args.data.resolve()), args.base, args.more)
+    finished = finished_stages(train(args.work / "run", stages, seed=7, start="synthetic"))
+    cache, inputs = StageCache(), finished["base"].inputs
+    data, judge = cache.get(inputs["data"]), Judge(cache.get(inputs["tma"]))
+    dataset = data.split("val")
+    chosen = np.random.default_rng(0).permutation(len(dataset))[:CLIPS]
+    truths = [truth_of(dataset, index) for index in chosen.tolist()]
+    text = judge.texts(truths)
+
+    def judged(motions: Sequence[Joints]) -> dict[str, Any]:
+        """What a motion for each clip has right, and TMA's recall."""
+        layout = judge.motions.layout
+        columns = layout.part(judge.motions.part)
+        latent = embed_motions(judge.motions, [encode(canonicalize(j), layout)[:, columns] for j in motions])
+        hits = [recalls(LatentRow(text, latent, latent, seed, SIZE))["t2m_r1"] for seed in range(10)]
+        found = [
+            [*agrees(truth.truth or {}, joints, None, data.layout.fps).values()]
+            for truth, joints in zip(truths, motions, strict=True)
+        ]
+        return {"counts": [[sum(one), len(one), int(all(one))] for one in found], "tma": float(np.mean(hits))}
+
+    def made(stage: str, way: str) -> dict[str, Any]:
+        motions = perform(Bundle([finished[stage]], cache), truths, seed=0, sampling=WAYS[way])
+        return judged([motion.joints for motion in motions])
+
+    def row(title: str, found: Sequence[dict[str, Any]], **more: Any) -> Record:
+        every, whole = np.transpose([figures(np.array(one["counts"], float)) for one in found]).tolist()
+        cells = {"every": every, "whole": whole, "tma": [one["tma"] for one in found]}
+        return {"title": title, "cells": cells, **more}
+
+    rows = []
+    for way, sampling in WAYS.items():
+        facts = {"split": "val", "clips": len(truths), "batch": BATCH, "top_p": sampling.top_p}
+        facts["guidance"] = sampling.cfg_scale
+        names = {"base": ["base"]} | {arm: [f"{arm}_{seed}" for seed in SEEDS] for arm in ARMS}
+        counts = {}
+        for arm, stages in names.items():
+            found = [kept(args.work / f"{way}-{s}.json", lambda s=s, way=way: made(s, way)) for s in stages]
+            counts[arm] = np.array([one["counts"] for one in found], float)
+            steps = f"{args.base:,}" if arm == "base" else f"{args.base:,} and {args.more:,} more"
+            rows.append(row(f"{way}: {arm}", found, protocol={**facts, "steps": steps}))
+            if arm != "base":
+                rows[-1]["seeds"] = list(SEEDS)
+            if arm in ("predictions", "samples"):
+                both = gains(counts[arm], counts["tokens"])
+                rows[-1]["cells"] |= {"every_gain": both[0], "whole_gain": both[1]}
+    rows.append(row("recorded", [judged([truth.joints for truth in truths])]))
+    near = kept(
+        args.work / "nearest.json",
+        lambda: judged([one.joints for one in by_nearest_caption(data.split("train"), truths)]),
+    )
+    rows.append(row("nearest training caption", [near]))
+    report("L_align", COLUMNS, rows, args.record)
+
+
+if __name__ == "__main__":
+    main()
