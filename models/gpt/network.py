@@ -122,7 +122,7 @@ class InterleavedGPT(TokenNetwork):
 
     def hidden(self, x: Tensor, cache: KVCache | None = None) -> Tensor:
         """Causal states [B, L, D] of inputs x [B, L, D]; with a cache, x continues what it holds."""
-        start = 0 if cache is None else cache.length
-        x = self.dropout(x + self.positions[start : start + x.shape[1]].to(x.dtype))
+        places = slice(x.shape[1]) if cache is None else cache.positions(x.shape[1])
+        x = self.dropout(x + self.positions[places].to(x.dtype))
         out: Tensor = self.stack(x, causal=True, cache=cache)
         return out

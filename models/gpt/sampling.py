@@ -6,25 +6,44 @@ Notable choices:
   depends on its text, its seed and the settings, and on nothing else in the batch. Batched matrix products
   round in their own way, so a draw within 1e-6 of a boundary of the distribution can still differ.
 - Guidance runs the conditional and the unconditional half in one forward.
+- On a GPU a token of the GPT is one CUDA graph. Matrix products have the type they have in training: of the
+  weights, float32 in every bundle, or that of autocast around the call. Half precision is not the default
+  there, since the same seed then makes another motion than on a CPU.
 
-Legend: B batch, V vocabulary, G groups, P slots of a group.
+Legend: B batch, V vocabulary, G groups, P slots of a group, D width.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
+from motionloom.models.layers.attention import KVCache
 from motionloom.models.layers.frozen import evaluating
+from motionloom.models.layers.graphs import recorded
+from motionloom.models.layers.linear import product_type
 from motionloom.models.layers.seeds import sample_seeds as sample_seeds
+
+_LOOK = 16
+"""Tokens after which a GPU is asked whether all rows have ended: it is waited for then."""
+
+_ROOM = 32
+"""Places of a cache of fixed size are a multiple of this, so that few lengths have a graph of their own."""
+
+_FIXED = {"cuda"}
+"""Kinds of devices on which a step has the same shapes all along. Elsewhere attention is over the positions
+so far: that is less to compute, and a CPU's sums would be rounded otherwise with hidden places among them."""
 
 
 @dataclass(frozen=True)
@@ -123,59 +142,147 @@ def requested_groups(
     return found
 
 
-def decode(
-    network: TokenNetwork,
-    hidden: Callable[[int, Tensor], Tensor],
-    start: Tensor,
-    before: Tensor,
-    limit: Tensor,
-    *,
-    uniform: Tensor,
-    free: bool,
-    how: Drawing,
-    scale: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Draw tokens one by one; all of them int64 [B, N * P], those of `start` included, and the numbers of new
-    groups int64 [B].
+class Rows:
+    """Rows of tokens that are being drawn. All that a step reads and writes stays in the same tensors.
 
     Args:
-        hidden: The network's output at a position [B, 1, D] ([2B, 1, D] under guidance), given its number and
-            the tokens int64 [B, N * P] of which those before it are known. Called with ascending numbers.
         start: Tokens [B, M * P] of `before` [B] groups a row; the others are drawn.
         limit: New groups at which each row must stop, int64 [B].
         uniform: Draws float64 [B, most new tokens] in [0, 1).
         free: Whether rows may draw End before their limit.
         scale: Each row's guidance [B]; None without.
     """
-    batch, size = len(limit), len(network.pattern)
-    total = int((before + limit).max()) * size if batch else 0
-    tokens = functional.pad(start, (0, max(0, total - start.shape[1])))
-    counts = torch.zeros_like(limit)
-    ended = torch.zeros_like(limit, dtype=torch.bool)
-    no = torch.zeros_like(ended)
-    for step in range(int(before.min()) * size if batch else 0, total):
-        group, slot = divmod(step, size)
-        new = group >= before
+
+    def __init__(
+        self,
+        network: TokenNetwork,
+        start: Tensor,
+        before: Tensor,
+        limit: Tensor,
+        *,
+        uniform: Tensor,
+        free: bool,
+        how: Drawing,
+        scale: Tensor | None,
+    ) -> None:
+        self.network, self.free, self.how = network, free, how
+        batch, size = len(limit), len(network.pattern)
+        self.first, self.last = 0, 0
+        if batch:
+            self.first, self.last = int(before.min()) * size, int((before + limit).max()) * size
+        self.at = torch.full((1,), self.first, device=limit.device)
+        """Number of the token to draw, int64 [1]."""
+        self.tokens = functional.pad(start, (0, max(0, self.last - start.shape[1])))
+        self.before, self.limit, self.uniform, self.scale = before, limit, uniform, scale
+        self.counts, self.ended = torch.zeros_like(limit), torch.zeros_like(limit, dtype=torch.bool)
+
+    def draw(self, hidden: Tensor) -> None:
+        """Draw token number `at` of each row by the network's output there [B, 1, D], of guidance [2B, 1, D].
+
+        Nothing here waits for the device, and no shape depends on what lies there.
+        """
+        network, scale, size = self.network, self.scale, len(self.network.pattern)
+        group, slot = self.at // size, self.at % size
+        opens, new = slot == 0, group >= self.before
         # Rows that only read their start are not alive yet, and those behind their End not any more.
-        alive = new & (group < before + limit) & ~ended
-        if slot == 0 and not bool((alive | ~new).any()):
-            break
+        alive = new & (group < self.before + self.limit) & ~self.ended
+        no = torch.zeros_like(self.ended)
         # A motion is never empty, so its first group cannot be End.
-        may_end = alive & (group > before) if free and slot == 0 else no
+        may_end = alive & (group > self.before) & opens if self.free else no
         # Numbers count from a row's first new token, whatever it starts from.
-        index = (step - before * size).clamp(0, uniform.shape[1] - 1)
-        own = uniform.gather(1, index[:, None])[:, 0]
+        index = (self.at - self.before * size).clamp(0, self.uniform.shape[1] - 1)
+        own = self.uniform.gather(1, index[:, None])[:, 0]
         kind = network.slots[slot]
-        legal = network.legal_at(network.ends[kind].expand(batch), may_end, no)
+        legal = network.legal_at(network.ends[kind].expand(len(no)), may_end, no)
         rows = legal if scale is None else legal.repeat(2, 1)
-        logits = network.logits(hidden(step, tokens), kind.expand(len(rows), 1), rows[:, None])[:, 0]
-        token = how(logits if scale is None else guide(logits, legal, scale), own)
-        if slot == 0:
-            stops = alive & (token == network.ends[network.slots[0]])
-            ended, alive = ended | stops, alive & ~stops
-            counts = counts + alive
-        tokens[:, step] = torch.where(new, torch.where(alive, token, 0), tokens[:, step])
-    return tokens, counts
+        logits = network.logits(hidden, kind.expand(len(rows), 1), rows[:, None])[:, 0]
+        token = self.how(logits if scale is None else guide(logits, legal, scale), own)
+        stops = alive & opens & (token == network.ends[network.slots[:1]])
+        self.ended |= stops
+        alive = alive & ~stops
+        self.counts += alive & opens
+        known = self.tokens.index_select(1, self.at)[:, 0]
+        drawn = torch.where(new, torch.where(alive, token, 0), known)
+        self.tokens.index_copy_(1, self.at, drawn[:, None])
+        self.at += 1
+
+    def done(self) -> bool:
+        """Whether no row draws or reads its start any more."""
+        group = self.at // len(self.network.pattern)
+        return bool(((group >= self.before) & (self.ended | (group >= self.before + self.limit))).all())
+
+    def run(self, step: Callable[[int], None]) -> tuple[Tensor, Tensor]:
+        """Take `step`, which calls `draw`, for each number in order; all tokens int64 [B, N * P], those of
+        the start included, and the numbers of new groups int64 [B].
+        """
+        every = _LOOK if self.at.is_cuda else len(self.network.pattern)
+        for number in range(self.first, self.last):
+            if (number - self.first) % every == 0 and self.done():
+                break
+            step(number)
+        return self.tokens, self.counts
+
+
+def advance(gpt: InterleavedGPT, rows: Rows, first: Tensor, cache: KVCache) -> None:
+    """Draw the next token of each row behind those that the cache holds; `first` [B, 1, D], of guidance
+    [2B, 1, D], is read before token 0.
+    """
+    before = (rows.at - 1).clamp(min=0)
+    kinds = gpt.slots[before % len(gpt.pattern)].expand(len(rows.tokens), 1)
+    x = gpt.embed(rows.tokens.index_select(1, before), kinds)
+    # Both passes of guidance read the tokens that were drawn under guidance.
+    x = x if rows.scale is None else torch.cat([x, x])
+    rows.draw(gpt.hidden(torch.where(rows.at == 0, first, x), cache))
+
+
+class FixedSteps:
+    """Steps of rows of one shape, of which a GPU makes one graph: a network, a cache and rows that stay where
+    they are, and are filled for each call.
+
+    The network is a copy, so that weights in training may lie anywhere. Its matrices have the type in which
+    their products are computed, as autocast would cast them at each use.
+    """
+
+    def __init__(self, shape: object, gpt: InterleavedGPT, rows: Rows, first: Tensor) -> None:
+        self.shape = shape
+        self.gpt, self.rows, self.first = copy.deepcopy((gpt, rows, first))
+        for module in self.gpt.requires_grad_(False).modules():
+            if isinstance(module, nn.Linear):
+                module.to(product_type(module.weight))
+        self.cache = self.gpt.stack.cache(self.rows.tokens.shape[1], self.rows.at)
+        self.step = recorded(partial(advance, self.gpt, self.rows, self.first, self.cache), first.device)
+
+    def run(self, gpt: InterleavedGPT, rows: Rows, first: Tensor) -> tuple[Tensor, Tensor]:
+        """Draw rows of this shape; return as `Rows.run` does."""
+        torch._foreach_copy_(list(self.gpt.parameters()), list(gpt.parameters()))
+        for name, value in vars(rows).items():
+            if isinstance(value, Tensor):
+                getattr(self.rows, name).copy_(value)
+        self.first.copy_(first)
+        self.rows.first, self.rows.last = rows.first, rows.last
+        self.cache.clear()
+        tokens, counts = self.rows.run(lambda _: self.step())
+        return tokens.clone(), counts.clone()
+
+
+_KEPT: WeakKeyDictionary[InterleavedGPT, FixedSteps] = WeakKeyDictionary()
+"""The steps that a network took last, for the next call of the same shape."""
+
+
+@torch.inference_mode(False)  # what is kept is written again, which tensors of that mode do not bear outside
+@torch.no_grad()
+def run_fixed(gpt: InterleavedGPT, rows: Rows, first: Tensor) -> tuple[Tensor, Tensor]:
+    """Draw rows by steps of fixed shapes; return as `Rows.run` does."""
+    types = first.dtype, gpt.positions.dtype, product_type(gpt.positions)
+    shape = first.shape, rows.tokens.shape, rows.scale is None, rows.free, rows.how, first.device, types
+    # Taken out meanwhile: another thread with the same network makes its own.
+    steps = _KEPT.pop(gpt, None)
+    if steps is None or steps.shape != shape:
+        steps = None  # so that its memory is free for the next
+        steps = FixedSteps(shape, gpt, rows, first)
+    made = steps.run(gpt, rows, first)
+    _KEPT[gpt] = steps
+    return made
 
 
 @torch.no_grad()
@@ -208,25 +315,21 @@ def generate(
     limit = requested_groups(groups, batch, most=gpt.max_groups, limit=gpt.max_groups, device=device)
     gpt.require_guidance(cfg_scale)
     size, most = len(gpt.pattern), int(limit.max()) if batch else 0
+    fixed = device.type in _FIXED and batch > 0
+    room = -(-most * size // _ROOM) * _ROOM if fixed else most * size
     # All numbers are drawn before the loop, so that a row does not depend on the others' lengths.
-    uniform = uniform_numbers(seeds_of(seed, batch, "texts"), most * size, device)
+    uniform = uniform_numbers(seeds_of(seed, batch, "texts"), room, device)
     scale = torch.full((batch,), cfg_scale, device=device) if cfg_scale != 1 else None
-    cache = gpt.stack.cache(max(1, most * size))
-
-    def hidden(step: int, tokens: Tensor) -> Tensor:
-        if step:
-            x = gpt.embed(tokens[:, step - 1 : step], gpt.slots[(step - 1) % size].expand(batch, 1))
-            # Both passes of guidance read the tokens that were drawn under guidance.
-            x = x if scale is None else torch.cat([x, x])
-        else:
-            x = gpt.embed_text(text)
-            if scale is not None:
-                x = torch.cat([x, gpt.embed_text(text, torch.ones(batch, dtype=torch.bool, device=device))])
-        return gpt.hidden(x, cache)
-
-    start, before = torch.zeros(batch, 0, dtype=torch.int64, device=device), torch.zeros_like(limit)
+    start, before = torch.zeros(batch, room, dtype=torch.int64, device=device), torch.zeros_like(limit)
+    rows = Rows(gpt, start, before, limit, uniform=uniform, free=groups is None, how=how, scale=scale)
     with evaluating(gpt):
-        tokens, counts = decode(
-            gpt, hidden, start, before, limit, uniform=uniform, free=groups is None, how=how, scale=scale
-        )
-    return as_codes(tokens.view(batch, most, size), gpt.pattern, counts)
+        first = gpt.embed_text(text)
+        if scale is not None:
+            nothing = torch.ones(batch, dtype=torch.bool, device=device)
+            first = torch.cat([first, gpt.embed_text(text, nothing)])
+        if fixed:
+            tokens, counts = run_fixed(gpt, rows, first)
+        else:
+            cache = gpt.stack.cache(max(1, room))
+            tokens, counts = rows.run(lambda _: advance(gpt, rows, first, cache))
+    return as_codes(tokens[:, : most * size].reshape(batch, most, size), gpt.pattern, counts)

@@ -30,7 +30,8 @@ def attention(
 ) -> Tensor:
     """Attention [B, H, L, D/H] of queries to keys and values [B, H, S, D/H]; mask added, or `causal`."""
     half = query.dtype in (torch.float16, torch.bfloat16)  # the fused kernel knows no other type
-    if query.is_cuda and half and mask is not None and mask.shape[1] == mask.shape[2] == 1:
+    several = query.shape[2] > 1  # for one query, copying all keys would cost more than the mask does
+    if query.is_cuda and half and several and mask is not None and mask.shape[1] == mask.shape[2] == 1:
         return unmasked_attention(query, key, value, mask, dropout, scale)
     return F.scaled_dot_product_attention(
         query, key, value, mask, dropout_p=dropout, is_causal=causal, scale=scale
@@ -58,39 +59,62 @@ def unmasked_attention(
 
 
 class LayerCache:
-    """Keys and values [B, H, size, D/H] of the positions one layer has seen; allocated once, at the first
-    append.
+    """Keys and values [2, B, H, size, D/H] of the positions one layer has seen, made at the first append.
+
+    `at` int64 [1] is where the next position is stored, by whoever decodes; without it the cache counts.
     """
 
-    def __init__(self, size: int) -> None:
-        self.size = size
+    def __init__(self, size: int, at: Tensor | None = None) -> None:
+        self.size, self.at = size, at
         self.length = 0
-        self.keys: Tensor | None = None
-        self.values: Tensor | None = None
+        self.pairs: Tensor | None = None
 
-    def append(self, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
-        """Store [B, H, L, D/H] more positions; return everything stored so far."""
-        if self.keys is None or self.values is None:
-            shape = (keys.shape[0], keys.shape[1], self.size, keys.shape[3])
-            self.keys, self.values = keys.new_empty(shape), values.new_empty(shape)
-        end = self.length + keys.shape[2]
+    def append(self, pairs: Tensor) -> tuple[Tensor, Tensor]:
+        """Store keys and values [2, B, H, L, D/H] of L more positions; return those of all stored so far, or
+        with `at` those of all `size` places.
+        """
+        if self.pairs is None:
+            # Zeros, since what a mask hides is still multiplied, by 0.
+            self.pairs = pairs.new_zeros((*pairs.shape[:3], self.size, pairs.shape[4]))
+        if self.at is not None:
+            self.pairs.index_copy_(3, self.at, pairs)
+            return self.pairs[0], self.pairs[1]
+        end = self.length + pairs.shape[3]
         if end > self.size:
             raise ValueError(f"the cache holds {self.size} positions, {end} were asked for")
-        self.keys[:, :, self.length : end] = keys
-        self.values[:, :, self.length : end] = values
+        self.pairs[:, :, :, self.length : end] = pairs
         self.length = end
-        return self.keys[:, :, :end], self.values[:, :, :end]
+        return self.pairs[0, :, :, :end], self.pairs[1, :, :, :end]
 
 
 class KVCache:
-    """One `LayerCache` a layer, for step-by-step decoding without gradient."""
+    """One `LayerCache` a layer, for step-by-step decoding without gradient.
 
-    def __init__(self, layers: int, size: int) -> None:
-        self.layers = [LayerCache(size) for _ in range(layers)]
+    With `at` nothing depends on how many positions are stored but for values on the device: each step has the
+    same shapes, and attention is over all `size` places, of which a mask hides those behind `at`.
+    """
+
+    def __init__(self, layers: int, size: int, at: Tensor | None = None) -> None:
+        self.size, self.at = size, at
+        self.layers = [LayerCache(size, at) for _ in range(layers)]
 
     @property
     def length(self) -> int:
         return self.layers[0].length
+
+    def positions(self, count: int) -> slice | Tensor:
+        """Return the indices of the next `count` positions; 1 with `at`."""
+        return slice(self.length, self.length + count) if self.at is None else self.at
+
+    def visible(self) -> Tensor | None:
+        """Return the places that hold positions up to `at`, bool [1, size]; None where all that come do."""
+        return None if self.at is None else torch.arange(self.size, device=self.at.device)[None] <= self.at
+
+    def clear(self) -> None:
+        """Forget what is stored at the places of `at`."""
+        for layer in self.layers:
+            if layer.pairs is not None:
+                layer.pairs.zero_()
 
 
 class SelfAttention(nn.Module):
@@ -113,10 +137,12 @@ class SelfAttention(nn.Module):
         """
         batch, length, dim = x.shape
         # Cut along the last dimension: the gradients of the three are put together by one copy, not by two.
-        query, key, value = (self._heads(part) for part in self.qkv(x).chunk(3, dim=-1))
+        projected = self.qkv(x)
+        query, key, value = (self._heads(part) for part in projected.chunk(3, dim=-1))
         if cache is not None:
             before = cache.length
-            key, value = cache.append(key, value)
+            pairs = projected[..., dim:].unflatten(-1, (2, self.heads, -1))
+            key, value = cache.append(pairs.permute(2, 0, 3, 1, 4))
             if causal and before and length > 1:
                 seen = torch.ones(length, before + length, dtype=torch.bool, device=x.device)
                 mask = seen.tril(diagonal=before)

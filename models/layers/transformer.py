@@ -196,6 +196,7 @@ class Transformer(nn.Module):
         """x [B, L, D]; mask bool [B, L] of visible positions or [B, L, S], or `causal`; cache to decode;
         memory [B, M, D] and its mask [B, M] or [B, L, M].
         """
+        mask = cache.visible() if mask is None and cache is not None else mask
         given, seen = (_added(mask, x), causal), (memory, _added(memory_mask, x))
 
         def step(index: int, x: Tensor) -> Tensor:
@@ -221,9 +222,9 @@ class Transformer(nn.Module):
         out: Tensor = block(x, *given)
         return out
 
-    def cache(self, size: int) -> KVCache:
-        """An empty cache of `size` positions for this stack."""
-        return KVCache(len(self.blocks), size)
+    def cache(self, size: int, at: Tensor | None = None) -> KVCache:
+        """An empty cache of `size` positions for this stack; with `at` int64 [1] they are stored there."""
+        return KVCache(len(self.blocks), size, at)
 
 
 class SkipTransformer(Transformer):

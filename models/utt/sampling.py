@@ -22,7 +22,7 @@ from torch.nn.functional import pad
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
-from motionloom.models.gpt.sampling import Drawing, decode, requested_groups, seeds_of, uniform_numbers
+from motionloom.models.gpt.sampling import Drawing, Rows, requested_groups, seeds_of, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, as_codes, slot_codes
 from motionloom.models.layers.frozen import evaluating
 from motionloom.models.utt.backbone import State
@@ -143,10 +143,11 @@ def generate(
         condition = _stacked(condition, null)
         z = None if z is None else torch.cat([z, z])
     frame_condition = utt.frame_condition(condition)
+    rows = Rows(utt, given, before, limit, uniform=uniform, free=groups is None, how=how, scale=scale)
     state: State | None = None
     seen = opened = 0
 
-    def hidden(step: int, tokens: Tensor) -> Tensor:
+    def draw(step: int) -> None:
         nonlocal state, seen, opened
         # Where the window has moved on, its positions are numbered anew and the cache is of no use.
         first = window_start(step, utt.config.block_size, size)
@@ -154,21 +155,19 @@ def generate(
         if state is None or fresh:
             state, seen, opened = utt.begin(condition, z), first, first
         kinds = utt.slots[torch.arange(seen, step, device=device) % size].expand(batch, -1)
-        x = utt.embed(tokens[:, seen:step], kinds)
+        x = utt.embed(rows.tokens[:, seen:step], kinds)
         at = 0 if fresh else seen - first + 1
         x = utt.motion_inputs(x.repeat(2, 1, 1) if guided else x, at, frame_condition, first=first)
         seen = step
-        return utt.backbone.extend(x, state)[:, -1:]
+        rows.draw(utt.backbone.extend(x, state)[:, -1:])
 
     with evaluating(utt):
-        tokens, counts = decode(
-            utt, hidden, given, before, limit, uniform=uniform, free=groups is None, how=how, scale=scale
-        )
+        tokens, counts = rows.run(draw)
     longest = int(counts.max()) if batch else 0
     # Rows start behind starts of different lengths; the result begins with each row's first new group.
     at = before[:, None] * size + torch.arange(longest * size, device=device)
-    rows = tokens.gather(1, at.clamp(max=max(0, tokens.shape[1] - 1))).view(batch, longest, size)
-    return as_codes(rows, utt.pattern, counts)
+    new = tokens.gather(1, at.clamp(max=max(0, tokens.shape[1] - 1))).view(batch, longest, size)
+    return as_codes(new, utt.pattern, counts)
 
 
 def _stacked(condition: Encoded, null: Encoded) -> Encoded:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from motionloom.datasets.schema import Config
-from motionloom.models.gpt.sampling import Drawing, decode, requested_groups, uniform_numbers
+from motionloom.models.gpt.sampling import Drawing, Rows, requested_groups, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
 from motionloom.models.layers.frozen import evaluating
 from motionloom.models.layers.transformer import LayerNorm
@@ -153,19 +153,18 @@ def draw_tokens(
     limit = requested_groups(groups, batch, most=net.max_groups, limit=net.max_groups, device=device)
     most = int(limit.max()) if batch else 0
     uniform = uniform_numbers(seeds, most * size, device)
+    start, before = torch.zeros(batch, 0, dtype=torch.int64, device=device), torch.zeros_like(limit)
+    rows = Rows(net, start, before, limit, uniform=uniform, free=groups is None, how=how, scale=None)
     with evaluating(net):
         read, state = net.read(text, mask)
 
-        def hidden(at: int, tokens: Tensor) -> Tensor:
+        def draw(at: int) -> None:
             nonlocal state
             x = net.start.expand(batch, -1)
             if at:
-                x = net.embed_at(tokens[:, at - 1], net.slots[(at - 1) % size].expand(batch))
+                x = net.embed_at(rows.tokens[:, at - 1], net.slots[(at - 1) % size].expand(batch))
             state = net.step(x, state, read)
-            return state[:, None]
+            rows.draw(state[:, None])
 
-        start, before = torch.zeros(batch, 0, dtype=torch.int64, device=device), torch.zeros_like(limit)
-        tokens, counts = decode(
-            net, hidden, start, before, limit, uniform=uniform, free=groups is None, how=how, scale=None
-        )
+        tokens, counts = rows.run(draw)
     return as_codes(tokens.view(batch, most, size), net.pattern, counts)
