@@ -31,12 +31,15 @@ class TrainingData:
         self.config, self.hardware = config, hardware
         self.train = train(config.batch_size // config.accumulate, rank(), world_size())
         self.validation = validation
-        self._held_out: DataLoader[Batch] | None = None
+        self._training: _Loader | None = None
+        self._held_out: _Loader | None = None
 
     def batches(self, step: int) -> DataLoader[Batch]:
         """All micro-batches from those of step `step` (from 0) to the end of the training."""
         parts = self.config.accumulate
-        return loader(Steps(lambda _, __: self.train, self.config.steps * parts, step * parts), self.hardware)
+        steps = Steps(lambda _, __: self.train, self.config.steps * parts, step * parts)
+        self._training = loader(steps, self.hardware)
+        return self._training
 
     def held_out(self) -> DataLoader[Batch]:
         """All validation batches; workers stay from one validation to the next."""
@@ -46,8 +49,11 @@ class TrainingData:
         return self._held_out
 
     def close(self) -> None:
-        """End the workers of the validation: they answer no signal, and the process would wait for them."""
-        self._held_out = None
+        """End all workers: they answer no signal, and the process would wait for them."""
+        for one in (self._training, self._held_out):
+            if one is not None:
+                one.close()
+        self._training = self._held_out = None
 
 
 def every_batch(validation: EvalSource) -> Steps[Batch]:
@@ -64,8 +70,17 @@ class _Loader(DataLoader[Batch]):
         with unsignalled():
             return super().__iter__()
 
+    def close(self) -> None:
+        """End the workers now; without this they end with the last reference to their iterator.
 
-def loader(steps: Steps[Batch], hardware: Hardware) -> DataLoader[Batch]:
+        An error that came from a worker holds its own traceback, and so the iterator, in a circle.
+        """
+        if self._iterator is not None:
+            self._iterator._shutdown_workers()  # type: ignore[attr-defined]
+            self._iterator = None
+
+
+def loader(steps: Steps[Batch], hardware: Hardware) -> _Loader:
     """A loader of batches that are whole already."""
     workers = hardware.workers_for(steps.last - steps.first)
     return _Loader(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-import resource
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -15,7 +14,6 @@ from rank_shares import require_shares
 from text_samples import WordLengths, caption_batches
 from torch.utils.data import DataLoader
 
-from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import frame_span
@@ -115,22 +113,6 @@ def test_loader_workers_change_nothing_and_a_run_resumes_anywhere(
         assert len(got) == 6 - start
         for one, other in zip(got, want[start:], strict=True):
             assert torch.equal(one, other)
-
-
-def test_shared_memory_that_takes_no_batch_is_an_error(train: ShardDataset, stats: FeatureStats) -> None:
-    """And no wait for ever. A limit on the size of files stands for memory that is full."""
-    batches = WindowBatches(train, stats, window=16, batch_size=8, seed=1)
-    loader = DataLoader(
-        Steps(lambda *_: batches, 6), batch_size=None, num_workers=1, multiprocessing_context="spawn"
-    )
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2**14, before[1]))
-    try:
-        with pytest.raises(RuntimeError) as caught:
-            next(iter(loader))
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert "hardware.workers" in str(sentence_of(caught.value))
 
 
 def test_caption_batches(train: ShardDataset, stats: FeatureStats, text: TextCache) -> None:

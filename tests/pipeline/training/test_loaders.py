@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import resource
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,13 +13,15 @@ from typing import Any
 
 import pytest
 import torch
+from tiny_adversaries import Vectors
 
+from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.lightning_data import StageData
-from motionloom.pipeline.training.loaders import on_device
+from motionloom.pipeline.training.loaders import TrainingData, on_device
 from motionloom.pipeline.training.trained_stage import Batches
 
 GIB = 2**30
@@ -68,6 +72,22 @@ def test_a_script_starts_workers_only_when_told(workers: int | str, wanted: int)
 def test_other_workers_are_refused(workers: object) -> None:
     with pytest.raises(UserError, match="workers"):
         Hardware.parse({"workers": workers}, "hardware")
+
+
+def test_shared_memory_that_takes_no_batch_ends_the_training_and_its_workers() -> None:
+    """A limit on the size of files stands for memory that is full."""
+    hardware = Hardware(accelerator="cpu", workers=2)
+    data = TrainingData(lambda *_: Vectors(2**12), None, TrainConfig(steps=8), hardware)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2**14, before[1]))
+    try:
+        with pytest.raises(RuntimeError) as caught:
+            next(iter(data.batches(0)))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "hardware.workers" in str(sentence_of(caught.value))
+    data.close()  # while the error still holds the iterator
+    assert not multiprocessing.active_children()
 
 
 def test_the_next_batch_is_copied_while_one_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
