@@ -234,14 +234,15 @@ class Benchmark:
         after = sha256_of(self.until(name, first=name) / "model.safetensors")
         return {"sha256": f"{before[:12]} {after[:12]}", "equal": "yes" if before == after else "no"}
 
-    def sampling(self, batch: int) -> Cells:
-        """Motions for one caption, `batch` at once."""
+    def sampling(self, batch: int, half: bool) -> Cells:
+        """Motions for one caption, `batch` at once, in float32 or under bfloat16's autocast."""
         bundle = Bundle.open(self.until("gpt").parents[1], self.device)
         seconds = min(FRAMES / bundle.layout.fps, bundle.max_seconds)
         for seed in range(2):  # the first one chooses kernels
             begin = time.perf_counter()
             how = {"seconds": seconds, "seed": seed, "batch": batch}
-            made = bundle.generate(["a person walks forward"] * batch, sampling=SamplingConfig(), **how)
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=half):
+                made = bundle.generate(["a person walks forward"] * batch, sampling=SamplingConfig(), **how)
             self.synchronize()
             took = time.perf_counter() - begin
         return {
@@ -304,7 +305,9 @@ def measurements(bench: Benchmark) -> Iterator[tuple[str, str, Callable[[], Cell
     for name in TRAINED:
         yield "trainings", name, partial(bench.training, name)
     for batch in (1, 32, 256):
-        yield "sampling", f"{batch} at once", partial(bench.sampling, batch)
+        for half in (False, True):
+            title = f"{batch} at once, {'bf16' if half else 'fp32'}"
+            yield "sampling", title, partial(bench.sampling, batch, half)
     for name in ("tokenizer", "gpt"):
         yield "bytes", name, partial(bench.again, name)
     for recipe in ("baselines-tiny", "baselines-tiny-ude"):
