@@ -147,9 +147,7 @@ MOST = 1e9
 
 
 def number(value: object, where: str, most: float = MOST, least: float = 0) -> float:
-    """The number that a field of a table or of JSON says; `UserError` beginning with `where` for anything
-    else, and beyond `least` to `most`.
-    """
+    """Return the number of a field; a `UserError` begins with `where`, also beyond `least` to `most`."""
     try:
         plain = not isinstance(value, str) or (value.isascii() and "_" not in value)
         found = float(value) if plain and isinstance(value, str | int | float) else math.nan

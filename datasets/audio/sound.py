@@ -280,9 +280,7 @@ def _length(path: Path, name: str) -> tuple[int, int]:
 
 @contextmanager
 def _opened(path: Path, name: str) -> Iterator[Any]:
-    """A `soundfile.SoundFile`, of length `_UNKNOWN` where an MP3 does not state it; `UserError` for all that
-    libsndfile finds wrong.
-    """
+    """Return a `soundfile.SoundFile`, its length `_UNKNOWN` if an MP3 has none; `UserError` if unreadable."""
     import soundfile  # only data with sound pays for the import
 
     try:
@@ -374,10 +372,7 @@ def _tag_bytes(file: BinaryIO) -> int:
 
 
 def _missing_mp3_bytes(file: BinaryIO, size: int) -> int:
-    """Return the bytes that an MP3 lacks of the length stated in its first frame; 0 where none is stated.
-
-    libsndfile fills what is missing with silence.
-    """
+    """Return the bytes an MP3 lacks of its stated length, or 0; libsndfile fills them with silence."""
     start = _tag_bytes(file)
     file.seek(start)
     frame = file.read(256)

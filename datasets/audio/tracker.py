@@ -62,10 +62,7 @@ _tracked: WeakKeyDictionary[Sound, Beats] = WeakKeyDictionary()
 
 
 def track(sound: Sound, power: NDArray[np.float32] | None = None) -> Beats:
-    """Return the beats of a whole piece, found once; none where it is shorter than two of the slowest.
-
-    `power` [T, 64] is that of its bands, where it is known.
-    """
+    """Return the beats of a piece, found once; none if it is too short. `power` [T, 64]: of its bands."""
     if sound not in _tracked:
         levels_in = levels(band_power(sound) if power is None else power)
         _tracked[sound] = decode(activations(load_beat_net(), levels_in))

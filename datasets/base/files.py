@@ -103,10 +103,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, data: object, *, sort_keys: bool = False, allow_nan: bool = False) -> None:
-    """Write JSON atomically; the same data gives the same bytes.
-
-    Keys stay in their order (a manifest reads best as its schema lists it) unless `sort_keys`.
-    """
+    """Write JSON atomically; equal data give equal bytes. Keys keep their order unless `sort_keys`."""
     text = json.dumps(data, indent=1, ensure_ascii=False, sort_keys=sort_keys, allow_nan=allow_nan)
     # Bytes of a file's name that are no UTF-8 are lone surrogates here, which no reader of JSON takes.
     write_text(path, re.sub("[\ud800-\udfff]", lambda half: f"\\\\u{ord(half[0]):x}", text) + "\n")

@@ -27,10 +27,7 @@ _CANNOT_LOCK = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 
 @contextmanager
 def file_lock(path: Path, *, wait: bool = True, shared: bool = False) -> Iterator[bool]:
-    """Hold the lock file `path`, made when absent, alone or together with others that hold it `shared`.
-
-    Gives false when another holds it and we do not `wait`.
-    """
+    """Hold the lock file `path`, alone or `shared`; yields False if it is taken and `wait` is off."""
     kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
         handle = _locked(path, kind | (0 if wait else fcntl.LOCK_NB))

@@ -57,9 +57,7 @@ def of_the_machine(error: BaseException) -> bool:
 
 
 def full_place(error: OSError, folder: Path) -> str:
-    """The place of an error that names no file: shared memory where that is full and the disk of `folder` is
-    not, else `folder`.
-    """
+    """Return the place of an error without a file: shared memory if that is full and the disk is not."""
     if error.errno not in _NO_MORE or not Path(SHARED_MEMORY).is_dir():
         return str(folder)
     shared_is_full = shutil.disk_usage(SHARED_MEMORY).free < _SPARE <= shutil.disk_usage(folder).free

@@ -59,9 +59,7 @@ class Suspect:
 
 
 def open_splits(root: Path, *, every: bool = False) -> dict[Split, ShardDataset]:
-    """The splits of a data set, those that are tested on first: of two clips that are the same the later, the
-    training's, is the one to go.
-    """
+    """Return the splits of a data set, training last: of two equal clips the later one is to go."""
     held = {shard.split for shard in load_manifest(root).shards}
     return {s: ShardDataset.open(root, s, every=every) for s in reversed(SPLITS) if s in held}
 

@@ -139,9 +139,7 @@ def _axes_last(matrices: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def multiply(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Matrix product over the two first axes: [3, 3, ...] times [3, K, ...] -> [3, K, ...]; the rest
-    broadcasts.
-    """
+    """Matrix product over the first two axes, [3, 3, ...] times [3, K, ...]; the rest broadcasts."""
     out = left[:, 0, None] * right[0]
     out += left[:, 1, None] * right[1]
     out += left[:, 2, None] * right[2]

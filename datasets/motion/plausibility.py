@@ -191,10 +191,7 @@ class PlausibilityStats:
         return float(np.median(self._columns()[3])) if len(self) else float("nan")
 
     def oddities(self, *, floor_at_zero: bool = False) -> list[Oddity]:
-        """Return faults of more than a few of the clips, the most serious first.
-
-        `floor_at_zero` for canonical motion, whose floor must be at height 0.
-        """
+        """Return faults of more than a few clips, the worst first; `floor_at_zero`: for canonical motion."""
         if not len(self):
             return []
         height, up, floor, above, toes, limbs = self._columns()

@@ -2,11 +2,11 @@
 
 Names hold a checksum of the content (or of the manifest that decides it), so a file is never out of date. One
 process downloads a file while the others that want it wait; it appears by a rename, whole or not at all.
-Locks are the kernel's (`flock`), so a killed process leaves none. The file unused for longest goes first;
-whoever has it mapped keeps its content until letting go.
+Locks are the kernel's (`flock`), so a killed process leaves none. The least recently used file is deleted
+first; a process that has it mapped keeps its content.
 
-Not fsspec's `filecache`: a file appears there under its URL's name as soon as it is downloaded, before a
-checksum can be compared; it has no limit of size; and processes that want one file each download it.
+fsspec's `filecache` would not do: there a file appears before its checksum can be compared, the size is not
+limited, and processes that want the same file each download it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from motionloom.datasets.base.lock import file_lock
 from motionloom.datasets.schema import Config, UserError, open_plain
 
 _OURS = re.compile(r"[0-9a-f]{64}\.(tar|index\.npz|manifest\.json)")
-"""Names of what is kept. Nothing else is ever deleted: a recipe may name any folder for the cache."""
+"""Names of cached files. No other file is ever deleted: a recipe may name any folder for the cache."""
 
 _PART = ".part"
 _LOCKS = ".locks"
@@ -37,7 +37,7 @@ class CacheConfig(Config):
     folder: str | None = None
     """A folder that processes and runs may share; unset means `motionloom/shards` in the user's cache."""
     gigabytes: float = Field(50.0, gt=0)
-    """Size limit (10^9 bytes); the shards unused for longest go first."""
+    """Size limit (10^9 bytes); the least recently used shards are deleted first."""
 
     @property
     def limit(self) -> int:
@@ -65,10 +65,7 @@ class FileCache:
         return file
 
     def get(self, name: str, size: int, make: Callable[[Path], object]) -> BinaryIO:
-        """Open the file `name`. `make` writes it to the path that it gets when it is not cached yet.
-
-        `size` (bytes, 0 if unknown) is made room for.
-        """
+        """Open the file `name`; if missing, free `size` bytes and let `make` write it to a path."""
         if size > self.limit:
             raise UserError(
                 f"{self.folder}: a file of {size} bytes is larger than the cache's limit of {self.limit}; "
@@ -96,7 +93,7 @@ class FileCache:
         return file
 
     def _make_room(self, size: int, keep: str = "") -> None:
-        """Delete the files unused for longest until `size` more bytes fit, and what killed processes left."""
+        """Delete temporary files of killed processes, and the oldest files until `size` bytes fit."""
         files = []
         used = size
         with os.scandir(self.folder) as entries:
@@ -124,7 +121,7 @@ class FileCache:
 
     @contextmanager
     def _lock(self, name: str, *, wait: bool = True) -> Iterator[bool]:
-        """Hold the lock that `name` shares with a few others; false when it is taken and we do not wait."""
+        """Context with the lock of `name` and a few others; False if it is taken and `wait` is off."""
         path = self.folder / _LOCKS / name[:2]
         with ExitStack() as stack:
             try:

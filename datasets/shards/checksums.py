@@ -1,8 +1,7 @@
 """Shards of a folder compared with the sha256 of their manifest.
 
-The indexed reader maps files and takes clips out of them, so a flipped bit would be trained on without a
-word. Whole files are compared before they are read, at the speed of the disk, and what a file was like then
-tells whether it has been touched since.
+The indexed reader maps files and reads single clips, so a flipped bit would be trained on unnoticed. Whole
+files are compared before they are read, at the speed of the disk; size, times and inode show later changes.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ def require_intact(shard: LocalShard, *, content: bool = True) -> None:
 
 
 def fault_of(shard: LocalShard, *, content: bool = True) -> str:
-    """Return what makes a shard another than the manifest's, in words; empty when nothing does."""
+    """Return in words how a shard differs from the manifest; empty if it does not."""
     require_plain(shard.path)
     size = shard.path.stat().st_size
     if size != shard.info.bytes:
@@ -67,10 +66,7 @@ def fault_of(shard: LocalShard, *, content: bool = True) -> str:
 def problems(
     shards: Sequence[LocalShard], threads: int, done: Callable[[], object] = lambda: None
 ) -> list[str]:
-    """Return the faults of shards, in their order; `done` is called for each that has been compared.
-
-    Hashing runs outside the interpreter's lock.
-    """
+    """Return the faults of shards, in order; `done` is called after each. Hashing releases the GIL."""
 
     def problem(shard: LocalShard) -> str | None:
         try:

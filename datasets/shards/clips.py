@@ -1,4 +1,4 @@
-"""`ClipDataset`: what batches, statistics and stages ask of a data set, be it one folder, a URL or a mix."""
+"""`ClipDataset`: the interface of a data set for batches, statistics and stages: a folder, a URL or a mix."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ClipDataset(Protocol):
 
     @property
     def present(self) -> NDArray[np.uint8]:
-        """Parts that every clip holds beside its body, bits of `ClipMeta.present`, [n]."""
+        """Parts beside the body that each clip has, bits of `ClipMeta.present`, [n]."""
         ...
 
     @property
@@ -69,5 +69,5 @@ class ClipDataset(Protocol):
         ...
 
     def parts(self) -> Sequence[tuple[ClipDataset, float]]:
-        """(data set, weight) of what it is made of; itself when it is one."""
+        """(data set, weight) of each part of a mix; itself if it is none."""
         ...

@@ -1,8 +1,7 @@
 """A data set carried from one place to another: a folder, a bucket, or a data set on the hub.
 
-A file that lies at the target with its sha256 is not sent again, so a copy that was killed goes on where it
-was. What was sent is compared there. The manifest goes last, and one of an older state is taken away first:
-no reader ever takes half a copy for a whole one.
+Files that the target has with their sha256 are not sent again, so a killed copy is resumed; sent files are
+compared there. The manifest goes last, and an older one is deleted first: no reader sees half a copy.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Copied(NamedTuple):
 
 
 def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
-    """Carry the data set at `source` to `target`, folders or URLs. Raises `UserError` for a damaged byte."""
+    """Copy the data set at `source` to `target`, folders or URLs; `UserError` if a byte is damaged."""
     here, there = open_store(source), open_store(target)
     if there.place.startswith("http"):
         raise UserError(f"{target}: a web server is only read; name a folder, s3://… or hf://datasets/…")
@@ -66,7 +65,7 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
 
 
 def _make_way(there: Store, manifest: Manifest, digest: str) -> None:
-    """Take the manifest of an older state away, and first what it alone may have."""
+    """Delete an older manifest at the target, after the files that it alone names."""
     if _digest(there, MANIFEST_FILE) in (None, digest):
         return
     old, _ = read_manifest(there)
@@ -79,7 +78,7 @@ def _make_way(there: Store, manifest: Manifest, digest: str) -> None:
 
 
 def _carry(here: Store, there: Store, name: str, wanted: str | None, folder: Path) -> bool:
-    """Send a file unless it is there, and compare it then; whether it was sent."""
+    """Send a file unless the target has it, compare it there, and return whether it was sent."""
     if wanted is not None and _digest(there, name) == wanted:
         return False
     source, target, path = here.where(name), there.where(name), folder / name
@@ -107,7 +106,7 @@ def _carry(here: Store, there: Store, name: str, wanted: str | None, folder: Pat
 
 
 def _digest(store: Store, name: str) -> str | None:
-    """sha256 of a file as it lies there, by its bytes or the hub's own record of them; None without one."""
+    """Return the sha256 of a stored file, from its bytes or the hub's record; None if it is missing."""
     where = store.where(name)
 
     def digest() -> str:

@@ -1,6 +1,6 @@
-"""The end of a conversion: list of what was left out, `index.npz` and `manifest.json` over finished shards.
+"""The end of a conversion: list of clips left out, `index.npz` and `manifest.json` of finished shards.
 
-A whole run ends with it; parts leave a record each (`Planned`), by which `join_parts` does the same later.
+Parts of a conversion leave a record each (`Planned`), from which `join_parts` does the same later.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ PARTS_FOLDER = ".parts"
 
 
 class Planned(Config):
-    """All that a finished set says beside its shards; equal in all parts of one conversion."""
+    """Facts of a finished set beside its shards; equal in all parts of one conversion."""
 
     manifest: Manifest
-    """Without shards; `dropped` are those that the plan left out."""
+    """Manifest without shards; `dropped` are the clips that the plan left out."""
     fingerprints: dict[str, str]
     """Fingerprint of every shard of all parts by its name, in the manifest's order."""
     items: int
@@ -52,7 +52,7 @@ class Planned(Config):
     """As in `DatasetFacts`."""
 
     def with_results(self, results: Sequence[Result]) -> Manifest:
-        """The manifest of shards that are made."""
+        """Return the manifest with finished shards."""
         shards = [shard for shard, _ in results if shard is not None]
         failed = [drop for _, drops in results for drop in drops]
         return self.manifest.model_copy(
@@ -61,7 +61,7 @@ class Planned(Config):
 
 
 def leave_record(out: Path, part: Part, planned: Planned) -> None:
-    """Write a part's record; none where all is made and joined already."""
+    """Write a part's record, unless the set is joined already."""
     if not (out / MANIFEST_FILE).exists():
         write_json(out / PARTS_FOLDER / f"{part.number}-of-{part.count}.json", planned.dump())
 
@@ -114,7 +114,7 @@ def _require_one_plan(out: Path, records: Mapping[Part, Planned]) -> Planned:
 
 
 def differences(before: Manifest, now: Manifest) -> str:
-    """Options that differ, at most three of them, as `fps 20.0 -> 10.0`; the source is no option."""
+    """Return up to three options that differ, as `fps 20.0 -> 10.0`; the source does not count."""
     old, new = (one.dump()["options"] | {"layout": one.layout, "fps": one.fps} for one in (before, now))
     keys = [key for key in sorted({*old, *new} - {SOURCE_CHECKSUM}) if old.get(key) != new.get(key)]
     told = [_difference(key, old.get(key), new.get(key)) for key in keys[:3]]
@@ -129,10 +129,7 @@ def _difference(key: str, before: object, now: object) -> str:
 
 
 def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
-    """Write all that a finished set has beside its shards, the manifest last.
-
-    `UserError` when no clip, or too few of the clips, became samples.
-    """
+    """Write the files beside the shards, the manifest last; `UserError` if too few clips became samples."""
     manifest = planned.with_results(results)
     manifest = manifest.model_copy(update={"excluded": Decisions.of(out).left_out})
     failed = manifest.dropped[len(planned.manifest.dropped) :]

@@ -1,4 +1,4 @@
-"""Places of all members: one JSON index per shard, one `index.npz` for the whole dataset.
+"""Offsets of all members: one JSON index per shard, one `index.npz` for the whole dataset.
 
 `NAME-SPLIT-000000.index.json` (`ShardIndex`) is readable and stands beside its tar; its presence means the
 tar is whole. `index.npz` holds the same offsets as flat arrays, one set per split (`train.frames`, ...), so
@@ -62,9 +62,9 @@ class ClipEntry(Config):
     key: str
     id: str
     source: str
-    """The item it was made of, as reports name it."""
+    """Name of its source item in reports."""
     made_from: str
-    """Digest of all that its bytes depend on."""
+    """Digest of everything that its bytes depend on."""
     held: int
     """Bits of `ClipMeta.present`."""
     frames: int
@@ -90,11 +90,11 @@ class ShardIndex(Config):
     clips: list[ClipEntry]
     dropped: list[Dropped]
     made_on: str = ""
-    """Kinds of processor, by which the last digits of a clip may differ; of clips that were kept, theirs."""
+    """Kinds of processor on which the clips were made: last digits may differ between them."""
 
     @property
     def kinds(self) -> set[str]:
-        """`made_on` one by one; empty for shards that were made before this was kept."""
+        """The kinds in `made_on`; empty if the index does not say."""
         return set(filter(None, self.made_on.split(", ")))
 
 
@@ -104,7 +104,7 @@ def index_path(tar: Path) -> Path:
 
 
 def clip_entries(path: Path, written: list[Written]) -> list[ClipEntry]:
-    """Index rows of a tar as it lies on the disk; `written` says the rest of its clips, in order."""
+    """Return the index rows of a tar on disk; `written` holds further facts of its clips, in order."""
     entries = []
     with open_plain(path) as file:
         for clip, about in zip(scan_tar(path), written, strict=True):
@@ -266,7 +266,7 @@ def _wrong_frames(index: SplitIndex, shards: list[ShardInfo], firsts: NDArray[np
 
 
 def _outside(index: SplitIndex, shards: list[ShardInfo], firsts: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Per shard: any member, or any motion's values, that leave the file. Column by column, to stay small."""
+    """Return for each shard whether a member or motion lies outside the file; by columns, to save memory."""
     size = np.array([shard.bytes for shard in shards], dtype=np.int64)
     wrong = np.zeros(len(shards), dtype=np.bool_)
     for column in range(len(MEMBERS)):

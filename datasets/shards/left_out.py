@@ -1,7 +1,6 @@
 """Clips left out of a data set: by reason, counted, and listed in a file beside the shards.
 
-Reasons differ from clip to clip in names and numbers (`0.67 s, shorter than 1 s`); those that differ in
-nothing else are one group: twenty identical messages are one line.
+Reasons that differ in names and numbers alone (`0.67 s, shorter than 1 s`) form one group, shown as one line.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ def drop(label: str, error: Exception) -> Dropped:
 
 @dataclass(frozen=True)
 class Group:
-    """Messages that say the same of different things."""
+    """Messages that differ in names and numbers alone."""
 
     kind: str
     """The reason with `…` for what differs."""
@@ -50,7 +49,7 @@ class Group:
 
 
 def kind_of_reason(reason: str, source: str = "") -> str:
-    """A reason without what differs from clip to clip: its name, quoted words, other files, numbers."""
+    """Return a reason with `…` for names, quoted words, files and numbers, which differ from clip to clip."""
     text = reason.replace(source, "…") if source else reason
     text = _FILE.sub("…", _QUOTED.sub("'…'", text))
     return _NUMBER.sub("…", text)[:200]
@@ -66,7 +65,7 @@ def grouped(dropped: Iterable[Dropped]) -> list[Group]:
 
 
 def grouped_notes(notes: Sequence[str]) -> list[str]:
-    """Notes in their order; four or more of one kind are one line with their number and the first of them."""
+    """Return notes in order; four or more of one kind become one line with their number and the first."""
     kinds: dict[str, list[str]] = defaultdict(list)
     for note in notes:
         kinds[kind_of_reason(note)].append(note)

@@ -43,7 +43,7 @@ class Part:
 
 @dataclass(frozen=True)
 class DatasetFacts:
-    """Everything of a data set's manifest that is known before the first clip is converted."""
+    """Facts of a data set's manifest that are known before the first clip is converted."""
 
     name: str
     layout: MotionLayout
@@ -57,19 +57,19 @@ class DatasetFacts:
     licences: dict[str, int] = field(default_factory=dict)
     """Clips under each licence, for sources that mix several."""
     credits: Sequence[str] = ()
-    """Sentences that these licences ask for."""
+    """Attributions that these licences require."""
     audio: dict[str, object] | None = None
-    """Settings the audio features are made with."""
+    """Settings of the audio features."""
     dropped: Sequence[Dropped] = ()
     """Clips that the plan has left out already."""
     lost: Sequence[Dropped] = ()
     """Clips among `dropped` that were meant to become samples."""
     most_lost: float = 1.0
-    """Share of the clips that may be lost; where more are, the finished set is said to be unfit."""
+    """Largest share of the clips that may be lost; beyond it the conversion fails."""
     notes: Sequence[str] = ()
 
     def made_from(self) -> dict[str, object]:
-        """Return everything that the bytes of every clip depend on, beside its own source."""
+        """Return everything that the bytes of all clips depend on, apart from their sources."""
         layout = self.layout
         options = {key: value for key, value in self.options.items() if key != SOURCE_CHECKSUM}
         return {

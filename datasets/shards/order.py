@@ -36,7 +36,7 @@ class Source:
 
 
 def source_order(source: Source, *key: int) -> NDArray[np.int64]:
-    """All items of one source once, [count], by the key."""
+    """Return all items of a source once, [count], in the order of the key."""
     if source.shards is None:
         return source.first + permutation(source.count, *key)
     numbers, shard = np.unique(source.shards, return_inverse=True)
@@ -71,7 +71,7 @@ def mixed_order(
 
 
 def shares(sources: Sequence[Source], size: int) -> list[int]:
-    """Places of each source among `size`, by largest remainder; `UserError` when one would get none."""
+    """Return each source's share of `size` items, by largest remainder; `UserError` if one would get none."""
     total = sum(source.weight for source in sources)
     wanted = np.array([source.weight / total * size for source in sources])
     counts = np.floor(wanted).astype(np.int64)

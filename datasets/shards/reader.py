@@ -1,6 +1,6 @@
 """`ShardDataset`: random access to the clips of one split, in a folder or on a server.
 
-Clips that the manifest excludes (`motionloom data clean`) are skipped: numbers count the others alone.
+Clips that the manifest excludes (`motionloom data clean`) are skipped and have no number.
 
 Opening reads `manifest.json` and the split's arrays of `index.npz`, and, in a folder, looks at the sizes of
 the shard files; no shard is opened before one of its clips is asked for. A motion is then a view into the
@@ -51,7 +51,7 @@ _MOTION = MEMBERS.index("motion.npy")
 _SHARD_NAME = re.compile(r"[A-Za-z0-9_-]+-(?:train|val|test)-(\d{6,})\.tar")
 
 OPEN_SHARDS = 256
-"""Shards mapped at a time in one process; the least recently used is let go."""
+"""Shards mapped at a time in one process; the least recently used is unmapped."""
 
 
 def load_manifest(root: Path) -> Manifest:
@@ -97,7 +97,7 @@ class MappedShards:
             self._most = max(1, min(OPEN_SHARDS, room // (8 * max(shard.bytes for shard in shards))))
 
     def member(self, shard: int, clip: int, column: int) -> tuple[mmap.mmap, int]:
-        """(buffer, its byte where the member starts). Views keep a map that is let go alive."""
+        """Return (buffer, offset of the member in it). Views keep an unmapped shard alive."""
         mapped = self.maps.get(shard)
         if mapped is None:
             mapped = self._map(shard)
@@ -238,7 +238,7 @@ class ShardDataset:
         return signal, int(rate)
 
     def let_go(self) -> None:
-        """Unmap the shards: for who reads all clips once, whose memory they would fill."""
+        """Unmap the shards, to free memory after all clips were read once."""
         self._access.maps.clear()
 
     def _captions(self, i: int, member: str) -> list[Caption]:

@@ -1,4 +1,4 @@
-"""`Sample`: what a converter hands to the shard writer, and its encoding as WebDataset members.
+"""`Sample`: a clip from a converter, and its encoding as WebDataset members.
 
 | member            | content |
 |-------------------|---------|
@@ -51,7 +51,7 @@ class Sample:
 def encode_sample(
     sample: Sample, *, split: Split, layout: MotionLayout, motion_type: MotionType
 ) -> dict[str, bytes]:
-    """Member name -> bytes. The writer sets `split` and `frames` of the metadata itself.
+    """Return bytes by member name; `split` and `frames` of the metadata are set here.
 
     Raises `ValueError` when the arrays or the metadata do not fit the layout or hold NaN or infinity.
     """

@@ -107,10 +107,7 @@ class LocalStore:
 
 
 class RemoteStore:
-    """A URL. What is read is kept in a cache, whole.
-
-    Data sets of one process share connections; another process (forked or spawned) opens its own.
-    """
+    """A URL, whose files are cached whole. Stores of one process share connections."""
 
     def __init__(self, url: str, cache: CacheConfig) -> None:
         self.place = url
@@ -132,7 +129,7 @@ class RemoteStore:
         return raw
 
     def open_index(self, digest: str) -> BinaryIO:
-        """The manifest holds the shards' checksums, so its own decides the index's content."""
+        """Open `index.npz`, cached under the manifest's checksum, which decides its content."""
         url = self.where(INDEX_FILE)
 
         def fetch(path: Path) -> None:
@@ -141,7 +138,7 @@ class RemoteStore:
         return self.cache.get(f"{digest}.index.npz", 0, fetch)
 
     def open_shard(self, shard: ShardInfo) -> BinaryIO:
-        """A shard in the cache was checked against the manifest's sha256 when it arrived."""
+        """Open a shard in the cache, where it was compared with the manifest's sha256 when it arrived."""
         return self.cache.get(f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path))
 
     def _fetch(self, shard: ShardInfo, path: Path) -> None:
@@ -165,10 +162,7 @@ Store = LocalStore | RemoteStore
 
 @lru_cache(maxsize=4)
 def _connect(scheme: str, pid: int, settings: tuple[tuple[str, str], ...]) -> Any:
-    """An fsspec file system of this process and environment.
-
-    Its own retries are off: `persist` is the only one that repeats.
-    """
+    """An fsspec file system of this process and environment, without retries of its own (see `persist`)."""
     try:
         import fsspec
 
@@ -254,7 +248,7 @@ def persist(what: str, action: Callable[[], T], *, first: bool = False) -> T:
 
 
 def _refusal(error: Exception) -> str | None:
-    """Return why repeating cannot help, or None when it may."""
+    """Return why an error is final, or None if repeating may help."""
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return "the disk of the cache folder is full; free space or lower the cache's gigabytes"
     if isinstance(error, TimeoutError):

@@ -35,10 +35,7 @@ class TarClip:
 
 
 def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
-    """The clips of a shard in the order they stand; `UserError` names what is wrong with the file.
-
-    `most` is how many clips it may have.
-    """
+    """Return the clips of a shard in order, at most `most`; a `UserError` names the fault."""
     clips: list[TarClip] = []
     seen: set[str] = set()
     size, end = require_plain(path), 0
@@ -75,9 +72,7 @@ def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
 
 
 def _entries(path: Path, file: BinaryIO) -> Iterator[tarfile.TarInfo]:
-    """The headers of a tar, one block each: `tarfile.open` would read longer ones whole, of any size that
-    they state, and no shard has them.
-    """
+    """Yield a tar's headers of one block each; `tarfile.open` would read longer ones of any stated size."""
     at = 0
     while (block := file.read(tarfile.BLOCKSIZE)).strip(b"\0"):
         try:
@@ -115,7 +110,7 @@ def _require_whole(path: Path, clips: list[TarClip]) -> None:
 
 
 def _check_end(path: Path, end: int) -> None:
-    """After the last entry come zeros: tar readers pass over anything else without a word."""
+    """Refuse anything but zeros after the last entry, which tar readers would ignore."""
     with path.open("rb") as file:
         file.seek(end)
         while block := file.read(1 << 20):

@@ -1,8 +1,7 @@
-"""One shard as one task: what it depends on, how it is made, how a finished one is recognised.
+"""One shard as one task: its fingerprint, its writing, and reuse of a finished one.
 
-A task carries everything its bytes depend on and its fingerprint hashes the same, so tasks may run in any
-order, in any process or as the elements of a cluster's job array, and a second run keeps what the first one
-finished.
+A task holds everything that its bytes depend on, and its fingerprint is the hash of that. So tasks may run in
+any order, in any process or as elements of a cluster's job array, and a second run keeps finished shards.
 """
 
 from __future__ import annotations
@@ -36,9 +35,9 @@ class ShardItem(NamedTuple, Generic[T]):
     """One item of a shard."""
 
     name: str
-    """In reports."""
+    """Name in reports."""
     made_from: str
-    """Digest of all that its clips depend on."""
+    """Digest of everything that its clips depend on."""
     item: T
 
 
@@ -69,9 +68,9 @@ def plan_shards(
 ) -> list[ShardTask[T]]:
     """Return the shards with their items in order: known before the first one is converted.
 
-    With `depends_on`, what the content of an item is, they are ordered by a hash of their names: when others
-    come and go, those that stay keep their neighbours, so that a shard finds them in few old ones. Items that
-    are `removed` leave their places empty, so that no other goes to another shard.
+    With `depends_on`, which returns an item's content, items are ordered by a hash of their names: they keep
+    their neighbours when others come and go, so that a new shard takes its clips from few old ones. `removed`
+    items leave their places empty, so that no other item moves to another shard.
     """
     tasks: list[ShardTask[T]] = []
     made_from = sha256_of_json(facts.made_from())
@@ -166,7 +165,7 @@ def _key(task: ShardTask[T], item: ShardItem[T], clip_id: str) -> str:
 
 
 def _processor() -> str:
-    """Kind and widest instructions of the processor, such as `x86_64 AVX2`: what sums are rounded by."""
+    """Return kind and widest instructions of the processor, which decide rounding: `x86_64 AVX2`."""
     import torch
 
     return f"{platform.machine()} {torch.backends.cpu.get_cpu_capability()}"
@@ -196,7 +195,7 @@ def _index_of(tar: Path) -> tuple[set[str], dict[str, list[ClipEntry]]]:
 
 @lru_cache(maxsize=8)
 def _read_index(tar: Path, changed: int) -> tuple[set[str], dict[str, list[ClipEntry]]]:
-    """`changed` tells the shards apart that lay at this place."""
+    """Read an index, cached by path and time of change."""
     index, clips_by_origin = ShardIndex.load_json(index_path(tar)), dict[str, list[ClipEntry]]()
     for clip in index.clips:
         clips_by_origin.setdefault(clip.made_from, []).append(clip)
@@ -204,7 +203,7 @@ def _read_index(tar: Path, changed: int) -> tuple[set[str], dict[str, list[ClipE
 
 
 def _convert_item(task: ShardTask[T], convert: Convert[T], item: ShardItem[T]) -> Encoded | Dropped:
-    """The samples of one item, or why there are none."""
+    """Return the samples of one item, or the reason why it has none."""
     label = item.name
     try:
         output = convert(item.item)

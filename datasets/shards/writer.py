@@ -91,11 +91,11 @@ def dataset_writer(
     depends_on: Callable[[T], object] | None = None,
     removed: Sequence[tuple[Split, T]] = (),
 ) -> Iterator[DatasetWriter[T]]:
-    """Take hold of `out` and look at what is finished there, for work between that and the writing.
+    """Context that locks `out` and compares it with the plan, for work between that and the writing.
 
-    `describe` names an item in reports and in the digest that decides whether what an earlier run made of it
-    is kept, so it must not change between runs. `depends_on` says what the item's content is, as plain JSON;
-    without it only names and the facts' options are compared. `removed` as for `plan_shards`.
+    `describe` names an item in reports and in the digest by which an earlier run's clips are kept, so it must
+    not change between runs. `depends_on` returns the item's content as plain JSON; without it only names and
+    the facts' options are compared. `removed` as for `plan_shards`.
     """
     how = how or WriteOptions()
     _check_arguments(facts, how)
@@ -131,7 +131,7 @@ class DatasetWriter(Generic[T]):
             remove_strays(out, self._planned)
 
     def _take_over(self, tasks: list[ShardTask[T]]) -> None:
-        """Put the shards of an earlier run aside that are not as planned, and plan to keep their clips."""
+        """Move an earlier run's shards that differ from the plan aside, and plan to keep their clips."""
         folder = self.out / OLD_FOLDER
         # Shards that do not fit the plan move aside first: their names now belong to other clips.
         finished = {task.path for task, result in zip(tasks, self._results, strict=True) if result}
@@ -187,10 +187,7 @@ class DatasetWriter(Generic[T]):
         return [item.item for task in tasks for item in task.items if item.made_from not in task.kept]
 
     def write(self, convert: Convert[T]) -> Manifest:
-        """Write the shards that are not finished; then, unless this is a part, index and manifest.
-
-        A part returns a manifest that covers the part alone.
-        """
+        """Write unfinished shards and, unless this is a part, index and manifest; a part's covers itself."""
         part = self._how.part
         if part is None:
             return finish(self.out, self._planned, self._shards(convert))
@@ -254,7 +251,7 @@ def _check_arguments(facts: DatasetFacts, how: WriteOptions) -> None:
 
 
 def _require_same(out: Path, now: Manifest) -> None:
-    """Never write over another dataset, or over a finished one that was made with other options."""
+    """Refuse to write over another dataset, or over a finished one with other options."""
     path = out / MANIFEST_FILE
     try:
         before = Manifest.parse(parse_json(read_plain(path), str(path)), str(path))

@@ -171,10 +171,7 @@ def _parts(keys: Sequence[bytes], texts: dict[bytes, str], place: Path) -> list[
 
 
 def _encode_part(part: _Part, encoder: TextEncoder) -> None:
-    """Write `sentence` [n, E], `lengths` [n] and `tokens` [sum, E], in the order of the part's captions.
-
-    Encoded by length, so that little is padded.
-    """
+    """Write `sentence` [n, E], `lengths` [n] and `tokens` [sum, E]; encoded by length to pad little."""
     order = sorted(range(len(part.captions)), key=lambda i: (len(part.captions[i]), i))
     sentence = np.empty((len(order), encoder.dim), dtype=np.float32)
     tokens: list[NDArray[np.float16]] = [np.empty((0, encoder.dim), dtype=np.float16)] * len(order)

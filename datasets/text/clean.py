@@ -70,10 +70,7 @@ _NOT = {"not", "no", "without", "never", "isn't", "doesn't"}
 
 
 def emotion_of(captions: Iterable[str]) -> str | None:
-    """The emotion that captions name, or None where they name none or several.
-
-    A word behind "not", "no", "without" or "never" names nothing.
-    """
+    """The emotion that captions name; None if none or several. Negated words do not count."""
     found = set()
     for caption in captions:
         words = re.findall(r"[a-z']+", caption.lower())

@@ -156,10 +156,7 @@ class Mate(nn.Module):
 
 
 def drop_conditions(conditions: Conditions, drop: Tensor) -> dict[str, Condition]:
-    """The conditions with every modality removed from the rows where `drop`, bool [B], is true.
-
-    Training some rows so is what classifier-free guidance needs.
-    """
+    """Conditions without any modality in rows where `drop`, bool [B], is true (classifier-free guidance)."""
     out = {}
     for name, (features, mask, pooled) in conditions.items():
         out[name] = Condition(

@@ -64,9 +64,7 @@ class EvaluatorModule(AlternatingModule):
         )
 
     def losses_of(self, group: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Losses of a batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
-        [B, D] (optional: all).
-        """
+        """Losses of "motion" [B, T, D], "length" [B], "conditions" with "text", optional "present" [B, D]."""
         net, motion, length, present = self.net, batch["motion"], batch["length"], batch.get("present")
         if group == MATCHING:
             text = batch["conditions"]["text"]

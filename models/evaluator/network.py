@@ -199,9 +199,7 @@ class Evaluator(nn.Module):
         return latent
 
     def encode_text(self, words: Tensor, mask: Tensor, classes: Tensor | None = None) -> Tensor:
-        """words [B, S, E], mask bool [B, S] (True = real, at the front), `classes` one-hot [B, S, G] where
-        words have some -> latents [B, Z].
-        """
+        """words [B, S, E], mask bool [B, S], `classes` one-hot [B, S, G] or None -> latents [B, Z]."""
         if words.shape[-1] != self.text_dim:
             raise ValueError(
                 f"this evaluator was built for {self.text_dim} text features, got {words.shape[-1]}"

@@ -73,11 +73,7 @@ def closing_length(pattern: Sequence[str]) -> int:
 
 
 def slot_codes(codes: Mapping[str, Tensor], pattern: Sequence[str]) -> Tensor:
-    """Return the codes of every slot, int64 [B, G, P], of streams [B, G * per_group].
-
-    Raises:
-        ValueError: Streams disagree about the number of groups.
-    """
+    """Return codes of every slot, int64 [B, G, P]; `ValueError` if streams differ in groups."""
     # A stream with two tokens in a group fills two slots of the pattern, in turn.
     per_group = {name: list(pattern).count(name) for name in pattern}
     count = codes[pattern[0]].shape[1] // per_group[pattern[0]]
@@ -235,9 +231,7 @@ class TokenNetwork(nn.Module):
         return out if known is None else out.masked_fill(~known[:, :-1, None], 0.0)
 
     def logits(self, hidden: Tensor, kinds: Tensor, legal: Tensor) -> Tensor:
-        """Hidden states [B, L, D], kinds [B, L], legal bool [B, L, V] -> float32 [B, L, V], -inf where
-        illegal.
-        """
+        """Hidden states [B, L, D], kinds [B, L], legal [B, L, V] -> float32 [B, L, V], -inf where illegal."""
         hidden = hidden.to(product_type(hidden))  # once, not for each head
         out = torch.full((*kinds.shape, self.vocabulary), -torch.inf, device=hidden.device)
         for kind, head in enumerate(self.heads):
@@ -256,9 +250,7 @@ class TokenNetwork(nn.Module):
         return self.legal_at(end, first, closing)
 
     def legal_at(self, end: Tensor, first: Tensor, closing: Tensor) -> Tensor:
-        """Bool [..., V] for positions with End token `end`, at a group's first slot or not, after an End or
-        not.
-        """
+        """Bool [..., V] for positions with End token `end`, at a group's first slot, after an End."""
         code = torch.arange(self.vocabulary, device=end.device)
         codes = (code < end[..., None]) & ~closing[..., None]
         ending = (code == end[..., None]) & (first | closing)[..., None]

@@ -65,9 +65,7 @@ def motion_beats(
 def beat_align(
     joints: NDArray[np.floating], music: NDArray[np.floating], fps: float, definition: str = "bailando"
 ) -> float:
-    """Beat Align of joints [T, N, 3] and music beats in seconds [M], one of them within the motion; 0 to 1, 0
-    without motion beats.
-    """
+    """Beat Align, 0 to 1, of joints [T, N, 3] and music beats in seconds [M]; 0 without motion beats."""
     how = DEFINITIONS[definition]
     last = len(joints) - (0 if how.late else 1)
     # Beats on the last frame have no step of their own; rounding keeps frame / fps * fps whole.

@@ -57,10 +57,7 @@ def kinetic_features(joints: NDArray[np.floating]) -> Array:
 
 
 def _windowed(values: Array, first: int, frames: int) -> Array:
-    """Means over frames t - 2 .. t + 2 for t = 1 .. frames - 1; `values[0]` is frame `first`'s.
-
-    Frames outside of the values are left out of the mean.
-    """
+    """Means over frames t - 2 .. t + 2, t = 1 .. frames - 1; `values` begin with frame `first`."""
     sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
     centre = np.arange(1, frames)
     begin = np.clip(centre - WINDOW - first, 0, len(values))

@@ -59,9 +59,7 @@ def _two_draws(count: int, pairs: int, seed: int) -> tuple[Tensor, Tensor]:
 
 
 def diversity(x: Tensor, *, pairs: int = 300, seed: int = 0) -> Tensor:
-    """Mean distance of `pairs` random pairs of rows of x [N, Z]; with N < `pairs`, of N pairs. Scalar
-    float64. `ValueError` for a single row, which differs from nothing.
-    """
+    """Mean distance (float64) of min(`pairs`, N) random pairs of rows [N, Z]; `ValueError` for one row."""
     if len(x) < 2:
         raise ValueError(f"diversity of {len(x)} rows: 2 or more are needed")
     first, second = _two_draws(len(x), min(pairs, len(x)), seed)

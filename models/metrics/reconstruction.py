@@ -39,9 +39,7 @@ class JointErrors(NamedTuple):
 
 
 def mpjpe(pred: Tensor, target: Tensor, *, root: int | None = 0) -> Tensor:
-    """Mean joint distance per frame, mm: [..., T, N, 3] -> [..., T]. Joint `root` of both is moved to the
-    origin first.
-    """
+    """Mean joint distance in mm, [..., T, N, 3] -> [..., T], with joint `root` of both at the origin."""
     if root is not None:
         pred, target = pred - pred[..., root : root + 1, :], target - target[..., root : root + 1, :]
     out: Tensor = 1000 * torch.linalg.vector_norm(pred - target, dim=-1).mean(-1)
@@ -49,9 +47,7 @@ def mpjpe(pred: Tensor, target: Tensor, *, root: int | None = 0) -> Tensor:
 
 
 def procrustes(pred: Tensor, target: Tensor) -> Tensor:
-    """`pred` [..., N, 3] under the rotation, scale and translation that bring it nearest to `target` (least
-    squares).
-    """
+    """`pred` [..., N, 3] under the similarity transform nearest to `target` (least squares)."""
     pred_mean, target_mean = pred.mean(-2, keepdim=True), target.mean(-2, keepdim=True)
     a, b = pred - pred_mean, target - target_mean
     u, s, vh = torch.linalg.svd(a.mT @ b)

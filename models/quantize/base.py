@@ -152,9 +152,7 @@ class LearntCodebook(nn.Module):
 
     @abstractmethod
     def _update(self, rows: Tensor, mask: Tensor, codes: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
-        """Learn from the real rows [n, d] of this rank; return the global counts [K] and how many codes were
-        reset.
-        """
+        """Learn from this rank's real rows [n, d]; return global counts [K] and the number of resets."""
 
     @abstractmethod
     def _penalty(self, latents: Tensor, near: Tensor, mean_square: Callable[[Tensor], Tensor]) -> Tensor:
@@ -190,9 +188,7 @@ def code_sums(values: Tensor, codes: Tensor, num_codes: int) -> Tensor:
 
 
 def usage_metrics(counts: Tensor, *, eps: float = 1e-7) -> dict[str, Tensor]:
-    """`perplexity` and `usage` of how often each code was used, [K]; `eps` is within the logarithm (T2M-GPT's
-    1e-7; UDE has 1e-10).
-    """
+    """`perplexity` and `usage` of code counts [K]; `eps` in the logarithm (T2M-GPT: 1e-7, UDE: 1e-10)."""
     share = counts / counts.sum().clamp(min=1)
     return {
         "perplexity": torch.exp(-(share * torch.log(share + eps)).sum()),

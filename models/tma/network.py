@@ -155,9 +155,7 @@ class Tma(nn.Module):
     def encode_motion(
         self, x: Tensor, length: Tensor, present: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """x [B, T, D] normalised features, length int64 [B] frames, `present` as in `coordinates` ->
-        (mu, logvar), float32 [B, Z].
-        """
+        """Encode x [B, T, D] of length int64 [B]; `present` as in `coordinates` -> (mu, logvar) [B, Z]."""
         if x.shape[-1] != self.motion_dim:
             raise ValueError(f"TMA was built for {self.motion_dim} motion features, got {x.shape[-1]}")
         x, length = self.subsample(x, length)
@@ -174,9 +172,7 @@ class Tma(nn.Module):
         return mu, logvar
 
     def decode(self, z: Tensor, length: Tensor, frames: int) -> Tensor:
-        """Z [B, Z] -> normalised features [B, ceil(frames / stride), D] at every `frame_stride`-th frame;
-        zero past `length` frames.
-        """
+        """Z [B, Z] -> features [B, ceil(frames / stride), D], every `frame_stride`-th; zero past `length`."""
         coordinates = self.decode_coordinates(z, length, frames)
         if self.basis is None:
             return coordinates

@@ -195,10 +195,7 @@ class Tokenizer(nn.Module, ABC):
         """Code vectors per stream [B, T / 4 * per_group, d] -> the decoder's input."""
 
     def missing(self, present: Tensor | None) -> dict[str, Tensor]:
-        """Bool [B] for each stream of a part that clips may lack: true where `present` [B, dim] lacks it.
-
-        The stream's codes are then meaningless. None = all are present.
-        """
+        """Bool [B] for each optional stream: True where `present` [B, dim] (None: all) lacks its part."""
         return {}
 
     def forward(
@@ -215,9 +212,7 @@ class Tokenizer(nn.Module, ABC):
         return TokenizerOutput(coordinates, reconstruction, latents.penalty, latents.codes, latents.metrics)
 
     def coordinates(self, x: Tensor, present: Tensor | None = None) -> Tensor:
-        """Motion [B, T, dim] in the coordinates of `Basis`, which the encoders read; zero in columns that are
-        not present. `features` is the inverse.
-        """
+        """Motion [B, T, dim] in the coordinates of `Basis`; zero in absent columns. Undone by `features`."""
         coordinates = self.basis.encode(x)
         return coordinates if present is None else coordinates.masked_fill(~present[:, None], 0.0)
 

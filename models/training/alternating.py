@@ -37,7 +37,7 @@ class OptimizerGroup:
     nets: tuple[nn.Module, ...]
     optim: OptimConfig
     every: int = 1
-    """Steps from one turn to the next."""
+    """The group takes a turn in every so many steps."""
     start_step: int = 0
     """First step with a turn; its warm-up and schedule begin there."""
     end_step: int | None = None
@@ -82,15 +82,15 @@ class AlternatingModule(StageModule):
 
     @abstractmethod
     def optimizer_groups(self) -> Sequence[OptimizerGroup]:
-        """The groups in the order of their turns; no parameter may belong to two."""
+        """Return the groups in the order of their turns; no parameter may belong to two."""
 
     @abstractmethod
     def losses_of(self, group: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return a group's losses and metrics on one batch: "loss" is minimised, the others are only logged.
 
-        `shared` is empty in the first turn on a batch. What a group puts there the next ones get, without
-        its gradient: a critic judges what the generator has made instead of having it made again. A group
-        whose forerunner had no turn must do without it.
+        `shared` is empty in the first turn on a batch. Tensors that a group puts there reach the later groups
+        detached: a critic judges the generator's output without a second forward pass. They are missing where
+        that group had no turn.
         """
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
@@ -126,9 +126,9 @@ class AlternatingModule(StageModule):
         ]
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor | None:
-        """Once all parts of a step are together, every group that has a turn takes it.
+        """Collect a part of the step; with the last one, let every group that has a turn take it.
 
-        Return the first one's loss on the first part, without a gradient; None before.
+        Return the first group's loss on the first part, detached; None before the last part.
         """
         self._parts.append(batch)
         if len(self._parts) < self.accumulate:
@@ -174,7 +174,7 @@ class AlternatingModule(StageModule):
         return values["loss"].detach()
 
     def _step_of(self, turn: _Turn) -> None:
-        """A group's step with the gradients that it has, if any."""
+        """Average and clip a group's gradients and step its optimizer, if it has any gradient."""
         group, optimizer = turn.group, turn.optimizer
         mean_gradients(turn.params)
         if all(param.grad is None for param in turn.params):
@@ -187,7 +187,7 @@ class AlternatingModule(StageModule):
 
     @contextmanager
     def _alone_trains(self, turn: _Turn) -> Iterator[None]:
-        """Inside, no other group's parameters get gradients; those of none of them are left as they are."""
+        """Context in which parameters of other groups get no gradients; those of no group are not touched."""
         others = [param for other in self._turns if other is not turn for param in other.params]
         for param in others:
             param.requires_grad_(False)

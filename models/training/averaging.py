@@ -1,9 +1,9 @@
 """Exponential moving average of a network's weights, kept beside the weights that are trained.
 
-The average begins with the weights after the first step. Until it is as long as the decay has it, the decay
-after n further steps is (1 + n) / (10 + n), as TensorFlow's and diffusers' averages have it: else a short
-training would save little but its first weights. Validation and the saved model use the average; training
-does not. Buffers (codebooks, which are averages already, and statistics) are those of the trained network.
+The average begins with the weights after the first step. After n further steps the decay is the smaller of
+the configured one and (1 + n) / (10 + n), as in TensorFlow and diffusers: otherwise a short training would
+save little but its first weights. Validation and the saved model use the average; training does not. Buffers
+(codebooks, which are averages already, and statistics) are copied from the trained network.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class AveragedWeights:
         self.decay, self._count = decay, 0
 
     def _take_in(self, average: _Tensors, weights: _Tensors, _: Tensor | int) -> None:
-        """Move the average towards the weights; the count on the device is not waited for."""
+        """Move the average towards the weights, without waiting for the device."""
         decay = min(self.decay, (1 + self._count) / (10 + self._count))
         get_ema_multi_avg_fn(decay)(average, weights, None)  # type: ignore[no-untyped-call]
 
@@ -44,7 +44,7 @@ class AveragedWeights:
 
     @contextmanager
     def swapped(self, net: nn.Module) -> Iterator[None]:
-        """Inside, `net` has the averaged weights."""
+        """Context in which `net` has the averaged weights."""
         self._swap(net)
         try:
             yield

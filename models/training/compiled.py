@@ -1,8 +1,8 @@
-"""Losses that torch compiles, and that are computed without where it cannot.
+"""Losses compiled with torch.compile, with a fall-back to eager mode where that fails.
 
-Graphs are kept while networks of the same structure are trained, such as the same with another seed; those of
-another are dropped, as they may hold as much memory as a step takes. Kernels are kept on disk as well, in
-`TORCHINDUCTOR_CACHE_DIR`.
+Graphs are kept while networks of one structure are trained, such as one network with several seeds. A network
+of another structure drops them, as they may hold as much memory as a step takes. Kernels are also kept on
+disk, in `TORCHINDUCTOR_CACHE_DIR`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ GRAPHS = 64
 """Graphs that one function may have: shapes of batches, training and validation, each kind of stage."""
 
 PLACES = 16
-"""Texts of a batch are filled up to a multiple of so many words, since a CUDA graph has one shape: it is then
-not made anew for each length of a batch's longest caption."""
+"""Captions of a batch are padded to a multiple of so many words: a CUDA graph has one shape, and each length
+would need its own."""
 
 
 class Compiled:
-    """A function of losses, compiled as one graph when it is called; the network is what it trains."""
+    """A loss function compiled as one graph at its first call; `net` is the network it trains."""
 
     _structure = ""
     """Structure of the network whose graphs are kept."""
@@ -56,7 +56,7 @@ class Compiled:
             return self.losses(*arguments)
 
     def leave(self, error: Exception) -> None:
-        """Compute without from here on, after one warning that says why."""
+        """Compute in eager mode from here on, after one warning that says why."""
         reason = getattr(error, "inner_exception", error)
         first = next(iter(str(reason).strip().splitlines()), type(reason).__name__)
         warnings.warn(f"torch.compile failed, training goes on without: {first}", stacklevel=3)
@@ -81,7 +81,7 @@ class Compiled:
 
 
 def _of_few_shapes(argument: object) -> object:
-    """A batch with its texts filled up to a multiple of `PLACES` words; anything else as it is."""
+    """Return a batch with its captions padded to a multiple of `PLACES` words; anything else unchanged."""
     if not isinstance(argument, dict) or not isinstance(argument.get("conditions"), dict):
         return argument
     filled = {name: _filled_up(condition) for name, condition in argument["conditions"].items()}
@@ -89,7 +89,7 @@ def _of_few_shapes(argument: object) -> object:
 
 
 def _filled_up(condition: Condition) -> Condition:
-    """A condition of words with hidden ones behind them; one that follows the motion's frames as it is."""
+    """Return a text condition padded with masked words; conditions timed by frames are returned unchanged."""
     more = -condition.mask.shape[1] % PLACES
     if condition.pooled is None or not more:
         return condition

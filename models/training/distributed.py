@@ -20,7 +20,7 @@ _alone = False
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Inside, this process works by itself although a process group exists: no collective is called."""
+    """Context in which no collective is called although a process group exists."""
     global _alone
     before, _alone = _alone, True
     try:
@@ -69,10 +69,10 @@ def sum_over_ranks_with_grad(x: Tensor) -> Tensor:
 
 
 def masked_mean(values: Tensor, mask: Tensor, present: Tensor | None = None) -> Tensor:
-    """Mean of `values` where `mask` is True; over several ranks a share, whose mean over ranks is that mean.
+    """Return this rank's share of the mean of `values` where `mask` is True; 0 where there are none.
 
-    Ranks hold different numbers of real frames or tokens, so each divides by the mean number per rank, not by
-    its own. 0 where there are none.
+    The mean of the shares over ranks is the mean over the whole batch: ranks hold different numbers of real
+    frames or tokens, so each divides by the mean number per rank, not by its own.
 
     Args:
         values: Any shape.
@@ -111,10 +111,10 @@ def gather_rows(x: Tensor) -> Tensor:
 
 
 def gather_rows_with_grad(x: Tensor) -> Tensor:
-    """`gather_rows` for a loss that every rank computes alike from the gathered rows (contrastive negatives).
+    """`gather_rows` for a loss that every rank computes from the same rows (contrastive negatives).
 
-    This rank's rows keep their gradient, times the number of ranks: the mean over ranks, which is taken of
-    gradients, is then that of one process. No collective runs in the backward pass.
+    The gradient of this rank's rows is multiplied by the number of ranks, so that the mean of gradients over
+    ranks is the gradient of one process. No collective runs in the backward pass.
     """
     if not is_distributed():
         return x
@@ -126,8 +126,8 @@ def gather_rows_with_grad(x: Tensor) -> Tensor:
 def mean_gradients(params: Sequence[nn.Parameter]) -> None:
     """Average gradients over ranks in place, as DDP does; every rank calls it with the same parameters.
 
-    A parameter without a gradient on some ranks counts as 0 there, and stays without one if all lack it: an
-    optimizer passes it over, as in one process. One collective for each dtype.
+    A missing gradient counts as 0, unless all ranks lack it: then the optimizer skips the parameter, as in
+    one process. One collective for each dtype.
     """
     if not is_distributed():
         return

@@ -16,8 +16,8 @@ class JointsModule(StageModule):
     """Trains on normalised columns of bodies and hands.
 
     Args:
-        layout: Its body and hands are what is modelled.
-        mean, std: Statistics of those columns, which joints are recovered by.
+        layout: Layout whose body and hands are modelled.
+        mean, std: Statistics of the columns of body and hands.
         loss: Weights of the losses.
     """
 
@@ -43,5 +43,5 @@ class JointsModule(StageModule):
             self.register_buffer(name, torch.as_tensor(values), persistent=False)
 
     def in_units(self, motion: Tensor) -> Tensor:
-        """Normalised columns [B, T, D] in their own units."""
+        """Return normalised columns [B, T, D] in their own units."""
         return motion.float() * self.std + self.mean

@@ -1,4 +1,4 @@
-"""An optimizer, its learning-rate schedule and the largest gradient it takes."""
+"""Settings of an optimizer: learning-rate schedule, weight decay and gradient clipping."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class OptimConfig(Config):
     """Largest gradient norm; 0 turns clipping off."""
 
     def build(self, params: Sequence[nn.Parameter]) -> Optimizer:
-        """Return the optimizer of these parameters, whose step is one kernel."""
+        """Return a fused optimizer of these parameters."""
         kind = torch.optim.AdamW if self.optimizer == "adamw" else torch.optim.Adam
         return kind(params, lr=self.lr, betas=self.betas, weight_decay=self.weight_decay, fused=True)
 

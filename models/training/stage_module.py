@@ -4,8 +4,7 @@
 train to the same weights.
 
 Every random draw of a training step (dropout, latents, Gumbel noise) comes from a generator state that is a
-pure function of (seed, step, rank), so a run that was killed and resumed repeats the undisturbed run bit for
-bit.
+pure function of (seed, step, rank), so a resumed run repeats the undisturbed run bit for bit.
 Codebooks draw by themselves, the same on every rank (`quantize/base.py`).
 """
 
@@ -40,7 +39,7 @@ Batch = dict[str, Any]
 
 
 class Means(TypedDict):
-    """Figures that were averaged together."""
+    """Sums of losses and metrics that are averaged together."""
 
     names: list[str]
     sums: Tensor
@@ -58,10 +57,10 @@ class StepFigures(NamedTuple):
 
 
 class StepSchedule(LambdaLR):
-    """The learning rate of a step as a factor of the first one, which depends on the step alone."""
+    """Learning-rate schedule that depends on the step alone, as a factor of `lr`."""
 
     def set_step(self, step: int) -> float:
-        """Set and return the rate of a step, whichever step came before."""
+        """Set and return the learning rate of a step, whichever step came before."""
         self.last_epoch, factor = step, self.lr_lambdas[0](step)
         for group, first in zip(self.optimizer.param_groups, self.base_lrs, strict=True):
             group["lr"] = first * factor
@@ -94,7 +93,7 @@ class StageModule(L.LightningModule, ABC):
 
     @property
     def step(self) -> int:
-        """Steps that are done, counted by the Trainer where one trains."""
+        """Number of steps done, by the Trainer's count if there is one."""
         return self._step if self._trainer is None else self._trainer.global_step
 
     @step.setter
@@ -102,14 +101,14 @@ class StageModule(L.LightningModule, ABC):
         self._step = step
 
     def setup(self, stage: str) -> None:
-        """Take over the parts of a step from a Trainer."""
+        """Take `accumulate_grad_batches` over from a Trainer."""
         if self.trainer.precision == "16-mixed":
             raise UserError("precision 16-mixed: losses are not scaled for float16; take bf16-mixed")
         if self.automatic_optimization:
             self.accumulate = self.trainer.accumulate_grad_batches
 
     def on_fit_start(self) -> None:
-        """Have frozen networks follow this one to its device."""
+        """Move frozen networks to the device of `net`."""
         for value in vars(self).values():
             if isinstance(value, Frozen):
                 value.module.to(self.device)
@@ -153,11 +152,11 @@ class StageModule(L.LightningModule, ABC):
     def compile_losses(self, *, graphs: bool = False) -> None:
         """Compile networks and losses as one graph; seeding and logging stay outside.
 
-        Where that fails there is one warning, and the rest is computed without, with the same draws.
+        Where that fails there is one warning, and training goes on in eager mode with the same random draws.
 
         Args:
-            graphs: Replay the kernels of each call as a CUDA graph. For one optimizer in one process, which
-                takes each loss before the next is computed.
+            graphs: Replay the kernels of each call as a CUDA graph; only with one optimizer in one process
+                that runs backward before the next forward.
         """
         self.losses = Compiled(self.losses, self.net, graphs=graphs)  # type: ignore[assignment]
 
@@ -199,7 +198,7 @@ class StageModule(L.LightningModule, ABC):
 
     @property
     def ends_row(self) -> bool:
-        """Whether a row of the log ends with the step that is being taken."""
+        """Whether the current step is the last one of a row of the log."""
         return (self.step + 1) % LOG_EVERY == 0
 
     def record(self, values: dict[str, Tensor], batch: Batch) -> None:
@@ -218,9 +217,7 @@ class StageModule(L.LightningModule, ABC):
         self._sums[names] = (figures if sums is None else sums + figures, count + 1)
 
     def saved_state(self) -> Callable[[], None]:
-        """Return a function that puts buffers (codebooks) and figures back as they are now, for a part of a
-        step that has to be computed again.
-        """
+        """Return a function that restores buffers (codebooks) and figures, to repeat a part of a step."""
         buffers = [(buffer, buffer.clone()) for buffer in self.buffers()]
         figures, sums = list(self.figures), dict(self._sums)
 

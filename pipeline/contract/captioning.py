@@ -27,7 +27,7 @@ class Sentence:
 
 
 class MotionCaptioner(Protocol):
-    """A trained stage that says what motions show."""
+    """A trained stage that describes motions in sentences."""
 
     @property
     def layout(self) -> MotionLayout:
@@ -35,18 +35,18 @@ class MotionCaptioner(Protocol):
 
     @property
     def part(self) -> Part:
-        """The columns of the layout that it reads."""
+        """The part of the layout that it reads."""
 
     @property
     def min_frames(self) -> int:
-        """Shorter motions cannot be read."""
+        """Frames of the shortest motion that it can read."""
 
     @property
     def max_frames(self) -> int:
-        """Most frames that are read; the rest of a longer motion is ignored."""
+        """Frames of the longest motion that it reads whole; the rest of a longer one is ignored."""
 
     def reads(self, present: int) -> bool:
-        """Whether it can read motions that hold only what these bits of `ClipMeta.present` say."""
+        """Whether it can read motions with these parts alone, bits of `ClipMeta.present`."""
 
     def caption(
         self, motions: Sequence[NDArray[np.float32]], count: int, present: Sequence[int] | None = None

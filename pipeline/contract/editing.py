@@ -1,9 +1,9 @@
-"""`EditTask`: what is to be done to a clip, for the command line, Python and the page's JSON.
+"""`EditTask`: the description of an edit, for the command line, Python and the page's JSON.
 
-Times are seconds of the clip: 0 is its first frame, what is made before it (`lead`) has negative ones.
+Times are seconds of the clip: 0 is its first frame, and frames made before it (`lead`) have negative times.
 Positions are metres in the clip's world, Y up, the floor at height 0.
 
-What is neither kept nor constrained is free: the model makes it.
+The model makes everything that is neither kept nor constrained.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Kept(Config):
     """None: to the clip's end."""
     parts: tuple[FigurePart, ...] = ("all",)
     but: tuple[FigurePart, ...] = ()
-    """Exceptions that are free after all: `parts: [all], but: [right_hand]` makes the right hand anew."""
+    """Parts that are not kept after all: `parts: [all], but: [right_hand]` makes the right hand anew."""
 
     @model_validator(mode="after")
     def _forward(self) -> Self:
@@ -44,7 +44,7 @@ class Kept(Config):
 
 
 class PathPoint(Config):
-    """Where the root is on the floor at one time."""
+    """Position of the root on the floor at one time."""
 
     at: Seconds
     x: Metres
@@ -52,7 +52,7 @@ class PathPoint(Config):
 
 
 class Pin(Config):
-    """Where a joint is at one time. A pose is several pins of one time."""
+    """Position of a joint at one time. A pose is several pins of one time."""
 
     at: Seconds
     joint: str
@@ -64,26 +64,26 @@ class EditTask(Config):
     """An edit: the parts of a clip to keep, and the constraints on the rest."""
 
     caption: str = ""
-    """Describes what is made; empty: whatever fits."""
+    """Describes the new motion; empty: any that fits."""
     lead: Seconds = Field(0.0, ge=0)
     """Seconds to make before the clip."""
     seconds: Seconds | None = Field(None, gt=0)
     """Length of the result from the clip's first frame on; None: the clip's. Longer: made after its end."""
     mirror: bool = False
-    """Left and right of the clip change places."""
+    """Swap left and right of the clip."""
     speed: float = Field(1.0, ge=0.1, le=10, allow_inf_nan=False)
-    """How many times as fast the clip goes."""
+    """Factor of the clip's speed."""
     repeat: int = Field(1, ge=1, le=20)
-    """How often the clip comes, each time from where it ended."""
+    """Number of times that the clip is played, each time from where it ended."""
     keep: tuple[Kept, ...] | None = None
-    """Without it: all of the clip where the result is longer than it or the clip is changed, else nothing."""
+    """None: all of the clip if the result is longer or the clip is changed, else nothing."""
     path: tuple[PathPoint, ...] = ()
-    """Between its points the root takes a smooth way that does not overshoot."""
+    """Points of the root's path, joined by a smooth curve that does not overshoot."""
     pins: tuple[Pin, ...] = ()
 
     @property
     def changes_clip(self) -> bool:
-        """Whether the clip is mirrored, retimed or repeated, which needs no model, before all else."""
+        """Whether the clip is mirrored, retimed or repeated, which comes first and needs no model."""
         return self.mirror or self.speed != 1 or self.repeat > 1
 
     @model_validator(mode="after")
@@ -96,28 +96,28 @@ class EditTask(Config):
 
 @dataclass(frozen=True)
 class EditReport:
-    """How near a motion is to its task; centimetres, and m/s²."""
+    """Errors of a motion against its task; centimetres, and m/s²."""
 
     kept_cm: float
-    """Furthest that a kept joint is from where it was: in the world where the legs are kept, else in the
-    figure. NaN where none is kept."""
+    """Largest displacement of a kept joint: in the world where the legs are kept, else in the figure's frame.
+    NaN where none is kept."""
     path_cm: float
-    """Furthest that the root is from its path; NaN without one."""
+    """Largest distance of the root from its path; NaN without one."""
     pins_cm: dict[str, float]
-    """How far each pinned joint is from its place, by joint and seconds."""
+    """Distance of each pinned joint from its place, by joint and seconds."""
     aside_degrees: float
     """Mean angle between where the figure faces and where it walks on its path; NaN without one."""
     seams: float
-    """Largest acceleration, of the joints on average, where kept and made meet; NaN where they do not."""
+    """Largest acceleration (mean over joints) where kept and made frames meet; NaN where they do not."""
     inside: float
-    """The largest of the clip itself."""
+    """Largest acceleration of the clip itself."""
     sliding: float
     """Mean speed of the slower foot where the legs are made, cm/s; NaN where they are kept."""
     clip_sliding: float
-    """That of the clip."""
+    """Sliding of the clip."""
 
     def lines(self) -> list[str]:
-        """The report for people, one line a figure; what was not asked for has none."""
+        """Return the report for people, one line for each figure that applies."""
         facing = f"faces {self.aside_degrees:.0f} degrees away from where it walks"
         seams = f"largest acceleration at a seam: {self.seams:.1f} m/s², in the clip {self.inside:.1f} m/s²"
         sliding = f"slower foot: {self.sliding:.1f} cm/s, in the clip {self.clip_sliding:.1f} cm/s"

@@ -1,13 +1,13 @@
 """The interface of a motion generator.
 
-A generator makes one group of columns of a layout (`part`): body and hands, the face, or all. It says which
-modalities it can be conditioned on and which sampling settings it takes notice of.
+A generator makes one group of columns of a layout (`part`): body and hands, the face, or all. It declares its
+modalities and the sampling settings that it uses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -29,17 +29,17 @@ Motion = NDArray[np.float32]
 
 
 _JUDGED = 3.0
-"""Seconds that a sound must last for its beats to be remarked on: a few of the slowest."""
+"""Shortest sound, in seconds, whose beats are judged: a few beats of the slowest music."""
 
 
 @dataclass(frozen=True)
 class Prompt:
-    """The conditions of one motion, as a person gives it and a viewer shows it."""
+    """The conditions of one motion as a user gives them, before encoding."""
 
     text: str = ""
-    """Describes the motion; empty without words."""
+    """Caption of the motion; may be empty."""
     face_text: str = ""
-    """Describes the face; empty takes `text`."""
+    """Caption of the face; empty: that of the motion."""
     sound: Sound | None = None
     """The music."""
     conditions: Mapping[str, object] = field(default_factory=dict)
@@ -60,18 +60,18 @@ class Prompt:
 
     @property
     def seconds(self) -> float | None:
-        """Length of what it brings, such as its music; None where that has none."""
+        """Length of its timed conditions, such as music; None without any."""
         found = [MODALITIES[name].seconds(value) for name, value in self.given.items() if name in MODALITIES]
         return min((length for length in found if length is not None), default=None)
 
     @property
     def silent(self) -> bool:
-        """Whether it brings a sound in which nothing is heard."""
+        """Whether its sound is silent."""
         return self.sound is not None and self.sound.silent
 
     @property
     def idle(self) -> bool:
-        """Whether nothing drives it but silence, in which the figure stands."""
+        """Whether silence is its only condition: the figure stands."""
         return self.modalities == {"audio"} and not self.conditions and self.silent
 
     @property
@@ -86,12 +86,9 @@ class Prompt:
         piece = self.sound.piece or self.sound
         return "hardly a beat is heard in the sound" if track(piece).confidence < NO_BEAT else ""
 
-    def with_words(self, text: str) -> Prompt:
-        return replace(self, text=text)
-
     @property
     def words(self) -> str:
-        """The words about the face, or else about the body."""
+        """The caption of the face, or else that of the motion."""
         return self.face_text or self.text
 
 
@@ -104,7 +101,7 @@ class GenerationRequest:
     frames: Sequence[int] | None
     """Length of each motion, or None where the model decides."""
     seeds: Sequence[int]
-    """One per motion, so that results do not depend on batching."""
+    """One for each motion, so that results do not depend on batching."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     noise_seeds: Sequence[int] | None = None
     """Seeds of a diffusion decoder's noise; None takes `seeds`. Other generators ignore them."""
@@ -113,14 +110,14 @@ class GenerationRequest:
     units; None takes motions of its own. Other generators ignore them."""
 
     def text(self, who: str) -> Condition:
-        """The encoded texts; `who` is conditioned on them, for the message where there are none."""
+        """Return the encoded texts; a `UserError` without any names the generator `who`."""
         text = self.conditions.get("text")
         if text is None:
             raise UserError(f"{who} is conditioned on text, and none was given")
         return text
 
     def lengths(self, who: str) -> Sequence[int]:
-        """Frames of each motion; `UserError` where the request has none and `who` cannot decide."""
+        """Return the frames of each motion; a `UserError` without any names the generator `who`."""
         if self.frames is None:
             raise UserError(
                 f"{who} needs an explicit length: give --seconds, in a recipe seconds, or to evaluate it "
@@ -138,7 +135,7 @@ class GenerationRequest:
 
 @dataclass(frozen=True)
 class Stretch:
-    """One stretch of a motion's time line: what it is conditioned on, and how long it is."""
+    """One stretch of a motion's time line: its conditions and length."""
 
     conditions: Conditions
     """As of a request; timed modalities begin with the stretch."""
@@ -151,15 +148,15 @@ class Capabilities:
     """A generator's abilities besides `generate`; the default of each field says that it cannot."""
 
     drive: Callable[[Sequence[Stretch], Sequence[int], SamplingConfig], list[Motion]] | None = None
-    """As `generate`, of several stretches one after another, a seed for each motion; [T, C] each."""
+    """Generates stretches that follow each other, with a seed for each motion; [T, C] each."""
     edit: Callable[..., list[Motion]] | None = None
-    """Fills in what an edit leaves free, as `DiffusionMotion.edit` does."""
+    """Makes the free parts of an edit, as `DiffusionMotion.edit` does."""
     denoising: Callable[[SamplingConfig], tuple[Sampler, int]] | None = None
-    """Sampler and number of steps of its diffusion model: as asked for, or else the model's own."""
+    """Returns sampler and number of steps of its diffusion model under these settings."""
     seed_frames: int = 0
-    """Frames of the motion that it goes on from, and with which what it makes begins."""
+    """Frames of the seed motion that it continues; its output begins with them."""
     note: str = ""
-    """A few words that its figures must say."""
+    """A remark that must stand beside its figures."""
 
 
 class MotionGenerator(Protocol):
@@ -171,7 +168,7 @@ class MotionGenerator(Protocol):
 
     @property
     def part(self) -> Part:
-        """The columns of the layout that it makes."""
+        """The part of the layout that it makes."""
 
     @property
     def method(self) -> str:
@@ -183,23 +180,23 @@ class MotionGenerator(Protocol):
 
     @property
     def prepared(self) -> Mapping[str, object]:
-        """Outputs of the stages of its modalities, by name, such as the text source and music statistics."""
+        """Outputs of the stages that encode its modalities, by name: the text source, music statistics."""
 
     @property
     def settings(self) -> frozenset[str]:
-        """The fields of `SamplingConfig` that it takes notice of."""
+        """The fields of `SamplingConfig` that it uses."""
 
     @property
     def unit_frames(self) -> int:
-        """Lengths are multiples of this."""
+        """Frames of which every length is a multiple."""
 
     @property
     def max_frames(self) -> int | None:
-        """Longest motion; None without a limit."""
+        """Frames of the longest motion; None without a limit."""
 
     @property
     def decides_length(self) -> bool:
-        """Whether it can be asked for a motion without a length."""
+        """Whether it decides a motion's length if the request has none."""
 
     @property
     def capabilities(self) -> Capabilities:

@@ -25,11 +25,11 @@ class Role:
     name: str
     optional: bool
     gives: str
-    """The stage that must fill it: of the kind of this name or a subclass of it, or one that gives this."""
+    """Name of the kind that fills it (or a subclass), or of something that stages give."""
 
     @staticmethod
     def parse(text: str) -> Role:
-        """As it stands in `takes`: "stats", "tma?", "face_tokenizer?: tokenizer"."""
+        """Parse an entry of `takes`: "stats", "tma?", "face_tokenizer?: tokenizer"."""
         left, _, gives = text.partition(":")
         name = left.strip().removesuffix("?")
         return Role(name, left.strip().endswith("?"), gives.strip() or name)
@@ -49,12 +49,12 @@ class Every:
     optional: ClassVar[bool] = True
 
     def key(self, stage: str) -> str:
-        """The name under which one of them stands among a stage's inputs."""
+        """Return the key of one such stage among the inputs."""
         return f"{self.name}.{stage}"
 
 
 class MissingInputError(UserError, KeyError):
-    """A role was asked for that no finished stage fills."""
+    """A role that is read has no finished stage."""
 
     def __str__(self) -> str:
         return str(self.args[0])
@@ -64,7 +64,7 @@ class Inputs(Mapping[str, Any]):
     """The loaded inputs of a stage, by role; each is loaded when it is first read.
 
     A stage that trains declares its inputs as a subclass: a role is an annotated attribute, optional if its
-    type allows None. `filled_by` names what fills a role that is called otherwise.
+    type allows None. `filled_by` names the kind that fills a role of another name.
 
         class GptInputs(Inputs):
             text: TextSource
@@ -90,7 +90,7 @@ class Inputs(Mapping[str, Any]):
 
     @classmethod
     def of(cls, inputs: Inputs) -> Self:
-        """The same inputs with the attributes that this class declares."""
+        """Return the inputs as an instance of this class."""
         if isinstance(inputs, cls):
             return inputs
         made = cls(inputs._makers)
@@ -124,7 +124,7 @@ class Inputs(Mapping[str, Any]):
 
 
 class _FilledBy:
-    """A role whose name is not that of what fills it."""
+    """A role that does not have the name of the kind that fills it."""
 
     def __init__(self, what: str) -> None:
         self.what, self.name = what, ""
@@ -137,5 +137,5 @@ class _FilledBy:
 
 
 def filled_by(what: str) -> Any:
-    """An optional role that a stage of kind `what`, or one that gives `what`, fills."""
+    """Declare an optional role for stages of kind `what`, or that give `what`."""
     return _FilledBy(what)

@@ -1,4 +1,4 @@
-"""The stages of a run that have finished, and previews of those that have not run yet."""
+"""Finished stages of a run or export, and previews of stages that have not run yet."""
 
 from __future__ import annotations
 
@@ -38,9 +38,7 @@ from motionloom.pipeline.store.weights import LayoutFacts
 def preview_of(
     stage: Stage | CompletedStage, others: Mapping[str, Stage | CompletedStage] | None = None
 ) -> object:
-    """Return the preview of a recipe's stage, as far as it is known before it has run; of a finished one its
-    output without what only running it needs.
-    """
+    """Return what is known of a stage's output before it has run; a finished one's may lack its weights."""
     if isinstance(stage, CompletedStage):
         makers = {role: partial(preview_of, source) for role, source in stage.inputs.items()}
         return stage.kind.preview_of_finished(stage, Inputs(makers))
@@ -128,10 +126,9 @@ def _gives(kind: StageKind, record: StageRecord) -> frozenset[str]:
 def generators_of(run: Path) -> list[CompletedStage]:
     """The finished stages of a run that generate, its default first.
 
-    Those that the recipe lists as a stage's inputs come first, in that order, then those that a finished
-    stage such as `generate` has read as generators: a recipe with several says so which it means. Those of
-    other runs are among them where one of these stages reads them. One that another started from is none,
-    unless it is listed or read.
+    First come those that the recipe lists as a stage's inputs, in that order, then those that a finished
+    stage such as `generate` has read, also from other runs. A generator from which another was trained on is
+    left out, unless it is listed or read.
     """
     stages = finished_stages(run)
     makers = {stage.folder.resolve(): stage for stage in stages.values() if stage.gives(GENERATOR)}
@@ -185,7 +182,7 @@ class BundleFile(Config):
     packages: tuple[str, ...] = Field((), exclude_if=lambda packages: not packages)
     """Packages beside motionloom that its stages need, as `name==version`."""
     sampling: dict[str, object] = Field(default_factory=dict)
-    """Fields of `SamplingConfig` that its motions are best drawn with, where nobody says otherwise."""
+    """Recommended fields of `SamplingConfig`."""
 
 
 def open_exported(folder: Path, what: str = GENERATOR) -> list[CompletedStage]:
@@ -208,7 +205,7 @@ def open_exported(folder: Path, what: str = GENERATOR) -> list[CompletedStage]:
 
 
 def exported_sampling(folder: Path) -> SamplingConfig:
-    """How an export's motions are best drawn; fields of which it says nothing are not set."""
+    """Return the sampling settings that an export recommends; other fields are not set."""
     return SamplingConfig.parse(read_bundle(folder).sampling, f"{folder / BUNDLE_FILE}: sampling")
 
 

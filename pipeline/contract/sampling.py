@@ -1,4 +1,4 @@
-"""Settings of generation: how tokens, latents and noise are drawn."""
+"""Sampling settings of generators."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Guidance = Annotated[float, Field(ge=1)]
 
 
 class SamplingConfig(Config):
-    """How tokens, latents and noise are drawn. Fields that are not set are as the model recommends."""
+    """Settings of drawing tokens, latents and noise; unset fields are as the model recommends."""
 
     temperature: float = Field(1.0, ge=0)
     """Below 1 safer, above 1 more varied; 0 is greedy: the likeliest token, a latent's mean."""
@@ -44,17 +44,17 @@ class SamplingConfig(Config):
 
     @staticmethod
     def of(given: SamplingConfig | Mapping[str, object] | None) -> SamplingConfig:
-        """The config, also of a mapping with its keys, such as `{"top_p": 0.9}`."""
+        """Return the config; a mapping such as `{"top_p": 0.9}` is parsed."""
         return SamplingConfig.parse({} if given is None else given, "sampling")
 
     def over(self, recommended: SamplingConfig) -> SamplingConfig:
-        """These settings, those that are not set here as `recommended` has them."""
+        """Return these settings, with unset fields from `recommended`."""
         return recommended.model_copy(update={name: getattr(self, name) for name in self.model_fields_set})
 
     def scale(self, present: Mapping[str, bool]) -> float:
-        """Guidance of a motion, by the modalities that it is conditioned on."""
+        """Return the guidance scale of a motion with these modalities present."""
         return next((self.guidance[name] for name in self.guidance if present.get(name)), self.cfg_scale)
 
     def guidance_of(self, part: Part) -> float:
-        """Guidance of a generator of that part."""
+        """Return the guidance scale of a generator of that part."""
         return self.face_cfg_scale if part == "face" and self.face_cfg_scale is not None else self.cfg_scale

@@ -1,4 +1,4 @@
-"""Curves and figures of a stage in the report, sizes in a dry run."""
+"""A stage's curves and figures for the report, and its sizes for a dry run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Curve:
 
     prefix: str
     title: str = ""
-    """Shown behind the stage's name; the prefix when empty."""
+    """Title after the stage's name; empty: the prefix."""
 
 
 class Showing(Protocol):

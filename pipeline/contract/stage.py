@@ -1,9 +1,8 @@
-"""The contract of a stage: what every kind answers for itself, so that nothing else holds a list of kinds.
+"""The interface of stage kinds, through which all other code asks about them: nothing else lists kinds.
 
-A kind says which inputs it takes and what it gives, runs, and loads again what it left behind. Kinds that
-train say more (`training/trained_stage.py`). The graph, the dry run, exports, `generate`, `evaluate` and the
-report ask these questions of the stages of a run; a new stage answers them in its own file and is registered
-by one line.
+A kind declares its inputs and outputs, runs, and loads what it made. Kinds that train have further methods
+(`training/trained_stage.py`). The graph, the dry run, exports, `generate`, `evaluate` and the report use this
+interface alone; a new kind implements it in its own file and is registered by one line.
 
 `register(MyStage())` adds a kind, ours and others'; `datasets/base/register.py` says where that line stands.
 """
@@ -49,7 +48,7 @@ ALIGNMENT = "alignment"
 """Offered by stages that embed text and motion in one space: they load as a `LoadedTma`."""
 
 FACE_ALIGNMENT = "face_alignment"
-"""The same of captions of faces and of expressions."""
+"""Offered by stages that embed captions of faces and expressions in one space."""
 
 SHOWING = "showing"
 """Offered by stages that have curves or figures for the report."""
@@ -69,7 +68,7 @@ class StageConfig(Config):
     @model_validator(mode="before")
     @classmethod
     def _keep_defaults(cls, data: object) -> object:
-        """A group of settings of which some are given keeps what the stage sets of the others."""
+        """Fill a partly given group of settings with the stage's own defaults."""
         if not isinstance(data, dict):
             return data
         out = dict(data)
@@ -110,7 +109,7 @@ class CompletedStage:
     """Whether it belongs to another run or to an export; then `name` names both."""
 
     def gives(self, what: str) -> bool:
-        """Whether other stages may ask this one for `what`."""
+        """Whether it offers `what` to other stages."""
         return what in self.kind.gives(self.config)
 
     def upstream(self) -> Iterator[CompletedStage]:
@@ -152,20 +151,20 @@ class StageCache:
 
 @dataclass(frozen=True)
 class StageContext:
-    """All that a stage's `run` may use. `inputs` maps each role to a finished stage."""
+    """The arguments of a stage's `run`. `inputs` maps each role to a finished stage."""
 
     name: str
     recipe: str
     """Name of the recipe, for people."""
     config: Any
     folder: Path
-    """Where it writes; a stage that trains finds its checkpoints there when it goes on."""
+    """Its output folder, with the checkpoints from which a training is resumed."""
     inputs: Mapping[str, CompletedStage]
     seed: int
     hardware: Hardware
     console: Console
     stage_cache: StageCache
-    """Where inputs are loaded, each once."""
+    """Loads each input once."""
     rank: int = 0
     world: int = 1
     """This process among those that share the stage's work."""
@@ -204,20 +203,20 @@ class StageKind(ABC, Generic[C]):
     """
 
     name: str
-    """In recipes: `kind: name`."""
+    """Its name in recipes: `kind: name`."""
     summary: str
     """A few words for people."""
     config: type[C]
     """Its fields are the keys of the stage in a recipe."""
     takes: tuple[str | Every, ...] = ()
-    """Inputs: roles, with a trailing "?" for one that a recipe can do without, or `Every`. A role called
-    otherwise than what fills it tells that behind a colon: "face_tokenizer?: tokenizer"."""
+    """Inputs: roles, with a trailing "?" if optional, or `Every`. The kind that fills a role of another name
+    stands behind a colon: "face_tokenizer?: tokenizer"."""
     offers: frozenset[str] = frozenset()
-    """Names of what other stages may ask of it, such as "tokenizer" or `GENERATOR`."""
+    """Names of its outputs for other stages, such as "tokenizer" or `GENERATOR`."""
     exports: tuple[str, ...] = ()
     """Roles whose stages an export must take along for this stage to load."""
     version: int = 1
-    """Raised when the same config makes something else than before."""
+    """Increased when the same config gives another output than before."""
     trains: bool = False
     """Whether `run` is a training, in which all processes of a run take part."""
     curves: tuple[Curve, ...] = ()
@@ -236,8 +235,8 @@ class StageKind(ABC, Generic[C]):
         return tuple(one if isinstance(one, Every) else Role.parse(one) for one in self.takes)
 
     def modules(self, config: C) -> Iterable[str]:
-        """Modules that decide what a stage makes, those of its classes: the code of those that are not
-        motionloom's is in its fingerprint (`register.code_of`). A kind that gives none goes by `version`.
+        """Return the modules that decide its output: the code of those outside of motionloom is part of the
+        fingerprint (`register.code_of`). A kind without any has its `version` alone.
         """
         return [base.__module__ for base in type(self).__mro__ if issubclass(base, StageKind)]
 
@@ -247,10 +246,7 @@ class StageKind(ABC, Generic[C]):
         """Refuse, with a `UserError`, a combination with the recipe's other stages that cannot work."""
 
     def external(self, config: C) -> object:
-        """Facts about files outside the run (names, sizes, checksums) that belong to the fingerprint.
-
-        A `NotThereError` is told with the `--set` that names another folder.
-        """
+        """Facts of files outside the run, for the fingerprint; a `NotThereError` is told with its `--set`."""
         return None
 
     def share(self, context: StageContext) -> None:

@@ -47,10 +47,7 @@ class Units:
         result: Callable[[int], Mapping[str, NDArray[Any]]],
         done: Callable[[int], object] | None = None,
     ) -> None:
-        """Make this process's share of the units 0 to `count` - 1 called `name`, those that are not there.
-
-        `done` is called with the number of a unit, made now or before.
-        """
+        """Make this process's missing units of 0 to `count` - 1; `done` is called with each unit's number."""
         self.folder.mkdir(parents=True, exist_ok=True)
         for index in range(self.rank, count, self.world):
             path = self._path(name, index)

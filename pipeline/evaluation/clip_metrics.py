@@ -85,9 +85,7 @@ CLIP_METRICS.follow(_require_own_columns)
 
 
 def agreement(performance: Performance) -> Row:
-    """1 or 0 for each attribute of a clip's caption that geometry can measure, and for all together; only
-    synthetic clips know what they do.
-    """
+    """1 or 0 for each attribute of a synthetic clip's caption that geometry measures, and for all."""
     if performance.truth is None or "action" not in performance.truth:
         return {}
     agreeing = agrees(performance.truth, performance.joints, performance.face, performance.fps)
@@ -131,9 +129,7 @@ def beat_alignment(performance: Performance) -> Row:
 
 
 def recognition(performance: Performance) -> Row:
-    """Whether a dance has the genre, style and tempo (within 5 %) of its truth, and how far the tempo is off:
-    |tempo / true tempo - 1|.
-    """
+    """Whether a dance has its true genre, style and tempo (within 5 %), and |tempo / true tempo - 1|."""
     truth = performance.truth or {}
     if not truth.get("genre") or performance.frames < MIN_FRAMES:
         return {}

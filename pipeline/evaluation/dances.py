@@ -92,10 +92,7 @@ def with_music(dataset: ClipDataset) -> NDArray[np.bool_]:
 def dance_at(
     dataset: ClipDataset, index: int, *, unit: int = 1, seconds: float | None = None
 ) -> DanceClip | None:
-    """The clip with music at `index`, cut to whole units of frames and to at most `seconds`.
-
-    None where it holds no sound, or where not one unit of it has some.
-    """
+    """The clip with music at `index`, cut to whole units and `seconds`; None if no unit has sound."""
     stored = dataset.wav(index)
     if stored is None:
         return None
@@ -130,10 +127,7 @@ def dance_at(
 def dances_of(
     dataset: ClipDataset, count: int | None, *, unit: int = 1, seconds: float | None = None
 ) -> list[DanceClip]:
-    """At most `count` clips with music (None: all), different songs first, in the order of the data set.
-
-    The same data give the same clips.
-    """
+    """Up to `count` clips with music (None: all) in a fixed order, different songs first."""
     # A permutation of a fixed seed spreads the choice over the data set, whatever its order.
     order = np.random.default_rng(0).permutation(np.flatnonzero(with_music(dataset)))
     chosen = different_first(order.tolist(), [song_of(dataset, index) for index in order.tolist()])

@@ -91,9 +91,7 @@ def recalls(row: LatentRow) -> Values:
 
 
 def tma_alignment(row: LatentRow) -> Values:
-    """`recalls`, and the mean distance of each caption's latent from its motion's, both of length 1, and as
-    they are.
-    """
+    """`recalls`, and mean distances between captions and their motions, of unit length and as they are."""
     unit = matching_score(unit_length(row.text), unit_length(row.motion))
     plain_score = matching_score(row.text, row.motion)
     return recalls(row) | {"matching_score": float(unit), "latent_distance": float(plain_score)}
@@ -227,9 +225,7 @@ def _choice(
 
 
 def _spread(role: str, title: str, latents: Latents, protocol: Protocol, seed: int) -> list[Figure]:
-    """Figures of the distance to recorded motion and of variety, beside as many training clips and the mean
-    pose.
-    """
+    """FID and variety, also of as many training clips and of the mean pose."""
     motions = {
         MODEL: latents.made, TRAINING: [latents.others], STILL: [latents.still], RECORDED: [latents.real]
     }  # fmt: skip

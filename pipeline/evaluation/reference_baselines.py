@@ -199,9 +199,7 @@ def nearest_texts(known: Sequence[str], wanted: Sequence[str]) -> list[int]:
 
 
 def by_nearest_labels(train: ClipDataset, truths: Sequence[Truth]) -> list[Truth]:
-    """For each clip the captioned training clip that agrees with its truth in most attributes, the first of
-    several. An empty list unless every clip carries its truth.
-    """
+    """For each clip the training clip whose truth agrees most; empty unless every clip has a truth."""
     usable = np.flatnonzero(has_caption(train)).tolist()
     records = [train.meta(index).truth for index in usable]
     if not usable or not all(records) or not all(t.truth for t in truths):

@@ -95,9 +95,7 @@ def retrieve(
 
 
 def alignment_stage(run: Path, name: str | None = None) -> CompletedStage:
-    """A finished stage that aligns text with motion, or an evaluator: by name, else `tma`, else the recipe's
-    first, evaluators last.
-    """
+    """Return the judge of that name, else `tma`, else the recipe's first; evaluators come last."""
     names = _judges(run)
     name = name or (names or ["tma"])[0]
     if name not in names:
@@ -155,9 +153,7 @@ def _figures(name: str, meaning: str, values: dict[str, float], facts: dict[str,
 
 
 def retrieval_command(run: Path, *, stage: str | None = None, console: Console) -> Path:
-    """Print the table and write RUN/retrieval.json; of a `stage` other than the default,
-    RUN/retrieval-STAGE.json.
-    """
+    """Print the table and write RUN/retrieval.json, or RUN/retrieval-STAGE.json of a given stage."""
     require_own(run)
     file = retrieve(run, stage)
     print_tables(file.figures, console)

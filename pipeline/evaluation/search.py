@@ -140,9 +140,7 @@ class Search:
         return np.asarray(embed_motions(self.tma, [features], [present])[0])
 
     def motion_file(self, path: Path) -> Vectors:
-        """The embedding [Z] of a clip's file (`read_clip`), or of an .npy of joints or of the set's columns
-        [T, D], at the set's frame rate.
-        """
+        """The embedding [Z] of a clip file (`read_clip`) or an .npy of joints or columns [T, D]."""
         if path.suffix.lower() != ".npy":
             clip = read_clip(path)
         else:

@@ -150,10 +150,7 @@ def digest_of(truths: Sequence[Truth]) -> str:
 
 
 def reconstruct_truth(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.float32]:
-    """A clip's body-hand features [T, D] through a tokenizer of any part of the body, face included or not.
-
-    Of columns that it does not model, the mean comes back.
-    """
+    """A clip's features [T, D] through a body tokenizer; columns it does not model become the mean."""
     return reconstruct_all(tokenizer, truth)[:, tokenizer.layout.part("bodyhand")]
 
 

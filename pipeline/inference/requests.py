@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from numbers import Integral
 from typing import TYPE_CHECKING
 
@@ -61,9 +62,7 @@ def prompts_of(
     sounds: Sequence[Sound | None] | None,
     conditions: Mapping[str, Sequence[object]] | None = None,
 ) -> list[Prompt]:
-    """One prompt a motion from lists of equal length; `conditions` adds modalities by name. One face caption
-    alone is that of every motion.
-    """
+    """Return a prompt for each motion; a single face caption is used for all, `conditions` by modality."""
     more = conditions or {}
     given: dict[str, Sequence[object] | None] = {"captions": captions, "sounds": sounds, **more}
     counts = {name: len(values) for name, values in given.items() if values is not None}
@@ -103,10 +102,7 @@ def require_used(
     face_captions: Iterable[str] | None,
     sampling: SamplingConfig,
 ) -> None:
-    """Refuse settings that were given, and that neither the body's generator nor `face` takes notice of.
-
-    `faces` are all of the model's by method, for the fix.
-    """
+    """Refuse given settings that neither the body's generator nor `face` uses; `faces`: for the fix."""
     if face is None and face_captions is not None:
         raise UserError("this model makes no face: leave the face captions out")
     used = body.settings | (frozenset() if face is None else face.settings)
@@ -210,7 +206,7 @@ def encode_prompts(
 
     `words` are the prompts' texts, about the body or the face; an empty one is no text.
     """
-    rows = [prompt.with_words(text).given for prompt, text in zip(prompts, words, strict=True)]
+    rows = [replace(prompt, text=text).given for prompt, text in zip(prompts, words, strict=True)]
     out: dict[str, Condition] = {}
     for name, record in MODALITIES.items():
         given = [row.get(name) for row in rows]

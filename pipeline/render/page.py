@@ -74,10 +74,7 @@ class Page:
         digits: int = 3,
         pinned: bool = False,
     ) -> Page:
-        """A table; numbers stand right with `digits` decimals, None is a dash.
-
-        A `pinned` first column stays in sight while the others are scrolled.
-        """
+        """A table: numbers with `digits` decimals, None as a dash; a `pinned` first column stays."""
         numeric = [
             any(_is_number(row[k]) for row in rows)
             and all(_is_number(row[k]) or row[k] is None for row in rows)

@@ -24,9 +24,7 @@ DECISIONS = "decisions.json"
 
 
 def suspects_of(root: Path, model: str | None = None, *, progress: bool = False) -> dict[Place, Suspect]:
-    """Suspects of the data set in `root` that nobody has decided about, the worst first; with a model, also
-    those whose captions its TMA finds far from their motion.
-    """
+    """Undecided suspects of the data set in `root`, worst first; with a model also by captions."""
     kept = Decisions.of(root).kept
     suspects = find_suspects(open_splits(root), kept, progress=progress)
     if model is None:

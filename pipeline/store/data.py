@@ -117,10 +117,7 @@ class Data:
         return any((self.folder / name).exists() for name in (SHARDS, REFERENCE, MIX))
 
     def local_shards(self) -> list[LocalShard]:
-        """All shards that lie in folders of this machine; a server's are compared on arrival.
-
-        None of a kind that is not ours and keeps its data in another way.
-        """
+        """Shards in folders of this machine; a server's are compared on arrival. None of other kinds."""
         if not self._is_ours:
             return []
         return [

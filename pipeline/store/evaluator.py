@@ -92,9 +92,7 @@ class LoadedEvaluator:
 
     @torch.no_grad()
     def embed_motion(self, motion: Tensor, length: Tensor, present: Tensor | None = None) -> Tensor:
-        """Latents [B, Z] of normalised features [B, T, D], the columns of `part`; length int64 [B]; `present`
-        bool [B, D]: those that each motion holds (None = all).
-        """
+        """Latents [B, Z] of features [B, T, D] of `part`, length int64 [B], `present` bool [B, D] or None."""
         device = device_of(self.net)
         near = None if present is None else present.to(device)
         return self.net.encode_motion(motion.to(device), length.to(device), near)

@@ -194,9 +194,7 @@ def save_known(folder: Path, body: KnownCaptions, face: KnownCaptions, actions: 
 
 
 def load_known(folder: Path) -> tuple[KnownTexts, dict[str, KnownCaptions]]:
-    """Return what is known, and both kinds by name, "body" and "face"; empty where `folder` has no such
-    files.
-    """
+    """Return the known texts of a folder, and "body" and "face" of them; empty without such files."""
     texts, embeddings = (folder / name for name in KNOWN_FILES)
     if not texts.is_file():
         return KnownTexts(body=KnownText(), face=KnownText()), {}

@@ -117,10 +117,7 @@ class TokensOfCaptions(Protocol):
 
 @dataclass(frozen=True)
 class LoadedTma:
-    """A trained alignment model, the columns it reads and their statistics.
-
-    Its methods take tensors of any device and give those of its own.
-    """
+    """A trained alignment model with its columns and statistics; tensors may be on any device."""
 
     net: Tma
     layout: MotionLayout
@@ -156,10 +153,7 @@ class LoadedTma:
 
     @torch.no_grad()
     def embed_motion(self, motion: Tensor, length: Tensor, present: Tensor | None = None) -> Tensor:
-        """Motion latents [B, 256] of normalised features [B, T, D], the columns of `part`.
-
-        `present` bool [B, D]: those that each motion holds (None = all).
-        """
+        """Motion latents [B, 256] of normalised features [B, T, D]; `present` bool [B, D], None = all."""
         near = None if present is None else present.to(self.device)
         return self.net.encode_motion(motion.to(self.device), length.to(self.device), near)[0]
 

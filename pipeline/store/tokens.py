@@ -54,9 +54,7 @@ class TokenStore:
         return np.diff(self.starts)
 
     def stretches(self, begin: NDArray[np.int64], count: NDArray[np.int64]) -> Codes:
-        """Codes of `count` [B] groups from group `begin` [B] of the split on: per stream int64
-        [B, most * per_group]; after a shorter row's own come others, of no meaning.
-        """
+        """Codes of groups `begin` + 0 .. `count` [B], int64 [B, most * per_group] a stream, with padding."""
         places = begin[:, None] + np.arange(count.max())
         groups = torch.from_numpy(np.minimum(places, self.starts[-1] - 1))
         return {name: flat.reshape(-1, n)[groups].flatten(1) for (name, flat), n in self._streams()}
@@ -225,9 +223,7 @@ class TokenBatches(Dataset[dict[str, Any]]):
     def _drawn(
         self, items: NDArray[np.int64], turns: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """A caption of each clip, and first group and length of the stretch it is about, or of a random part
-        of one that is longer than the block; each [B].
-        """
+        """A caption of each clip, and first group and length of its stretch, at most a block; each [B]."""
         own, chosen, skipped = self.captions, self.captions.starts[items], np.zeros_like(items)
         choices = own.starts[items + 1] - chosen
         if self.training:

@@ -207,9 +207,7 @@ class Release:
     """Ends the message of what is refused."""
 
     def fill(self, path: Path, net: torch.nn.Module) -> None:
-        """Load the safetensors of a release into `net`; a `UserError` names file, tensor and both shapes
-        where they differ, where one is missing, or where there are others.
-        """
+        """Load a release's safetensors into `net`; a `UserError` names file, tensor and both shapes."""
         own = net.state_dict()
         lacking = dict(net.named_parameters()).keys() - self.names.keys()
         assert not lacking, f"no published name for {sorted(lacking)}"

@@ -68,7 +68,7 @@ class Checkpoint(_Lightning):
 
 
 def weights_of(module: nn.Module) -> dict[str, Tensor]:
-    """Weights and buffers; of FSDP gathered on rank 0, a collective."""
+    """Return weights and buffers; under FSDP a collective, and whole on rank 0 alone."""
     if _is_sharded(module):
         return cast(dict[str, Tensor], get_model_state_dict(module, options=_WHOLE))
     return dict(module.state_dict())
@@ -85,7 +85,7 @@ def load_weights(module: StageModule, state: dict[str, Tensor]) -> None:
 
 
 def optimizer_state(module: StageModule, optimizer: Optimizer) -> OptimizerState:
-    """State with parameters by number; of FSDP gathered on rank 0, a collective."""
+    """Return the state with parameters by number; under FSDP a collective, and whole on rank 0 alone."""
     if not _is_sharded(module):
         return optimizer.state_dict()
     whole = cast(OptimizerState, get_optimizer_state_dict(module, optimizer, options=_WHOLE))
@@ -109,13 +109,13 @@ def load_optimizer(module: StageModule, optimizer: Optimizer, state: OptimizerSt
 
 
 def _renamed(state: OptimizerState, names: Mapping[str, int] | Mapping[int, str]) -> OptimizerState:
-    """The state with other keys for its parameters."""
+    """Return the state with its parameters' keys replaced."""
     groups = [{**one, "params": [names[key] for key in one["params"]]} for one in state["param_groups"]]
     return {"state": {names[key]: values for key, values in state["state"].items()}, "param_groups": groups}
 
 
 def rows_of_ranks(module: StageModule) -> list[list[Means]]:
-    """Contributions of each rank to the next row of the log; a collective."""
+    """Return the sums of each rank for the next row of the log; a collective."""
     rows = [module.row_state()] * world_size()
     if world_size() > 1:
         dist.all_gather_object(rows, module.row_state())
@@ -123,7 +123,7 @@ def rows_of_ranks(module: StageModule) -> list[list[Means]]:
 
 
 def load_row(module: StageModule, rows: Sequence[list[Means]]) -> None:
-    """Continue the log's row; with another number of ranks each takes the mean of all."""
+    """Restore the sums of the log's row; with another number of ranks each gets the mean over all."""
     if len(rows) == world_size():
         module.load_row(rows[rank()])
         return
@@ -184,7 +184,7 @@ class BackgroundWriter:
         self._error: BaseException | None = None
 
     def write(self, state: object, path: Path) -> None:
-        """Copy the state now and write it meanwhile; waits for the one before."""
+        """Copy the state and write it in the background; waits until the file before it is written."""
         self.finish()
         # No daemon: a process that ends by itself finishes the file.
         self._thread = threading.Thread(target=self._run, args=(snapshot(state), path), name="checkpoint")
@@ -195,11 +195,7 @@ class BackgroundWriter:
         return self._thread is not None and self._thread.is_alive()
 
     def finish(self) -> None:
-        """Wait until what is being written is on disk.
-
-        Raises:
-            UserError: It could not be written.
-        """
+        """Wait until the file is on disk; `UserError` if it could not be written."""
         if self._thread is not None:
             self._thread.join()
             self._thread = None
@@ -221,7 +217,7 @@ class BackgroundWriter:
 
 
 def snapshot(value: object) -> object:
-    """Plain containers and tensors, copied to the memory of the host."""
+    """Return a copy of plain containers and tensors in host memory."""
     if isinstance(value, Tensor):
         return value.detach().to("cpu", copy=True)
     if isinstance(value, dict):
@@ -258,11 +254,7 @@ def write_checkpoint(checkpoint: object, path: Path) -> None:
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Content of a checkpoint that is as it was written; its tensors stay on disk until used.
-
-    Raises:
-        DamagedError: It is cut short, changed, or no checkpoint.
-    """
+    """Return the content of a checkpoint, its tensors mapped from disk; `DamagedError` if it is damaged."""
     try:
         _check_seal(path)
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
@@ -276,7 +268,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def readable(folder: Path, say: Callable[[str], None] = warnings.warn) -> Iterator[tuple[Path, Checkpoint]]:
-    """Sound checkpoints of a folder and their content, newest first; `say` is given why others are not."""
+    """Yield undamaged checkpoints and their content, newest first; `say` gets the faults of the others."""
     for path in sorted(folder.glob("*.ckpt"), reverse=True):
         try:
             content = read_checkpoint(path)

@@ -62,9 +62,9 @@ class TrainConfig(Config):
     """Keep only the borders of transformer blocks for the backward pass and compute the rest again there:
     less memory, about a third more time, the same figures."""
     checkpoint_every: int = Field(100, ge=1, json_schema_extra=RUNTIME)
-    """Steps between checkpoints; what a kill can cost."""
+    """Steps between checkpoints: the most that a kill can cost."""
     keep_checkpoints: int = Field(2, ge=2, json_schema_extra=RUNTIME)
-    """Newest checkpoints that are kept: the newest, and at least one more in case that is torn or damaged."""
+    """Number of newest checkpoints to keep; at least two, in case the newest is damaged."""
     keep_every: int = Field(0, ge=0, json_schema_extra=RUNTIME)
     """Also keep, for ever, each checkpoint whose step is a multiple of this; 0 keeps none of them."""
     sample_every: int = Field(0, ge=0, json_schema_extra=RUNTIME)
@@ -109,15 +109,12 @@ class TrainedStageConfig(StageConfig):
             self._require_shardable()
 
     def schedule_of_length(self) -> str | None:
-        """The learning-rate schedule that depends on `train.steps`, as one says it; None if none does.
-
-        Without one, more steps only add to those of a shorter training.
-        """
+        """Describe the learning-rate schedule that depends on `train.steps`; None if none does."""
         schedules = (f"{key}.schedule {optim.schedule}" for key, optim in optimizers_of(self))
         return next((one for one in schedules if not one.endswith(" constant")), None)
 
     def doubts(self) -> list[str]:
-        """Return a sentence on each setting that will hardly do what is meant."""
+        """Return a warning for each setting that probably does not do what is meant."""
         found = optimizers_of(self)
         return [f"{key}.{doubt}" for key, optim in found for doubt in optim.doubts(self.train.steps)]
 

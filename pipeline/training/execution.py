@@ -1,4 +1,4 @@
-"""Execution of a training: devices, processes and precision, and the module on them."""
+"""Devices, processes and precision of a training, and its optimizer steps on them."""
 
 from __future__ import annotations
 
@@ -54,10 +54,7 @@ def set_threads(module: nn.Module, hardware: Hardware) -> None:
 
 @contextmanager
 def repeatable(hardware: Hardware) -> Iterator[None]:
-    """Inside, a GPU computes the same bytes every time (`hardware.deterministic`); what cannot is an error.
-
-    A CPU does in any case.
-    """
+    """Context in which a GPU uses deterministic kernels alone (`hardware.deterministic`); others raise."""
     if not hardware.deterministic or hardware.resolved_accelerator() == "cpu":
         yield
         return
@@ -71,8 +68,8 @@ def repeatable(hardware: Hardware) -> Iterator[None]:
 
 
 class MixedPrecision(FabricMixedPrecision):
-    """As `lightning.Trainer` has it: batches stay as they are, and every use of a weight has a cast of its
-    own, so that its gradients add up in float32.
+    """Autocast as `lightning.Trainer` has it: batches are not cast, and each use of a weight is cast anew, so
+    that gradients add up in float32.
     """
 
     def forward_context(self) -> AbstractContextManager[object]:
@@ -125,11 +122,11 @@ def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
 
 
 def _shard(module: nn.Module, mesh: DeviceMesh) -> nn.Module:
-    """Put a copy of the network in its place that is cut over the ranks (FSDP2); the network stays whole.
+    """Replace the module's network by a copy that is sharded over the ranks (FSDP2).
 
-    Every transformer block is one unit, gathered when it runs and cut again behind it; what is left
-    (embeddings, heads) is the last unit. Gradients are averaged over ranks as DDP averages them, and nothing
-    is gathered in fewer bits than it is kept in, so training equals DDP up to the order of sums.
+    Every transformer block is one unit, gathered when it runs and resharded after it; the rest (embeddings,
+    heads) is the last unit. Gradients are averaged over ranks as in DDP, and nothing is gathered in a lower
+    precision than it is kept in, so training equals DDP up to the order of sums.
     """
     from torch.distributed.fsdp import fully_shard  # imported where it is used: it takes a second
 
@@ -142,7 +139,7 @@ def _shard(module: nn.Module, mesh: DeviceMesh) -> nn.Module:
 
 
 class Execution:
-    """A module on this process's device, cut or wrapped as the strategy says, with its optimizers.
+    """A module on this process's device, wrapped for DDP or FSDP, with its optimizers.
 
     `take_step` calls the methods of the module that `lightning.Trainer` calls, in its order.
     """
@@ -180,9 +177,7 @@ class Execution:
         return torch.zeros(()) if loss is None else loss.detach()
 
     def _take_part(self, batch: Batch, number: int) -> Tensor | None:
-        """Loss of a part, whose gradients are added; computed again without CUDA graphs where their backward
-        pass fails as it runs.
-        """
+        """Add a part's gradients and return its loss; without CUDA graphs once one has failed."""
         losses = self.module.losses
         if not (isinstance(losses, Compiled) and losses.graphs):
             return self._add_gradients(batch, number)

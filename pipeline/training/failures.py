@@ -1,8 +1,7 @@
 """Trainings that go wrong: a loss or gradient that is not finite, an error in a step, a process that hangs.
 
-A process that makes no progress for
-`hardware.stall_seconds` writes the tracebacks of all its threads and ends; the others end with it, by
-torchrun or the time-out of their process group.
+A process that makes no progress for `hardware.stall_seconds` writes the tracebacks of all its threads and
+ends; torchrun or the time-out of the process group ends the others.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class Failure:
 
     @property
     def order(self) -> float:
-        """Earliest first; of one step, a process whose own loss failed before one that got its gradient."""
+        """Sort key: by step, then ranks whose own loss failed before those that got their gradients."""
         return 2.0 * self.step + (not self.terms)
 
     def describe(self) -> str:
@@ -55,7 +54,7 @@ class Failure:
 
 
 def first_failure(module: StageModule) -> Failure | None:
-    """Read and clear what the module has noted of its latest steps."""
+    """Return the first failure among the figures of the latest steps, which are cleared."""
     figures, norms = module.figures[:], module.norms[:]
     module.figures.clear()
     module.norms.clear()
@@ -89,12 +88,7 @@ class FailureGuard:
         self.name, self.module = name, module
 
     def check(self) -> None:
-        """All ranks call this at the same steps.
-
-        Raises:
-            NotFiniteError: In the lead, if any rank has failed.
-            TeamError: In the other ranks.
-        """
+        """Collective: raise `NotFiniteError` in the lead and `TeamError` elsewhere if any rank has failed."""
         # The rank that failed first is the cause: the others got its gradient.
         failure = first_failure(self.module)
         orders = all_ranks([math.inf if failure is None else failure.order], self.module.device)[
@@ -134,11 +128,7 @@ class ShardWatch:
         self._checks = 0
 
     def check(self, device: torch.device) -> None:
-        """All ranks call this at the same steps, and look at a part of the shards each, in turns.
-
-        Raises:
-            JointError: In all ranks, if a shard has changed or is gone.
-        """
+        """Collective: look at some shards on each rank, in turns; `JointError` if one has changed."""
         if not self._states:
             return
         self._checks += 1
@@ -148,12 +138,12 @@ class ShardWatch:
             raise JointError(self._say(int(number)))
 
     def explain(self, error: Exception) -> Exception:
-        """The error, or where this process finds that a shard has changed the one that says so."""
+        """Return `error`, or the error of a changed shard where this process finds one."""
         number = self._changed(0, 1)
         return error if number is None else UserError(self._say(number))
 
     def _changed(self, first: int, every: int) -> int | None:
-        """The number of a shard that is not as it was, among every so many."""
+        """Return the first changed shard among numbers `first`, `first + every`, ...; None if none is."""
         numbered = list(enumerate(self._states.items()))[first::every]
         return next((number for number, (path, state) in numbered if state_of(path)[:2] != state), None)
 

@@ -35,7 +35,7 @@ class StageData(L.LightningDataModule):
         self.batches, self.config, self.hardware = batches, train, hardware
 
     def setup(self, stage: str) -> None:
-        """Compute in as many threads of a CPU as the pipeline's own loop: another number rounds otherwise."""
+        """Use as many CPU threads as the pipeline's own loop: the number of threads changes rounding."""
         if self.trainer is not None:
             set_threads(self.trainer.lightning_module, self.hardware)
 

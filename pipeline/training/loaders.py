@@ -1,4 +1,4 @@
-"""The loaders of a training, in workers beside it, and their batches on its device."""
+"""Data loaders of a training, and their batches on its device."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class TrainingData:
         return self._held_out
 
     def close(self) -> None:
-        """End all workers: they answer no signal, and the process would wait for them."""
+        """Stop all workers, which ignore signals; the process would wait for them."""
         for one in (self._training, self._held_out):
             if one is not None:
                 one.close()
@@ -81,7 +81,7 @@ class _Loader(DataLoader[Batch]):
 
 
 def loader(steps: Steps[Batch], hardware: Hardware) -> _Loader:
-    """A loader of batches that are whole already."""
+    """Return a loader of ready batches."""
     workers = hardware.workers_for(steps.last - steps.first)
     return _Loader(
         steps,
@@ -95,10 +95,7 @@ def loader(steps: Steps[Batch], hardware: Hardware) -> _Loader:
 
 
 def on_device(batches: Iterable[Batch], fabric: Fabric) -> Iterator[Batch]:
-    """The batches where `fabric` computes; a GPU gets the next one while this one is computed.
-
-    Pinned memory is copied by a stream of its own, which the computing one waits for batch by batch.
-    """
+    """Yield the batches on the device of `fabric`; on a GPU the next one is copied by a stream of its own."""
     if fabric.device.type != "cuda":
         yield from map(fabric.to_device, batches)
         return

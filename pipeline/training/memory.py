@@ -1,4 +1,4 @@
-"""Cost of a training before it runs: parameters and memory of one process, on fake tensors.
+"""Estimate of parameters and memory of one training process, on fake tensors.
 
 The network is built and its loss computed on tensors that have shapes but no values, so the figures come from
 the code that will run, under the precision it will run in. Memory counts weights, gradients, the optimizer's
@@ -69,7 +69,7 @@ def _trained(module: StageModule) -> list[nn.Parameter]:
 
 
 def _saved_bytes(module: StageModule, inputs: Batch, *, half: bool) -> int:
-    """Bytes that the backward pass of one loss keeps, parameters apart; `half` under autocast."""
+    """Return the bytes that one loss keeps for the backward pass, parameters apart; `half`: autocast."""
     own = {p.untyped_storage()._cdata for p in module.parameters()}
     sizes: dict[int, int] = {}
 

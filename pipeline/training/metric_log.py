@@ -1,8 +1,8 @@
 """The log of a training: `metrics.jsonl`, and Lightning's loggers, which get the same rows.
 
-A row reaches file and loggers only once the checkpoint that holds it is on disk: none of the loggers can take
-a row back, and after a kill all of them show every step once. A logger that fails is dropped with a warning:
-no result depends on it, and a resumed training sends it the rows that it lacks.
+A row reaches file and loggers only once the checkpoint that holds it is on disk: no logger can take a row
+back, so every step is logged once, after a kill too. A logger that fails is dropped with a warning; a resumed
+training sends it the rows that it lacks.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ FOLDER = "logs"
 """Folder of the loggers in a stage's folder, and of a process that stalled; no result depends on it."""
 
 _SENT = "sent.json"
-"""In that folder: how many rows each logger has. A kill may come between a checkpoint and the sending."""
+"""File in that folder with the number of rows each logger has got: a kill may come before they are sent."""
 
 _MLFLOW_SERVER = os.environ.get("MLFLOW_TRACKING_URI")
-"""As the user has set it: mlflow itself writes there which one it uses."""
+"""Read at import: mlflow overwrites the variable with the server it uses."""
 
 Row = dict[str, float]
 """Figures by name, and "step"."""
@@ -129,7 +129,7 @@ class MetricLog:
 
     @contextmanager
     def _kept(self, name: LoggerName) -> Iterator[Logger]:
-        """A logger, which is dropped if the block fails."""
+        """Context around the use of a logger, which is dropped if that fails."""
         with optional(f"logger {name} of {self.title}", self.console):
             yield self._loggers[name]
             return
@@ -167,7 +167,7 @@ class MetricLog:
 
 
 def _append(path: Path, lines: bytes) -> None:
-    """All of them or none, for whoever reads meanwhile."""
+    """Append lines in one write, so that a reader sees all of them or none."""
     with open_own(path, "ab") as file:
         size = file.seek(0, 2)
         if file.write(lines) != len(lines):

@@ -32,13 +32,13 @@ Handler = Callable[[int, FrameType | None], object] | int | None
 _BETWEEN = 0.5
 """Seconds from one agreement of the ranks to the next: far below any grace time, far above an all-reduce."""
 _GROWTH = 4
-"""An interval in steps grows by no more than this at once: the first steps are slow."""
+"""Largest factor between two intervals in steps: the first steps are slow."""
 _PATIENCE = timedelta(minutes=30)
 """Longest wait for a rank; a validation batch or a checkpoint takes less."""
 
 
 class Signals:
-    """Notes the first signal instead of letting it end the process; a context manager.
+    """Context manager that notes the first signal instead of letting it end the process.
 
     Further ones change nothing: launchers repeat what the whole process group has got already. Only the main
     thread can be asked to note signals; in another one this does nothing.
@@ -59,7 +59,7 @@ class Signals:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """As it was before; a signal that came too late for the training is passed on."""
+        """Restore the handlers; a signal that the training has not answered is raised again."""
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         self._before = {}
@@ -76,7 +76,7 @@ class Signals:
 
 @contextmanager
 def unsignalled() -> Iterator[None]:
-    """Processes started inside never get those signals: a group that is signalled keeps its loader workers.
+    """Context in which started processes ignore the signals, so that loader workers survive them.
 
     They end with their parent, or when it asks them to.
     """
@@ -91,7 +91,7 @@ def unsignalled() -> Iterator[None]:
 
 
 class Agreement:
-    """Which signal any rank has got, asked of all ranks at the same steps; one process asks itself."""
+    """Agreement of all ranks, at the same steps, on the signal that any of them has got."""
 
     def __init__(self, signals: Signals, world: int) -> None:
         self.signals = signals
@@ -101,14 +101,14 @@ class Agreement:
         self._time = time.monotonic()
 
     def after_step(self) -> int:
-        """The signal, or 0; every rank calls this after every step and every validation batch."""
+        """Return the signal or 0; every rank calls this after every step and every validation batch."""
         if self.group is None:
             return self.signals.number
         self._count += 1
         return self.now() if self._count >= self._next else 0
 
     def now(self) -> int:
-        """The signal, or 0, asked in any case."""
+        """Return the signal or 0, always with a collective."""
         if self.group is None:
             return self.signals.number
         # One all-reduce carries both the signal and the pace; MAX lets any rank's signal win.
@@ -123,7 +123,7 @@ class Agreement:
         return int(agreed[0])
 
     def restart_pace(self) -> None:
-        """From here on borders come at another pace: batches of a validation, or steps again."""
+        """Measure the interval anew: calls change from steps to batches of a validation, or back."""
         self._every, self._last, self._time = 1, self._count, time.monotonic()
         self._next = self._count + 1
 

@@ -1,4 +1,4 @@
-"""How a training is watched: the bar, per rank speed, use and waits, and motions drawn while it goes on.
+"""Telemetry of a training: progress bar, speed, utilisation and waits per rank, and sampled motions.
 
 A row every ten steps goes into `flight/rank_N.jsonl` of the stage's folder, which the report draws. Motions
 (`train.sample_every`) are drawn by a process of its own.
@@ -36,9 +36,9 @@ from motionloom.pipeline.training.utilization import Utilization
 
 
 class WaitTimes(dict[str, float]):
-    """Seconds that this process has waited, by cause; on a GPU seconds after all that was queued was done.
+    """Seconds that this process has waited, by cause; on a GPU counted from when its queue was empty.
 
-    `data`: for the next batch, what the reader had not prepared while the step before it was computed;
+    `data`: for the next batch, where it was not ready when the step before it ended;
     `checkpoints`: for copying the state, and for the checkpoint before it if that was still being written;
     `validation`: for the losses on held-out data;
     `ranks`: for ranks that came later to a step.
@@ -53,7 +53,7 @@ class WaitTimes(dict[str, float]):
 
     @property
     def aside(self) -> float:
-        """Seconds in which no step was taken."""
+        """Seconds spent on checkpoints and validations."""
         return self["checkpoints"] + self["validation"]
 
     @contextmanager
@@ -73,14 +73,14 @@ class WaitTimes(dict[str, float]):
                 self._unread.append((cause, mark, _mark()))
 
     def read(self) -> None:
-        """Add the waits of a GPU since the last call; it must come to the end of each."""
+        """Add the waits of a GPU since the last call, synchronising with it."""
         for cause, begin, end in self._unread:
             end.synchronize()
             self[cause] += begin.elapsed_time(end) / 1000
         self._unread.clear()
 
     def shares(self, before: Mapping[str, float], seconds: float) -> dict[str, float]:
-        """Shares of the last `seconds` spent waiting since `before`, a copy made then: 0 to 1, by cause."""
+        """Return the shares of `seconds` spent waiting since the copy `before` was made: 0 to 1, by cause."""
         return {cause: min(1.0, (now - before[cause]) / max(seconds, 1e-9)) for cause, now in self.items()}
 
 
@@ -93,7 +93,7 @@ def _mark() -> torch.cuda.Event:
 class Telemetry:
     """Measures the steps of one process; `folder` is the stage's, `at_peak` as `Utilization` has it.
 
-    No error in writing ends the training: the rest of the rows are only shown then.
+    An error in writing does not end the training: later rows are only shown.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Telemetry:
             self._log = path
         self._use = Utilization(rows, module.step, at_peak)
         self._start_seconds = 0.0
-        """Until the first step was over, which compiles; checkpoints and validations apart."""
+        """Seconds until the end of the first step, which compiles; without checkpoints and validations."""
 
     def batch(self, batch: Batch) -> None:
         """A batch has been read: count its frames or tokens."""
@@ -137,7 +137,7 @@ class Telemetry:
             self._lengths.append(length)
 
     def begin_step(self) -> None:
-        """Validations and checkpoints do not count in the time of a step."""
+        """Start the clock of a step, after validations and checkpoints."""
         self._step_start, self._waited_before = time.perf_counter(), self.waits.process
 
     def end_step(self) -> None:
@@ -150,7 +150,7 @@ class Telemetry:
             self._start_seconds = time.perf_counter() - self._start - self.waits.aside
 
     def end_row(self) -> dict[str, float]:
-        """Write a row; all ranks call this after the same step. What loggers get of it."""
+        """Write a row and return the figures for loggers; all ranks call this after the same step."""
         # The step times of all ranks, so that each knows how long it has waited for the slowest.
         late = all_ranks(([0.0] * LOG_EVERY + self._own)[-LOG_EVERY:], self.module.device)
         self.waits["ranks"] += waited_in_steps(late, rank())
@@ -190,7 +190,7 @@ class Telemetry:
         return {f"flight/{name}": value for name, value in row.items()}
 
     def summary(self) -> str:
-        """Speed and waits since this process began to train, in words; "" if it took no step."""
+        """Return a sentence on speed and waits since this process began to train; "" if it took no step."""
         steps, wall = self.module.step - self._first, time.perf_counter() - self._start
         self._read_lengths()
         self.waits.read()
@@ -230,26 +230,26 @@ def all_ranks(values: Sequence[float], device: torch.device) -> Tensor:
 def waited_in_steps(seconds: Tensor, rank: int) -> float:
     """Seconds that a rank has waited in its steps [W, K] for the rank that came last to each.
 
-    A rank whose batch came late keeps the others waiting in the step's first collective: their step takes
-    longer than its own by as much.
+    A rank with a late batch keeps the others waiting in the step's first collective: their steps take longer
+    than its own by that time.
     """
     return float((seconds[rank] - seconds.min(dim=0).values).sum())
 
 
 def _rss_mib() -> float:
-    """The most memory this process has had so far."""
+    """Return the peak resident memory of this process."""
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return most / 2**20 if sys.platform == "darwin" else most / 2**10
 
 
 _REDRAW = 0.1
-"""Seconds between two states of the bar, which is drawn no more often."""
+"""Least seconds between two redraws of the bar."""
 _WIDE = 130
-"""Columns of a terminal that hold the bar with speed and use; on fewer, count and time left would be cut."""
+"""Least terminal width for the bar with speed and utilisation."""
 
 
 class StepProgress:
-    """Steps done, loss, speed and time left: a bar on a terminal, a line every 15 s elsewhere; the lead's."""
+    """Progress on rank 0: a bar on a terminal, a line every 15 s elsewhere."""
 
     def __init__(self, name: str, first: int, steps: int, console: Console) -> None:
         self.name, self.steps, self.console = name, steps, console
@@ -288,11 +288,11 @@ class StepProgress:
 
 
 _PROGRAM = "motionloom.pipeline.runs.samples"
-"""On a floor above, which only the new process needs."""
+"""Module of a layer above, imported by the new process alone."""
 
 
 class SampleProcess:
-    """Starts the drawing, one process at a time. The training never waits for it, nor ends with it."""
+    """Starts processes that draw samples, one at a time; the training does not wait for them."""
 
     def __init__(self, context: StageContext, kind: str, every: int) -> None:
         """`every` is in steps; 0, or a kind that makes no motion, draws nothing."""
@@ -302,7 +302,7 @@ class SampleProcess:
         self._failed = False
 
     def saved(self, step: int) -> None:
-        """The checkpoint of a step is on disk: draw with it, where it is time and no drawing goes on."""
+        """Start drawing with the checkpoint of `step` if samples are due and no process is drawing."""
         code = 0 if self._process is None else self._process.poll()
         if code is None or not self.every or step % self.every:
             return

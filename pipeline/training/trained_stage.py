@@ -1,7 +1,7 @@
-"""A stage that trains one network: the part of the contract that all such kinds share.
+"""Base of the stages that train one network.
 
-How a network is built is said once, in `facts` and `network`. Training calls them with what the input stages
-made, a dry run with previews of it, and loading with the facts that were written beside the weights.
+`facts` and `network` say how the network is built. Training calls them with the outputs of the input stages,
+a dry run with previews of these, and loading with the facts that were saved beside the weights.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ N = TypeVar("N", bound=nn.Module)
 
 @dataclass(frozen=True)
 class Batches:
-    """Where a training's batches come from."""
+    """Sources of a training's batches."""
 
     train: BatchSource
     validation: EvalSource | None
@@ -94,7 +94,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
 
     @abstractmethod
     def facts(self, config: C, inputs: I) -> ModelFacts:
-        """All that building the network needs beside the inputs that an export takes along."""
+        """Return the facts that build the network, beside the inputs that an export takes along."""
 
     @abstractmethod
     def network(self, facts: ModelFacts, inputs: I) -> N:
@@ -124,15 +124,16 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         return self.module(config, net, inputs, seed=0)
 
     def prepare(self, config: C, net: N, inputs: I) -> None:
-        """Set what the network takes over from other stages before training: statistics, weights."""
+        """Set statistics and weights that the network takes over from other stages before training."""
 
     def loaded(self, net: N, facts: ModelFacts, inputs: I) -> object:
         """Return the output for other stages: the trained network, frozen, or an object around it."""
         return net
 
     def release(self, net: N) -> Release | None:
-        """The names that published weights have for the tensors of such a network, so that `published` may
-        load them in place of a training; None of a kind that nobody has published, or of other settings.
+        """Return the published names of the network's tensors, by which `published` loads them.
+
+        None where no such weights are published, or not with these settings.
         """
         return None
 
@@ -151,13 +152,13 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         return {"published": sha256_of(path)}
 
     def exported_config(self, config: C) -> C:
-        """Without the folder in which published weights lay."""
+        """Return the config without the folder of published weights."""
         if config.published is None:
             return config
         return config.model_copy(update={"published": Path(config.published.name)})
 
     def build(self, config: C, inputs: I, seed: int) -> tuple[N, ModelFacts]:
-        """Return the untrained network, with what it takes over from other stages, and its facts."""
+        """Return the untrained network, prepared from other stages, and its facts."""
         facts = self.facts(config, inputs)
         torch.manual_seed(seed)
         net = self.network(facts, inputs)
@@ -199,7 +200,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         return self.loaded(_frozen(self.network(facts, inputs)), facts, inputs)
 
     def preview_of_finished(self, stage: CompletedStage, given: Inputs) -> object:
-        """The network of a stage outside the recipe's run, without its weights."""
+        """Return the network of a stage outside the recipe's run, without its weights."""
         facts, inputs = load_facts(stage.folder), self.inputs.of(given)
         return self.loaded(_frozen(self.network(facts, inputs)), facts, inputs)
 
@@ -213,7 +214,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         copy_files(stage.folder, target, MODEL_FILES)
 
     def require_inputs(self, config: C, given: Inputs) -> None:
-        """The network is built on tensors that have shapes but no values."""
+        """Build the network on tensors without values, which raises where the inputs do not fit."""
         from torch._subclasses.fake_tensor import FakeTensorMode
 
         with FakeTensorMode(allow_non_fake_inputs=True):

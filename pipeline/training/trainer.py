@@ -205,7 +205,7 @@ class Training:
         self.stall.progress()
 
     def _parts(self, batches: Iterator[Batch]) -> Iterator[Batch]:
-        """The parts of one step's batch, each read when it is wanted."""
+        """Yield the parts of one step's batch, each read when it is needed."""
         for _ in range(self.config.accumulate):
             with self.telemetry.waits.waiting_for("data"):
                 batch = next(batches)
@@ -213,7 +213,7 @@ class Training:
             yield batch
 
     def _log_row(self) -> None:
-        """A row of the log: means of the last ten steps over all ranks."""
+        """Log the means of the last ten steps over all ranks."""
         means = self.module.take_row()
         if world_size() > 1 and means:
             values = torch.stack(list(means.values()))
@@ -223,7 +223,7 @@ class Training:
         self.log.append(self.module.step, _numbers(means), gauges)
 
     def _validate(self) -> None:
-        """Losses on all held-out batches, their means weighted by rows; a signal ends it after a batch."""
+        """Log the mean losses on all held-out batches, weighted by rows; a signal ends it after a batch."""
         module, loader = self.module, self.data.held_out()
         # Weights that are not finite would make the validation a figure that nobody can read.
         self.failures.check()
@@ -253,7 +253,7 @@ class Training:
             self.log.append(module.step, _numbers({f"val/{k}": v / rows for k, v in sums.items()}), {})
 
     def _answer(self, number: int) -> None:
-        """End with `Interrupted`, this step saved, if a signal has come to any rank."""
+        """Save this step and raise `Interrupted` if any rank has got a signal."""
         if not number:
             return
         self.signals.answered = True
@@ -264,7 +264,7 @@ class Training:
         raise self._interrupted(number)
 
     def _end_compiling(self, number: int) -> Interrupted | None:
-        """The end by a signal while torch compiles; None where steps since the last save would be lost."""
+        """Return the error that ends the process while torch compiles; None if steps would be lost."""
         return self._interrupted(number) if self.module.step in (0, self._saved) else None
 
     def _interrupted(self, number: int) -> Interrupted:
@@ -289,7 +289,7 @@ class Training:
         self.stall.progress()
 
     def _finish_writing(self) -> None:
-        """Wait until what is being written is on disk; `UserError` where it could not be written."""
+        """Wait until the checkpoint is on disk; `UserError` if it could not be written."""
         self.writer.finish()
         if self._writing:
             self._writing = False

@@ -1,4 +1,4 @@
-"""Share of a card's peak that a training reaches (MFU), and share of its time that was good (goodput).
+"""Model FLOPs utilisation (MFU) and goodput of a training.
 
 MFU is as in PaLM (Chowdhery et al. 2022, appendix B): matrix products and convolutions of one forward and one
 backward pass, over the time of a step and the dense peak of the maker's data sheet. What is recomputed for
@@ -34,7 +34,7 @@ PEAKS = {
 
 
 def peak_flops(device: torch.device, precision: str) -> float | None:
-    """Return the FLOP/s that the device can reach in a `train.precision`; None where that is not known."""
+    """Return the peak FLOP/s of the device in a `train.precision`; None if unknown."""
     if device.type != "cuda":
         return None
     name = torch.cuda.get_device_name(device)
@@ -43,10 +43,7 @@ def peak_flops(device: torch.device, precision: str) -> float | None:
 
 
 def pass_flops(module: StageModule, batch: Batch) -> int:
-    """Return the FLOPs of a forward and a backward pass over one batch, by copies that hold no values.
-
-    Groups that take turns count as if each had one in every step.
-    """
+    """Return the FLOPs of forward and backward pass over a batch, all groups' turns, on fake tensors."""
     with FakeTensorMode(allow_non_fake_inputs=True) as fake:
         with FakeCopyMode(fake):
             module, batch = copy.deepcopy((module, batch))

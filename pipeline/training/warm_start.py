@@ -1,4 +1,4 @@
-"""Trainings that go on from another network of their kind: what both must have in common."""
+"""Trainings that start from another network of their kind, and the checks that both fit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ START = "start"
 
 
 def starts_from(name: str, first: str, others: Mapping[str, Stage]) -> bool:
-    """Whether a stage is `first`, or was trained on from it, directly or over others; "" is none."""
+    """Whether a stage is `first` or was trained from it, directly or through others; "" is no stage."""
     if not first:
         return not name
     visited: set[str] = set()
@@ -35,7 +35,7 @@ def require_same_start(
     roles: Sequence[str],
     settings: Sequence[str] = (),
 ) -> None:
-    """Refuse a start that is another network than that of `stage`, or reads and writes something else.
+    """Refuse a start whose network, inputs or outputs differ from those of `stage`.
 
     Args:
         free: Settings of the network that only training reads.
@@ -63,9 +63,7 @@ def require_same_start(
 
 
 def _alike(role: str, stage: Stage, start: Stage, others: Mapping[str, Stage]) -> bool:
-    """Whether both get the same in a role: a tokenizer or TMA that was itself trained on from the start's
-    speaks nearly the same language.
-    """
+    """Whether both have the same input in a role, or the stage's was trained from the start's."""
     own, first = stage.inputs.get(role, ""), start.inputs.get(role, "")
     if role == "text":
         return same_encoder(first, own, others)

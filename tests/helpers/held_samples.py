@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from shard_samples import write_made
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import FACE, HANDS, Caption, Split
-from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.shards.writer import write_dataset
 
 LAYOUT = MotionLayout.named("wholebody363")
 COUNT = 24
@@ -42,11 +41,4 @@ class Convert:
 
 def write(out: Path, garbage: float = 0.0, present: tuple[int, ...] = (3, 1, 2, 0, 3)) -> Path:
     items: list[tuple[Split, int]] = [("test" if i % 4 == 3 else "train", i) for i in range(COUNT)]
-    write_dataset(
-        out,
-        items,
-        Convert(present, garbage),
-        DatasetFacts("present", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
-        WriteOptions(clips_per_shard=5, progress=False),
-    )
-    return out
+    return write_made(out, items, Convert(present, garbage), LAYOUT, clips_per_shard=5)

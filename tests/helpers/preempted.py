@@ -24,12 +24,8 @@ seed: 5
 hardware: {{accelerator: cpu, threads: 1, loggers: []}}
 stages:
   data:
-    kind: bvh
-    source: {source}
-    joint_map: {source}/joint_map.json
-    captions: {source}/captions.jsonl
-    licence: CC0
-    fps: 20
+    {{kind: bvh, source: {source}, joint_map: {source}/joint_map.json, captions: {source}/captions.jsonl,
+      licence: CC0, fps: 20}}
   stats: {{kind: stats}}
   tokenizer:
     kind: rvq

@@ -41,14 +41,9 @@ def write_run(run: Path, stages: Mapping[str, Mapping[str, Any]]) -> Path:
             for role, source in stage.get("inputs", {}).items()
         }
         record = {
-            "stage": name,
-            "kind": stage["kind"],
-            "version": 1,
-            "fingerprint": f"of-{name}",
-            "seed": 0,
-            "config": stage.get("config", {}),
-            "inputs": inputs,
-        }
+            "stage": name, "kind": stage["kind"], "version": 1, "fingerprint": f"of-{name}", "seed": 0,
+            "config": stage.get("config", {}), "inputs": inputs,
+        }  # fmt: skip
         (folder / "artifact.json").write_text(json.dumps(record))
         if "figures" in stage:
             stage["figures"].write(folder / FILE_NAME)

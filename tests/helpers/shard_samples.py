@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import signal
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,6 +19,7 @@ from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import DropClip, Sample
 from motionloom.datasets.shards.writer import write_dataset
 
+T = TypeVar("T")
 LAYOUT = MotionLayout.named("body133")
 SPLIT_OF: tuple[Split, ...] = ("train", "train", "train", "val", "test")
 
@@ -72,11 +75,31 @@ class Convert:
         return clip(i)
 
 
+def digests(folder: Path) -> dict[str, str]:
+    """sha256 of all files below a folder, by their paths."""
+    found = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
+
+
 def facts(**changes: Any) -> DatasetFacts:
     return replace(
         DatasetFacts("made", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
         **changes,
     )
+
+
+def write_made(
+    out: Path,
+    made: Sequence[tuple[Split, T]],
+    convert: Callable[[T], Sample],
+    layout: MotionLayout = LAYOUT,
+    describe: Callable[[T], str] = str,
+    **how: Any,
+) -> Path:
+    """Write a data set named made, of any items; `how` are fields of `WriteOptions`."""
+    options = WriteOptions(**{"progress": False, **how})
+    write_dataset(out, made, convert, facts(layout=layout), options, describe=describe)
+    return out
 
 
 def write(out: Path, count: int = 60, convert: Convert | None = None, **changes: Any) -> Manifest:

@@ -116,16 +116,11 @@ stages:
     net: {layers: 1, dim: 32, heads: 4, ff: 64}
     train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8, ema: 0.9}
   face_vae:
-    kind: tma
-    part: face
-    net: {latent: 32, ff: 64, layers: 1}
-    loss: {contrastive: 0}
-    train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}
+    {kind: tma, part: face, net: {latent: 32, ff: 64, layers: 1}, loss: {contrastive: 0},
+     train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}}
   face_diffusion:
-    kind: mdm
-    part: face
-    net: {dim: 32, ff: 64, layers: 1, heads: 4}
-    train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}
+    {kind: mdm, part: face, net: {dim: 32, ff: 64, layers: 1, heads: 4},
+     train: {steps: 8, batch_size: 8, checkpoint_every: 4, validate_every: 8}}
   generate: {count: 1}
   evaluate: {clips: 6, repeats: 1, size: 4}
   report: {count: 1}

@@ -134,9 +134,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _decode_numbers(value: object) -> NDArray[np.floating]:
-    """The array or number that a record describes, as numpy's own pickling would make it; objects, fields,
-    complex numbers and text are refused.
-    """
+    """The array or number of a record; objects, fields, complex numbers and text are refused."""
     match value:
         case float() | int():
             return np.asarray(value, dtype=np.float64)

@@ -43,10 +43,7 @@ def list_files(source: Path) -> tuple[Path, list[str]]:
 
 
 def read_file(path: Path, label: str) -> bytes:
-    """Return the content of a motion file; an .amc's stands behind that of its .asf skeleton and `JOINED`.
-
-    `UserError` when it cannot be read; `label` names it.
-    """
+    """Return a motion file's content, an .amc's behind its .asf and `JOINED`; `label` names it in errors."""
     try:
         data = read_plain(path, MAX_FILE_BYTES, label)
         if path.suffix.lower() != ".amc":
@@ -111,9 +108,7 @@ def read_motion(data: bytes, label: str) -> BvhMotion:
 
 
 def _read_header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, ...], bool]:
-    """Frames, frame rate, skeleton, its joints, and whether the file states other frames than it has;
-    `UserError` when it cannot be read.
-    """
+    """Frames, frame rate, skeleton, joints, and whether the header states another number of frames."""
     asf, joined, amc = data.partition(JOINED)
     if joined:
         found, parents = skeleton_of(asf, label)

@@ -202,9 +202,7 @@ class CaptionConfig(ConvertConfig):
 
 
 def unused_files(source: Path, paths: Sequence[str], captions: Captions) -> list[str]:
-    """Return notes on files in the source that look like captions and are not read, and on tables that were
-    given and hold none.
-    """
+    """Return notes on unread files that look like captions, and on given tables that hold none."""
     notes = []
     if captions.bad:
         count = len(captions.bad)
@@ -236,9 +234,7 @@ def digest_of(given: Path) -> str:
 
 
 def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: Listing) -> None:
-    """Note in the plan what is listed but missing and how captions and clips fit; `draft.stop` is the reason
-    that the conversion must not start yet.
-    """
+    """Note in the plan how captions and clips fit; `draft.stop` says why conversion must not start."""
     for name, clip_id in found.missing.items():
         draft.miss(name, f"clip '{clip_id}' is listed, but its file is not in the source")
     draft.notes += found.empty_splits({clip.label(): split for split, clip in draft.items})

@@ -249,10 +249,7 @@ def _without_repeats(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def text_records(folder: Path, paths: Iterable[Path]) -> Records:
-    """A record for each .txt file, named by its path without `.txt`.
-
-    The folder is in HumanML3D's grammar when the first line of any file is: then all lines must be.
-    """
+    """A record for each .txt file by its path; all have HumanML3D's grammar if any first line has."""
     texts: dict[Path, list[str]] = {}
     for path in paths:
         try:

@@ -129,9 +129,7 @@ def run_conversion(
 
 
 def moved_clips(folder: Path, plan: ConversionPlan[C]) -> str:
-    """Return how many clips of the finished set in a folder are in another split in the plan, by splits;
-    empty where all stay.
-    """
+    """Return how many clips of a finished set would change their split, by both splits; empty if none."""
     before: dict[str, Split] = {}
     with suppress(UserError):  # none, or unfinished
         shards = load_manifest(folder).shards

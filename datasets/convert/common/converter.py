@@ -122,9 +122,7 @@ class Converter(ABC, Generic[Cfg, C]):
         licence: str | None = None,
         mirror_of: str | None = None,
     ) -> ClipMeta:
-        """The facts of a sample: `motion` [T, D], whether hands and face were recorded, and the id of the
-        clip whose mirror image it is.
-        """
+        """Return a sample's facts: `motion` [T, D], parts recorded, and the id of the clip it mirrors."""
         return self.layout.clip_meta(
             clip.id,
             source=source or clip.label(),

@@ -179,13 +179,12 @@ def _old_index(root: Path, shard: ShardInfo) -> Path:
 
 
 def _put_aside(root: Path, shard: ShardInfo, concerned: Sequence[ClipEntry]) -> Counter[str]:
-    """Move a shard and its index into `.old`, the index last: it says that both are there. Return the
-    licences of clips in it.
-    """
+    """Move a shard, and then its index, into `.old`; return the licences of its clips."""
     old = root / OLD_FOLDER / shard.name
     if not index_path(old).exists():
         if not old.exists():
             (root / shard.name).replace(old)
+        # The index last: it says that both are there.
         index_path(root / shard.name).replace(index_path(old))
         sync_folder(old.parent)
     licences = Counter[str]()

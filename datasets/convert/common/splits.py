@@ -107,19 +107,13 @@ def read_ids(path: Path) -> tuple[dict[str, int], list[str]]:
 
 
 def original_of(clip_id: str) -> str | None:
-    """Id of the clip that this one mirrors, None for every other name.
-
-    HumanML3D and Motion-X name them so: `humanml/M007482` mirrors `humanml/007482`.
-    """
+    """Id of the original that a mirrored clip is made from (`humanml/M007482`: `humanml/007482`), or None."""
     found = _MIRRORED.fullmatch(clip_id)
     return found[1] + found[2] if found else None
 
 
 def keep_mirrors_together(splits: Mapping[str, Split], folder: Path) -> None:
-    """`UserError` when a mirrored clip is in another split than its original: the test set would leak.
-
-    Originals without a split are fine.
-    """
+    """`UserError` if a mirrored clip and its original are in two splits: the test set would leak."""
     for clip_id, split in splits.items():
         original = original_of(clip_id)
         if original is not None and splits.get(original, split) != split:

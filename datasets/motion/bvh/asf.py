@@ -57,10 +57,7 @@ class _Skeleton:
 
 
 def read_amc(asf: bytes, amc: bytes, *, name: str) -> BvhMotion:
-    """One motion of a subject, lengths in centimetres.
-
-    `UserError` names the file (`name`), the bone and what is wrong with it, for either text.
-    """
+    """Read one motion of a subject, in centimetres; a `UserError` names file, bone and fault."""
     skeleton = _skeleton(asf, f"{name} (its .asf)")
     numbers, frames = _frames(amc, skeleton.bones, name)
     names, parents = tuple(skeleton.bones), skeleton.parents

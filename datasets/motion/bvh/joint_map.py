@@ -148,10 +148,7 @@ class JointMap:
         return JointMap(str(path), skeleton, rows_in_order, **dict(about))
 
     def require_fit(self, joints: Sequence[str], clip: str) -> None:
-        """`UserError` naming `clip` and the first joint of the map that is not among `joints`, or twice.
-
-        Whether a joint has an End Site shows when a clip is read.
-        """
+        """`UserError` naming `clip` and the first joint of the map that `joints` lack or have twice."""
         counts = Counter([*joints, *map(END.format, dict.fromkeys(joints))])
         for name in dict.fromkeys(name for names in self.sources for name in names):
             if counts[name] == 0:

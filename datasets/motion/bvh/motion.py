@@ -93,10 +93,7 @@ class BvhMotion:
         return out
 
     def local_rotations(self, wanted: Sequence[int]) -> Floats:
-        """Rotations of some joints against their parents, joint first [M, T, 3, 3].
-
-        Identity without rotation channels.
-        """
+        """Local rotations of joints, joint first [M, T, 3, 3]; identity without rotation channels."""
         from scipy.spatial.transform import Rotation  # half a second, which reading a header need not take
 
         out = np.broadcast_to(np.eye(3), (len(wanted), self.frames, 3, 3)).copy()

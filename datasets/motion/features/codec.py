@@ -64,10 +64,7 @@ def encode(
 
 
 def decode(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:
-    """Features [..., T, D] (not normalised) -> joints [..., T, N, 3] in metres, float64.
-
-    Frame 0 stands above the origin with heading +Z.
-    """
+    """Features [..., T, D] -> joints [..., T, N, 3], float64, metres; frame 0 faces +Z at the origin."""
     _check_family(layout)
     if features.ndim < 2 or features.shape[-1] != layout.dim:
         raise UserError(
@@ -150,9 +147,7 @@ def encode_exact(
 def place(
     features: NDArray[np.floating], layout: MotionLayout, turn: NDArray[np.inexact], root: NDArray[np.inexact]
 ) -> NDArray[np.float64]:
-    """Local positions put into the world: `turn` = exp(i heading) [..., T], `root` = z + i x [..., T],
-    metres.
-    """
+    """Local positions in the world: `turn` = exp(i heading), `root` = z + i x, both [..., T], metres."""
     *lead, frames, _ = features.shape
     joints = np.empty((*lead, frames, layout.num_joints, 3), dtype=np.float64)
     local = features[..., layout.slice("positions")].reshape(*lead, frames, layout.num_joints - 1, 3)

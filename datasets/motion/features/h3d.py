@@ -116,10 +116,7 @@ def _published_heading(joints: NDArray[np.float64]) -> NDArray[np.float64]:
 def rotations_6d(
     points: NDArray[np.float64], angle: NDArray[np.float64], skeleton: Skeleton
 ) -> NDArray[np.float64]:
-    """First two columns of the local rotations of joints 1..N-1 (quirk 6).
-
-    Points [3, N, ..., T] and heading [..., T] -> [N - 1, 2, 3, ..., T].
-    """
+    """Points [3, N, ..., T], heading [..., T] -> two rotation columns of joints 1.. [N - 1, 2, 3, ..., T]."""
     parents = np.asarray(skeleton.parents[1:])
     directions, starts = published_chains(skeleton)
     axes = directions.T.reshape(3, -1, *(1,) * angle.ndim)

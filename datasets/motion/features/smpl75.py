@@ -55,9 +55,7 @@ def fit_smpl75(joints: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def joints24_of(columns: NDArray[np.floating]) -> NDArray[np.float64]:
-    """All of SMPL's joints [..., T, 24, 3] of columns [..., T, 75], on the neutral body, whose hands lie amid
-    the knuckles [ours].
-    """
+    """SMPL's joints [..., T, 24, 3] of columns [..., T, 75], on the neutral body with our hands."""
     turns = columns[..., 3:].reshape(*columns.shape[:-1], SMPL_JOINTS, 3)
     return smpl_joints(turns, columns[..., :3], _neutral24())
 

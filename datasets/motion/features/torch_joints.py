@@ -36,9 +36,7 @@ def torch_joints_of(features: Tensor, layout: MotionLayout) -> Tensor:
 
 
 def torch_way(features: Tensor, layout: MotionLayout) -> tuple[Tensor, Tensor, Tensor]:
-    """The root's heading in radians, x and z in metres, [..., T] each, of columns [..., T, D] whose first are
-    the root's.
-    """
+    """Heading in radians, x and z of the root in metres, [..., T] each, of columns [..., T, D]."""
     published = layout.family == "h3d"
     heading = _from_zero(features[..., layout.slice("root_yaw_velocity")][..., 0]) * (-2 if published else 1)
     # Of `h3d` a step is seen from the heading of the frame that it leads to.

@@ -41,9 +41,7 @@ class BailandoGenerator(DanceGenerator):
 
     @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
-        """Features in their own units; the seed motions are what their codes are decoded to, and without
-        them each dance goes on from a kept code, by its seed.
-        """
+        """Dances that begin with the seed motions' codes, or with a kept code by their seed."""
         lengths = request.lengths("Bailando")
         count = max(lengths) // self.unit_frames
         device, gpt = device_of(self.gpt), self.gpt

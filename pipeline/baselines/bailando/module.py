@@ -111,10 +111,7 @@ class CrossGptModule(StageModule):
         self.vq = Frozen(vq)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Return the losses of "motion" [B, T, 3 N], joints in metres, and "conditions" with "audio".
-
-        Rows without music do not count.
-        """
+        """Losses of "motion" [B, T, 3 N] in metres and "conditions"; rows without music do not count."""
         codes, music, heard = codes_of(self.net, self.vq.module, batch)
         logits, true = self.net(codes[:, :-1], music[:, 1:]), codes[:, 1:]
         counts = heard[:, None].expand(true.shape[:2])
@@ -234,9 +231,7 @@ class ActorCriticModule(AlternatingModule):
 def beat_rewards(
     joints: NDArray[np.floating], beats: NDArray[np.bool_], fps: float, code_frames: int, scale: float
 ) -> NDArray[np.float64]:
-    """scale x (both beats - 1/2) of each code [L], of joints [T, N, 3] from the root and frames with a
-    beat [T].
-    """
+    """scale x (both beats - 1/2) of each code [L], of joints [T, N, 3] and frames with a beat [T]."""
     danced = np.zeros(len(joints), dtype=np.bool_)
     danced[np.round(motion_beats(joints, fps) * fps).astype(int)] = True
     both = [frames.reshape(-1, code_frames).any(1) for frames in (danced, beats[: len(joints)])]

@@ -118,9 +118,7 @@ def code_errors(logits: Tensor, codes: Tensor) -> Tensor:
 def music_of_codes(
     music: Tensor, code_frames: int, codes: int | None = None, *, first: bool = False
 ) -> Tensor:
-    """The mean music [B, L, E] of the frames of each code, or that of the `first`; music [B, T, E], after its
-    end 0.
-    """
+    """Mean music [B, L, E] of each code's frames, or of their `first`; music [B, T, E] is 0 after its end."""
     count = -(-music.shape[1] // code_frames) if codes is None else codes
     rows = functional.pad(
         music[:, : count * code_frames], (0, 0, 0, max(0, count * code_frames - music.shape[1]))

@@ -27,10 +27,7 @@ class MotionVaeModule(JointsModule):
     loss_config: MotionVaeLossConfig
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Loss of one batch: "motion" [B, T, D], "length" [B], "present" bool [B, D] (optional: all).
-
-        Latents are sampled in training and are the means in evaluation.
-        """
+        """Loss of "motion" [B, T, D], "length" [B], optional "present"; latents are means in evaluation."""
         motion, present, config = batch["motion"], batch.get("present"), self.loss_config
         mask = length_mask(batch["length"], motion.shape[1])
         mu, logvar = self.net.encode(mask_missing(motion, present), mask)

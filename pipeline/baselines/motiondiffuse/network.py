@@ -171,9 +171,7 @@ class MotionDiffuse(nn.Module):
         return Words(states, text.mask, self.whole(states[torch.arange(len(last), device=last.device), last]))
 
     def denoise(self, noisy: Tensor, step: Tensor, words: Words, mask: Tensor) -> Tensor:
-        """The noise in noisy [B, T, D] (or as the schedule predicts) at step int64 [B]; zero where `mask`
-        bool [B, T] is False.
-        """
+        """Predicted noise in noisy [B, T, D] at step int64 [B]; zero where `mask` bool [B, T] is False."""
         frames = noisy.shape[1]
         waves = step_waves(step, self.config.dim).roll(self.config.dim // 2, dims=1)  # cosines first
         style = self.time(waves.to(noisy.dtype)) + words.whole

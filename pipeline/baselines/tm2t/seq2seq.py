@@ -95,9 +95,7 @@ class Seq2Seq(TokenNetwork):
             nn.init.normal_(table, std=dim**-0.5)
 
     def read(self, text: Tensor, mask: Tensor) -> tuple[EncodedWords, Tensor]:
-        """Words [B, S, E], `mask` bool [B, S] of real ones, from the first on -> what the decoder sees, and
-        its first state [B, D].
-        """
+        """Words [B, S, E], `mask` bool [B, S] -> memory of the decoder, and its first state [B, D]."""
         x = self.text_in(text.to(self.text_in.weight.dtype))
         last = mask.sum(1).clamp(min=1)[:, None] - 1
         # Backwards from each row's last word; padding is read after all words, and looked at nowhere.
@@ -145,10 +143,7 @@ class Seq2Seq(TokenNetwork):
 def draw_tokens(
     net: Seq2Seq, text: Tensor, mask: Tensor, groups: Tensor | None, seeds: Sequence[int], how: Drawing
 ) -> Codes:
-    """Tokens for captions [B, S, E]; of `groups` [B] groups, or until End is drawn.
-
-    A row depends on its caption and its seed alone.
-    """
+    """Tokens for captions [B, S, E], of `groups` [B] or until End; rows depend on their own seed alone."""
     batch, device, size = len(text), text.device, len(net.pattern)
     limit = requested_groups(groups, batch, most=net.max_groups, limit=net.max_groups, device=device)
     most = int(limit.max()) if batch else 0

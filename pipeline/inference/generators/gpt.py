@@ -95,9 +95,7 @@ class GptGenerator(OfTokens):
 
 
 def candidate_seeds(seeds: Sequence[int], count: int) -> list[int]:
-    """Seeds of `count` draws for each of `seeds`, grouped by motion: its own seed first, so that a
-    single draw is the first of several.
-    """
+    """`count` seeds for each of `seeds`, grouped by motion; the first is the motion's own."""
     return [one for seed in seeds for one in (seed, *sample_seeds(seed, count - 1))]
 
 

@@ -254,10 +254,7 @@ def _unit(vectors: Values) -> NDArray[np.float32]:
 
 
 def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
-    """The figure, frames a second and the name of a file's first animation.
-
-    `UserError` for a file of other figures than those of `write_glb`, and for a damaged one.
-    """
+    """Figure, frame rate and name of the first animation; `UserError` for files not of `write_glb`."""
     raw = read_plain(path, _LARGEST)
     parse_json(raw[20 : 20 + int.from_bytes(raw[12:16], "little")], str(path))
     try:

@@ -122,10 +122,7 @@ class TokensStage(StageKind[TokensConfig]):
 
 
 class EncodedSplit:
-    """The codes of all clips of a split, batch by batch, made where the tokenizer lies.
-
-    Clips are cut to a multiple of the group length and batched by length.
-    """
+    """Yield the codes of all clips of a split, cut to whole groups, in batches of like length."""
 
     def __init__(
         self, tokenizer: Tokenizer, dataset: ClipDataset, stats: FeatureStats, batch_frames: int

@@ -160,10 +160,7 @@ class Evaluation:
 def bundle_driven_by(
     modality: str, stages: Sequence[CompletedStage], stage_cache: StageCache
 ) -> Bundle | None:
-    """The first generator of body motion that is conditioned on `modality`, with the face generators.
-
-    None where there is none.
-    """
+    """Return the first generator of body motion that takes `modality`, and face generators, or None."""
     bundle = Bundle(stages, stage_cache)
     faces = [stage for stage in stages if bundle.of(stage).part == "face"]
     for stage in stages:

@@ -48,10 +48,7 @@ def draw_showings(page: Page, heading: str, kind: type[Showing], shown: Sequence
 
 
 def draw_curves(page: Page, stages: Sequence[CompletedStage], *, samples: bool = False) -> None:
-    """The curves of trainings, finished or going on, that the kinds of stages find worth drawing.
-
-    With `samples` what was drawn meanwhile is below them.
-    """
+    """Curves of trainings, finished or running; with `samples` also what was drawn meanwhile."""
     page.add_heading("Training")
     for stage in stages:
         rows = read_training_log(stage.folder)

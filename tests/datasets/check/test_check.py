@@ -15,25 +15,21 @@ from typing import Any
 import numpy as np
 import pytest
 from rich.console import Console
+from shard_samples import LAYOUT, write_made
 
 from motionloom.datasets.check.dataset import CheckReport, examine
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.check.leaks import find_leaks
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards import sample as sample_module
 from motionloom.datasets.shards import tar as shards
-from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.tar import scan_tar
-from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.runs.api import run_recipe
-
-LAYOUT = MotionLayout.named("body133")
 
 
 def walk(seed: int, frames: int = 40) -> np.ndarray:
@@ -74,15 +70,8 @@ def convert(made: Made) -> Sample:
 
 
 def report_on(root: Path, *clips: Made) -> CheckReport:
-    write_dataset(
-        root,
-        [(clip.split, clip) for clip in clips],
-        convert,
-        DatasetFacts("made", LAYOUT, licence="CC0", converter="test", converter_version=1, options={}),
-        WriteOptions(progress=False, strict=True),
-        describe=lambda clip: clip.id,
-    )
-    return examine(root)
+    items = [(clip.split, clip) for clip in clips]
+    return examine(write_made(root, items, convert, describe=lambda clip: clip.id, strict=True))
 
 
 def test_the_same_motion_twice(tmp_path: Path) -> None:

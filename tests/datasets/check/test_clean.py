@@ -10,22 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rich.console import Console
+from shard_samples import LAYOUT, write_made
 
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.faults import motion_faults
 from motionloom.datasets.check.suspects import decide, find_suspects, open_splits, undo
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, Decisions, Split, UserError
-from motionloom.datasets.shards.options import DatasetFacts, Reading, WriteOptions
+from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_clip
 from motionloom.pipeline.runs.api import run_recipe
 
-LAYOUT = MotionLayout.named("body133")
 CONFIG = SynthConfig(clips=30, seed=3, layout="body133")
 Joints = np.ndarray
 
@@ -164,10 +162,8 @@ def write(root: Path, people: list[Joints]) -> Path:
         Made("said", image[5], mirror_of="c5"),
         Made("jump", moved(slice(9, None))(people[20].copy())),
     ]
-    facts = DatasetFacts("made", LAYOUT, licence="CC0", converter="test", converter_version=1, options={})
-    how = WriteOptions(progress=False, strict=True, clips_per_shard=5)
-    write_dataset(root, [(c.split, c) for c in clips], convert, facts, how, describe=lambda clip: clip.id)
-    return root
+    items = [(clip.split, clip) for clip in clips]
+    return write_made(root, items, convert, describe=lambda clip: clip.id, strict=True, clips_per_shard=5)
 
 
 def test_suspects_of_a_set(root: Path) -> None:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections import Counter
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from bvh_clips import unpack_bandai
+from shard_samples import digests
 
+from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
 from motionloom.datasets.convert.bvh.plan import BvhClip
 from motionloom.datasets.convert.common.conversion import run_conversion
+from motionloom.datasets.convert.common.facts import parse_where, require_known
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
@@ -57,10 +60,6 @@ def config(folder: Path, **changes: Any) -> BvhConfig:
 def convert(given: BvhConfig, out: Path, *, workers: int = 1, **options: Any) -> Manifest:
     prepared = prepare(given, workers=workers, out=out)
     return run_conversion(prepared, out, workers=workers, progress=False, **options)
-
-
-def bytes_of(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
 
 
 def reasons(manifest: Manifest) -> dict[str, str]:
@@ -119,7 +118,7 @@ def test_ten_files_later_only_what_changed_is_converted(
     assert "new.bvh" in encoded and len(encoded) == 2, "the new clip, and the one whose caption changed"
     assert said[0].endswith("1 changed, 1 gone") and "1 new" in said[0]
     convert(given, tmp_path / "fresh", clips_per_shard=3)
-    assert bytes_of(tmp_path / "out") == bytes_of(tmp_path / "fresh")
+    assert digests(tmp_path / "out") == digests(tmp_path / "fresh")
     assert "new" in {clip.id for shard in manifest.shards for clip in entries(tmp_path / "out", shard.name)}
 
 
@@ -168,3 +167,65 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
         prepare(config(copy, source=tmp_path / "nothing"))
     with pytest.raises(UserError, match="no such file"):
         prepare(config(copy, source=tmp_path / "none"))
+
+
+# `where`: what an expression chooses, and what is said of one that cannot be read.
+
+
+FACTS: dict[str, Any] = {
+    "category": "Dance and Music", "seconds": 12.5, "is_mirror": "False", "task": ("text", "dance"),
+    "age": "31",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "holds"),
+    [
+        ("", True),
+        ("seconds<30", True),
+        ("seconds <= 12.5 and seconds >= 12.5", True),
+        ("seconds>12.5", False),
+        ("age=31.0", True),
+        ("age<9", False),  # by number, not by letter
+        ("category=dance AND music AND seconds<30", True),
+        ("category='dance and music' and seconds<30", True),
+        ('category!="dance and music"', False),
+        ("is_mirror=false", True),
+        ("task=dance and task!=walk", True),
+        ("category<3", False),
+        ("unknown=1", False),
+    ],
+)
+def test_conditions(text: str, holds: bool) -> None:
+    assert all(condition.holds(FACTS) for condition in parse_where(text)) == holds
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("seconds", "'seconds' is no condition"),
+        ("seconds<", "'seconds<' is no condition"),
+        ("seconds<30 or age=3", "is no condition"),
+        ("seconds<30 and", "'' is no condition"),
+        ("__import__('os')", "is no condition"),
+        ("a=1 and b==2", "'b==2' is no condition"),
+        ("a=1 b=2", "is no condition"),
+    ],
+)
+def test_what_cannot_be_read_is_quoted(text: str, said: str) -> None:
+    with pytest.raises(UserError, match=said.replace("(", r"\(")):
+        parse_where(text)
+
+
+def test_every_source_has_it_and_unknown_names_are_answered_with_those_there_are(
+    amass: ModuleType, tmp_path: Any
+) -> None:
+    for name, seconds in (("long", 3.0), ("short", 2.0)):
+        amass.save(tmp_path / f"in/CMU/01/{name}_poses.npz", **amass.walk(60.0, seconds))
+    plan = prepare(AmassConfig(source=tmp_path / "in", where="subset=cmu and seconds>2.5")).plan
+    assert [clip.id for _, clip in plan.items] == ["CMU/01/long_poses"]
+    assert ["seconds>2.5" in drop.reason for drop in plan.dropped] == [True]
+    with pytest.raises(UserError, match="where: 'seconds'"):
+        AmassConfig.parse({"source": str(tmp_path), "where": "seconds"}, "options")
+    with pytest.raises(UserError, match=r"'sceonds'.* category, seconds"):
+        require_known("sceonds<3", ["seconds", "category"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import random
@@ -17,6 +16,7 @@ import amass_clips
 import pytest
 import release_trees
 from bvh_clips import write_clip
+from shard_samples import digests
 
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import converter_named, prepare
@@ -63,11 +63,6 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def bytes_of(root: Path) -> dict[str, str]:
-    found = [path for path in sorted(root.rglob("*")) if path.is_file()]
-    return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in found}
-
-
 @pytest.mark.slow
 def test_parts_that_run_at_once_and_die_give_the_bytes_of_one_process(source: Path, tmp_path: Path) -> None:
     rng = random.Random()
@@ -92,7 +87,7 @@ def test_parts_that_run_at_once_and_die_give_the_bytes_of_one_process(source: Pa
     joined = join_parts(tmp_path / "parts")
     assert joined == Manifest.load_json(tmp_path / "whole/manifest.json")
     assert sum(shard.samples for shard in joined.shards) == 40 and len(joined.dropped) == 3
-    assert bytes_of(tmp_path / "parts") == bytes_of(tmp_path / "whole"), f"{count} parts"
+    assert digests(tmp_path / "parts") == digests(tmp_path / "whole"), f"{count} parts"
 
 
 SILENT = {"audio_features": False, "sound_rate": 8000}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import pickle
 import re
 from collections.abc import Sequence
@@ -14,6 +13,8 @@ import numpy as np
 import pytest
 import torch
 from sentence_transformers import SentenceTransformer
+from shard_samples import digests
+from text_samples import tiny_clip
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.text import build as build_module
@@ -63,43 +64,6 @@ def test_folders_that_hold_no_whole_model_are_refused(tmp_path: Path) -> None:
         MiniLmEncoder(tmp_path)
 
 
-def tiny_vocabulary(folder: Path) -> Path:
-    words = ["[PAD]", "[UNK]", "[CLS]", "[SEP]", "[MASK]", "a", "person", "walks", "jump", "someone", "left"]
-    (folder / "vocab.txt").write_text("\n".join(words))
-    return folder / "vocab.txt"
-
-
-def tiny_distilbert(folder: Path, seed: int = 0) -> Path:
-    from transformers import BertTokenizerFast, DistilBertConfig, DistilBertModel
-
-    torch.manual_seed(seed)
-    config = DistilBertConfig(vocab_size=11, dim=16, n_layers=2, n_heads=2, hidden_dim=32)
-    DistilBertModel(config).save_pretrained(folder / "model")
-    BertTokenizerFast(vocab=str(tiny_vocabulary(folder))).save_pretrained(folder / "model")
-    return folder / "model"
-
-
-def tiny_clip(folder: Path) -> Path:
-    from transformers import CLIPTextConfig, CLIPTextModelWithProjection, CLIPTokenizerFast
-
-    letters = [*"abcdefghijklmnopqrstuvwxyz", *(f"{c}</w>" for c in "abcdefghijklmnopqrstuvwxyz")]
-    vocabulary = {word: i for i, word in enumerate([*letters, "<|startoftext|>", "<|endoftext|>"])}
-    (folder / "vocab.json").write_text(json.dumps(vocabulary))
-    (folder / "merges.txt").write_text("#version: 0.2\n")
-    end = vocabulary["<|endoftext|>"]
-    torch.manual_seed(0)
-    config = CLIPTextConfig(
-        vocab_size=len(vocabulary), hidden_size=16, intermediate_size=32, num_hidden_layers=2,
-        num_attention_heads=2, projection_dim=16, max_position_embeddings=12, bos_token_id=end - 1,
-        eos_token_id=end, pad_token_id=end,
-    )  # fmt: skip
-    CLIPTextModelWithProjection(config).eval().save_pretrained(folder / "clip")
-    CLIPTokenizerFast(vocab=str(folder / "vocab.json"), merges=str(folder / "merges.txt")).save_pretrained(
-        folder / "clip"
-    )
-    return folder / "clip"
-
-
 def test_clip_folders_work(tmp_path: Path) -> None:
     from transformers import CLIPTextModelWithProjection
 
@@ -137,10 +101,6 @@ class Counting:
     def _vectors(self, caption: str, count: int) -> np.ndarray:
         seed = int.from_bytes(hashlib.md5((self.name + caption).encode()).digest()[:4], "big")
         return np.random.default_rng(seed).standard_normal((count, self.dim))
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in sorted(folder.iterdir())}
 
 
 def test_cache_gives_back_what_the_encoder_said(tmp_path: Path) -> None:

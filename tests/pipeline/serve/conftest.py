@@ -65,20 +65,12 @@ class QuickModel:
         self.edited: list[EditTask] = []
         generator = QuickGenerator()
         self.bundle = SimpleNamespace(
-            layout=LAYOUT,
-            faces={"gpt": None},
-            generator=generator,
-            recommended=SamplingConfig(cfg_scale=1.25, top_p=0.9),
-            generate=self.generate,
+            layout=LAYOUT, faces={"gpt": None}, generator=generator, main="body",
+            recommended=SamplingConfig(cfg_scale=1.25, top_p=0.9), stages=(),
             terms=Terms(credits=("Motion of nobody.",)),
-            main="body",
-            of=lambda stage: generator,
-            encode=lambda *_: {},
-            choose_face=lambda name: None,
-            drawing=lambda sampling: sampling,
-            notes=self.notes,
-            stages=(),
-        )
+            generate=self.generate, notes=self.notes, of=lambda stage: generator, encode=lambda *_: {},
+            choose_face=lambda name: None, drawing=lambda sampling: sampling,
+        )  # fmt: skip
 
     def edit(self, clip: GeneratedMotion, task: EditTask, *, seed: int = 0) -> list[EditedMotion]:
         """As a `MotionModel` does it."""

@@ -51,17 +51,10 @@ from motionloom.pipeline.runs.api import evaluate_run, run_recipe
 FPS = 20.0
 Splits = tuple[ClipDataset, ClipDataset]
 CONFIG = SynthConfig(
-    clips=24,
-    seed=5,
-    layout="smpl75",
-    fps=FPS,
-    actions=["dance"],
-    min_seconds=4.0,
-    max_seconds=6.0,
-    test_fraction=0.5,
-    val_fraction=0.0,
+    clips=24, seed=5, layout="smpl75", fps=FPS, actions=["dance"], min_seconds=4.0, max_seconds=6.0,
+    test_fraction=0.5, val_fraction=0.0,
     dances=DanceConfig(songs=12, song_seconds=10.0, conditions=DanceConditions(audio=1, both=0)),
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -199,12 +192,8 @@ seed: 7
 hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
 stages:
   data:
-    clips: 40
-    layout: smpl75
-    min_seconds: 2.0
-    max_seconds: 5.0
-    test_fraction: 0.34
-    dances: {songs: 9, song_seconds: 8, share: 0.5, conditions: {audio: 1.0, both: 0.0}}
+    {clips: 40, layout: smpl75, min_seconds: 2.0, max_seconds: 5.0, test_fraction: 0.34,
+     dances: {songs: 9, song_seconds: 8, share: 0.5, conditions: {audio: 1.0, both: 0.0}}}
   tma: null
   tokenizer:
     net: {width: 16, code_dim: 8, num_codes: 16, root_gain: 1.0, finger_gain: 0.0}

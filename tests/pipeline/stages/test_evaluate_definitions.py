@@ -3,27 +3,36 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
-from collections.abc import Iterator
+import shutil
+from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
 import torch
 from rich.console import Console
+from text_samples import tiny_clip, tiny_distilbert
 
-from motionloom.datasets.motion.layout import WRISTS
+from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.motion.layout import WRISTS, MotionLayout
+from motionloom.datasets.schema import UserError
 from motionloom.models.metrics import retrieval
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.figures import CHANCE, MODEL, RECORDED, STILL, TRAINING, FigureFile
+from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.latent_metrics import Latents, judged_figures
 from motionloom.pipeline.evaluation.reconstruction import FINGERS, published_errors
-from motionloom.pipeline.evaluation.truth import drawn, truth_of
+from motionloom.pipeline.evaluation.retrieval import retrieve
+from motionloom.pipeline.evaluation.truth import drawn, reconstruct_all, spread_any, truth_of
+from motionloom.pipeline.results.paper.compare import compare_with_paper
 from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.store.evaluator import embed_motions
+from motionloom.pipeline.runs.plan import Selection
+from motionloom.pipeline.stages.networks.evaluator import EvaluatorStage
+from motionloom.pipeline.store.evaluator import LoadedEvaluator, StageWords, embed_motions
+from motionloom.pipeline.store.weights import load_facts
 
 RECIPE = """
 extends: t2m-gpt-tiny
@@ -34,16 +43,9 @@ stages:
     {clips: 90, min_seconds: 2.0, max_seconds: 5.0, test_fraction: 0.5, actions: [raise], hand_shapes: [fist]}
   text: {encoder: DISTILBERT}
   words: {kind: text, encoder: CLIP}
-  tma:
-    inputs: {text: words}
-    net: {latent: 8, ff: 16, layers: 1}
-    train: {steps: 2, batch_size: 4}
-  tokenizer:
-    net: {width: 8, depth: 1, code_dim: 8, num_codes: 8}
-    train: {steps: 2, batch_size: 4}
-  gpt:
-    net: {layers: 1, dim: 16, heads: 2, ff: 16}
-    train: {steps: 2, batch_size: 4}
+  tma: {inputs: {text: words}, net: {latent: 8, ff: 16, layers: 1}, train: {steps: 2, batch_size: 4}}
+  tokenizer: {net: {width: 8, depth: 1, code_dim: 8, num_codes: 8}, train: {steps: 2, batch_size: 4}}
+  gpt: {net: {layers: 1, dim: 16, heads: 2, ff: 16}, train: {steps: 2, batch_size: 4}}
   face_tokenizer: null
   face_tokens: null
   face_gpt: null
@@ -53,20 +55,12 @@ stages:
 """
 
 
-@pytest.fixture(scope="module")
-def models() -> Iterator[ModuleType]:
-    """Makers of tiny text encoders, of equal width."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(Path(__file__).parents[2] / "datasets" / "text"))
-        yield importlib.import_module("test_text_cache")
-
-
 @pytest.mark.slow
-def test_tma_reads_captions_by_its_own_encoder(models: ModuleType, tmp_path: Path) -> None:
+def test_tma_reads_captions_by_its_own_encoder(tmp_path: Path) -> None:
     """The GPT's prior is one encoder's, the judge another's of the same width (Table 8, first row)."""
     for kind in ("distilbert", "clip"):
         (tmp_path / kind).mkdir()
-    encoders = models.tiny_distilbert(tmp_path / "distilbert"), models.tiny_clip(tmp_path / "clip")
+    encoders = tiny_distilbert(tmp_path / "distilbert"), tiny_clip(tmp_path / "clip")
     recipe = RECIPE.replace("DISTILBERT", str(encoders[0])).replace("CLIP", str(encoders[1]))
     (tmp_path / "recipe.yaml").write_text(recipe)
     run_recipe(tmp_path / "recipe.yaml", tmp_path / "run", console=Console(quiet=True))
@@ -191,3 +185,157 @@ def test_matching_is_that_of_the_public_code(
     assert found[MODEL, "fid"] == pytest.approx(golden["fid_pred_gt_float64"].item(), rel=1e-5)
     rows = {row for row, name in found if name == "fid"}
     assert rows == {MODEL, TRAINING, STILL}, "recorded motion has no distance to itself"
+
+
+# The trained evaluator: it judges, and refuses.
+
+
+OWN = """
+name: judge
+seed: 1
+hardware: {accelerator: cpu, threads: 1, convert_workers: 1}
+stages:
+  data:
+    {kind: synth, clips: 300, layout: body133, min_seconds: 2.0, max_seconds: 5.0, test_fraction: 0.2,
+     actions: [walk, turn, squat, kick, raise]}
+  stats: {kind: stats}
+  text: {kind: text}
+  evaluator:
+    kind: evaluator
+    net: {movement_hidden: 64, movement: 64, motion_hidden: 64, text_hidden: 64, latent: 32}
+    movement_steps: 2
+    train: {steps: 4, batch_size: 32, checkpoint_every: 60, validate_every: 0}
+  temos:
+    {kind: tma, net: {latent: 8, ff: 16, layers: 1, heads: 2}, loss: {contrastive: 0.0},
+     train: {steps: 2, batch_size: 4, validate_every: 0}}
+  evaluate:
+    {kind: evaluate, clips: 24, repeats: 3, size: 8, lengths: recorded,
+     inputs: {tma: null, generators: [temos]}}
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The finished run."""
+    root = tmp_path_factory.mktemp("judge")
+    (root / "judge.yaml").write_text(OWN)
+    return run_recipe(root / "judge.yaml", root / "run", console=Console(quiet=True))
+
+
+def loaded(run: Path) -> tuple[Any, LoadedEvaluator]:
+    """Data and evaluator of a run."""
+    stages, stage_cache = finished_stages(run), StageCache()
+    return stage_cache.get(stages["data"]), stage_cache.get(stages["evaluator"])
+
+
+@pytest.mark.slow
+def test_an_evaluation_is_judged_by_it(run: Path) -> None:
+    file = FigureFile.read(run / "stages/evaluate/metrics.json")
+    weights = sha256_of(run / "stages/evaluator/model.safetensors")
+    assert file.about["judges"] == {
+        "evaluator": {"stage": "evaluator", "kind": "evaluator", "sha256": weights}
+    }
+    assert not any(one.name.startswith("tma.") for one in file.figures), "no TMA, no figures by it"
+    top = file.of("evaluator.top-1")
+    data, evaluator = loaded(run)
+    assert top is not None and top.protocol["judge"] == weights
+    assert (top.protocol["clips"], top.protocol["candidates"]) == (24, 8)
+    others, still, made = (file.of("evaluator.fid", row) for row in (TRAINING, STILL, MODEL))
+    assert others is not None and still is not None and made is not None
+    assert 0 < others.value < still.value and made.value > 0 and data.layout == evaluator.layout
+    retrieved = retrieve(run, "evaluator")
+    truths = [t for t in (truth_of(data.split("test"), i) for i in range(60)) if t.caption]
+    judge_ = Judge(evaluator)
+    text, motion = judge_.texts(truths), judge_.recorded(truths)
+    closest = torch.cdist(text.double(), motion.double()).argmin(1) == torch.arange(len(truths))
+    first = retrieved.of("A.t2m/R@1")
+    assert first is not None and first.value == pytest.approx(closest.double().mean().item())
+    assert retrieved.about["sha256"] == weights and retrieved.about["clips"] == len(truths) == 60
+
+
+@pytest.mark.slow
+def test_other_layouts_and_words_are_refused(run: Path) -> None:
+    data, evaluator = loaded(run)
+    evaluator.require_layout(data.layout, "evaluator")
+    words = evaluator.words
+    assert isinstance(words, StageWords)
+    foreign = replace(evaluator, words=replace(words, encoder="other:123"))
+    stats = replace(evaluator.stats, layout=MotionLayout.named("body133", fps=30))
+    given = EvaluatorStage.inputs({"stats": lambda: stats, "text": lambda: words.text})
+    facts = load_facts(run / "stages/evaluator")
+    for refused, said in (
+        (lambda: evaluator.require_layout(MotionLayout.named("wholebody313"), "judge"), "wholebody313"),
+        (lambda: evaluator.require_layout(stats.layout, "judge"), "30 fps"),
+        (lambda: evaluator.embed_captions(["nobody says"], [()]), "'nobody says'"),
+        (lambda: foreign.embed_captions(["a person walks"], [()]), r"model\.json: .*other:123"),
+        (lambda: EvaluatorStage().loaded(evaluator.net, facts, given), "statistics of body133"),
+    ):
+        with pytest.raises(UserError, match=said):
+            refused()
+
+
+# Faces judged by a TMA of faces, motion beside what was recorded for its caption.
+
+
+FACES = """
+extends: small
+name: small
+stages:
+  face_evaluator:
+    {kind: tma, part: face, net: {latent: 8, ff: 16, layers: 1, frame_stride: 1}, loss: {contrastive: 0.1},
+     train: {steps: 4, batch_size: 8, checkpoint_every: 4, validate_every: 4}}
+  evaluate: {clips: 9, repeats: 2, size: 4}
+  # As in the recipes of the baselines.
+  evaluate_face_vae:
+    {kind: evaluate, clips: 9, repeats: 1, size: 4,
+     inputs: {tokenizer: null, face_tokenizer: null, tma: null, generators: [gpt, face_vae]}}
+  evaluate_face_diffusion:
+    {kind: evaluate, clips: 9, repeats: 1, size: 4,
+     inputs: {tokenizer: null, face_tokenizer: null, tma: null, generators: [gpt, face_diffusion]}}
+"""
+
+
+@pytest.fixture(scope="module")
+def judged(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with an evaluator of faces, evaluated by it."""
+    root = tmp_path_factory.mktemp("faces")
+    shutil.copy(small_run.recipe, root / small_run.recipe.name)
+    (root / "faces.yaml").write_text(FACES)
+    shutil.copytree(small_run.folder, root / "run")
+    wanted = "evaluate,evaluate_face_vae,evaluate_face_diffusion"
+    run_recipe(root / "faces.yaml", root / "run", select=Selection(until=wanted), console=Console(quiet=True))
+    return root
+
+
+@pytest.mark.slow
+def test_faces_have_a_judge(judged: Path) -> None:
+    file = FigureFile.read(judged / "run/stages/evaluate/metrics.json")
+    made = {one.name: one.value for one in file.figures if one.row == MODEL}
+    tops = {f"face_evaluator.{name}" for name in ("top-1", "top-2", "top-3", "matching_score")}
+    assert tops <= made.keys() and made["face_evaluator.fid"] > 0
+    assert file.about["judges"]["face_evaluator"]["stage"] == "face_evaluator"
+    others = file.of("reconstruction.face_evaluator.fid", TRAINING)
+    assert others is not None and others.value > 0 and made["reconstruction.face_evaluator.fid"] > 0
+    assert 0 <= made["reconstruction.face_evaluator.top-3"] <= 1
+    top = file.of("face_evaluator.top-1")
+    assert top is not None and (top.protocol["clips"], top.protocol["candidates"]) == (7, 4)
+    # By hand: one clip's expressions.
+    stages, stage_cache = finished_stages(judged / "run"), StageCache()
+    data, tokenizer = stage_cache.get(stages["data"]).split("test"), stage_cache.get(stages["face_tokenizer"])
+    errors, frames = 0.0, 0
+    for truth in (truth_of(data, index) for index in spread_any(data, 9)):
+        if truth.face is not None:
+            rebuilt = reconstruct_all(tokenizer, truth)[:, data.layout.slice("face")].astype(np.float64)
+            errors += np.sqrt(np.square(rebuilt - truth.face).sum(-1)).sum()
+            frames += len(rebuilt)
+    assert made["face.expression"] == pytest.approx(errors / frames, abs=2e-5)
+
+
+@pytest.mark.slow
+def test_each_facial_generator_has_a_row(judged: Path) -> None:
+    (found,) = compare_with_paper("humantomato/4", [judged / "run"])
+    ours = {row.method: row for row in found.rows if row.source == "ours"}
+    assert set(ours) == {"cVAE", "Diffusion", "Ours"}
+    for row in ours.values():
+        assert all(cell is not None for cell in row.cells[:6]), row
+    assert len({ours[method].cells[0].text for method in ours}) == 3  # type: ignore[union-attr]

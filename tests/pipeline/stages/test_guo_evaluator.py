@@ -19,16 +19,14 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from shard_samples import facts
+from shard_samples import write_made
 from torch import Tensor, nn
 
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, UserError
-from motionloom.datasets.shards.options import WriteOptions
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.shards.writer import write_dataset
 from motionloom.pipeline.evaluation.figures import MODEL, FigureFile
 from motionloom.pipeline.store.evaluator import embed_motions
 from motionloom.pipeline.store.published_evaluator import load_published
@@ -283,10 +281,8 @@ stages:
   text: {kind: text}
   guo: {kind: guo_evaluator, folder: FOLDER}
   temos:
-    kind: tma
-    net: {latent: 8, ff: 16, layers: 1, heads: 2}
-    loss: {contrastive: 0.0}
-    train: {steps: 2, batch_size: 4, validate_every: 0}
+    {kind: tma, net: {latent: 8, ff: 16, layers: 1, heads: 2}, loss: {contrastive: 0.0},
+     train: {steps: 2, batch_size: 4, validate_every: 0}}
   evaluate:
     {kind: evaluate, repeats: 4, size: 4, lengths: recorded, inputs: {evaluator: guo, generators: [temos]}}
 """
@@ -305,8 +301,7 @@ def shards(out: Path, walk: Callable[..., Any], tokens: bool) -> None:
         return Sample(meta, motion, texts=[Caption(text=text, tokens=words if tokens else None)])
 
     items = [("test" if number % 2 else "train", number) for number in range(20)]
-    options = WriteOptions(clips_per_shard=8, progress=False)
-    write_dataset(out, items, clip, facts(layout=LAYOUT), options)  # type: ignore[arg-type]
+    write_made(out, items, clip, LAYOUT, clips_per_shard=8)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,20 +12,24 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import torch.multiprocessing as mp
+from shard_samples import write_made
 from toy_gpt import encode_split
 
 from motionloom.datasets.loading.statistics import FeatureStats, compute
-from motionloom.datasets.motion.layout import Part
-from motionloom.datasets.schema import FACE, HANDS
+from motionloom.datasets.motion.layout import MotionLayout, Part
+from motionloom.datasets.schema import FACE, HANDS, Caption, Split, UserError
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.models.tokenizer.base import Tokenizer
+from motionloom.datasets.shards.sample import Sample
+from motionloom.models.gpt.tokens import stream_names
+from motionloom.models.tokenizer.base import Tokenizer, TokenizerConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig
-from motionloom.models.tokenizer.single import RvqConfig
+from motionloom.models.tokenizer.single import RvqConfig, VqConfig
 from motionloom.pipeline.evaluation.estimate import row_estimates
 from motionloom.pipeline.evaluation.reconstruction import face_errors, reconstruction_errors
-from motionloom.pipeline.evaluation.truth import Truth, reconstruct_truth, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, has_caption, reconstruct_truth, spread, truth_of
 from motionloom.pipeline.store.networks import TrainedTokenizer
-from motionloom.pipeline.store.tokens import TokenBatches, TokenStore, gpt_clips
+from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore, gpt_clips
 
 TINY: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
 Data = list[tuple[ShardDataset, FeatureStats]]
@@ -154,3 +159,194 @@ def test_faces_count_where_there_are_any(data: Data) -> None:
         assert found[-1]["expression_mean"] == pytest.approx(apart.mean(), rel=1e-5)
         assert errors(trained, [t for t in truths if t.face is None]) == {}
     assert found[0] == pytest.approx(found[1], rel=1e-6) and found[0]["expression"] > 0
+
+
+# What a GPT trains on: captions about a part of a clip, clips without captions, clips without hands.
+
+
+LAYOUT = MotionLayout.named("wholebody363")  # 30 fps
+FRAMES = 90
+WALKS = Caption(text="walks", start=0.0, end=1.0)
+SITS = Caption(text="sits", start=1.0, end=2.5)
+BLINK = Caption(text="blinks", start=2.0, end=2.05)
+ALL = Caption(text="everything")
+GROUPS = {"walks": (0, 8), "sits": (8, 19), "everything": (0, 22)}
+"""Groups of four frames with the borders nearest to those above."""
+
+
+@dataclass(frozen=True)
+class Convert:
+    """Clip i has the captions `texts[i]`, the face captions `faces[i]` and holds the bits `present[i]`."""
+
+    texts: Sequence[list[Caption]]
+    faces: Sequence[list[Caption]] = ()
+    present: Sequence[int] = ()
+
+    def __call__(self, i: int) -> Sample:
+        motion = np.random.default_rng(i).standard_normal((FRAMES, LAYOUT.dim)).astype(np.float32)
+        meta = LAYOUT.clip_meta(
+            f"clip{i}", source="made", split="train", frames=FRAMES, licence="CC0",
+            has_hands=not self.present or bool(self.present[i] & HANDS), truth={"action": "none"},
+        )  # fmt: skip
+        faces = list(self.faces[i]) if self.faces else []
+        return Sample(meta, motion, texts=list(self.texts[i]), face_texts=faces)
+
+
+def dataset_of(out: Path, convert: Convert) -> ShardDataset:
+    items: list[tuple[Split, int]] = [("train", i) for i in range(len(convert.texts))]
+    return ShardDataset.open(write_made(out, items, convert, LAYOUT, clips_per_shard=3), "train")
+
+
+def places(dataset: ShardDataset) -> list[int]:
+    """Where clip 0, 1, ... came to lie: shards are shuffled when they are written."""
+    return [dataset.ids.index(f"clip{i}") for i in range(len(dataset))]
+
+
+def clips_of(
+    dataset: ShardDataset, *, face: bool = False, config: TokenizerConfig | None = None
+) -> tuple[GptClips, TokenStore, Tokenizer]:
+    torch.manual_seed(0)
+    small = {"width": 8, "depth": 1, "code_dim": 8, "num_codes": 8}
+    net = (config or H2VQConfig(**small)).build(dataset.layout)
+    net(torch.randn(8, 16, net.dim))
+    net.freeze()
+    store = encode_split(net, dataset, compute(dataset), 512)
+    return gpt_clips(dataset, store, net, face=face, min_frames=16), store, net
+
+
+def batches_of(clips: GptClips, net: Tokenizer, *, most: int = 40, training: bool = True) -> TokenBatches:
+    eye, ends = torch.eye(len(clips.texts)), {s.name: s.num_codes for s in net.streams}
+    return TokenBatches(
+        clips.store, clips.captions, eye, eye, net.pattern, ends, most, 4, 0, training=training,
+        sources=clips.sources, present=clips.present,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("captions", [[WALKS, SITS], [SITS, WALKS, ALL, BLINK]])
+def test_a_caption_comes_with_its_own_stretch(tmp_path: Path, captions: list[Caption]) -> None:
+    clips, _, net = clips_of(dataset_of(tmp_path, Convert([captions] * 2)))
+    assert clips.texts == [c.text for c in captions if c is not BLINK], "too short beside longer ones"
+    own = clips.captions
+    for row, first, count in zip(own.rows, own.first, own.count, strict=True):
+        assert (first, first + count) == GROUPS[clips.texts[row]]
+    first = batches_of(clips, net, training=False)[0]
+    assert clips.texts[int(first["text"][0].argmax())] == captions[0].text
+
+
+def test_truth_is_what_the_caption_is_about(tmp_path: Path) -> None:
+    texts = [[WALKS, SITS], [SITS, ALL], [], [BLINK, SITS]]
+    faces = [[Caption(text="frowns", start=1.5), Caption(text="smiles", end=1.0)], [ALL], [], []]
+    dataset = dataset_of(tmp_path, Convert(texts, faces))
+    where = places(dataset)
+    truths = [truth_of(dataset, i) for i in where]
+    assert [t.caption for t in truths] == ["walks", "everything", "", "sits"]
+    assert [t.face_caption for t in truths] == ["smiles", "everything", "", "sits"]
+    spans = [(0, 28), (0, 88), (0, 88), (30, 74)]
+    for i, (truth, (first, end)) in enumerate(zip(truths, spans, strict=True)):
+        np.testing.assert_array_equal(
+            truth.features, dataset.motion(where[i])[first:end, LAYOUT.part("bodyhand")]
+        )
+        assert truth.face is not None and len(truth.face) == len(truth.joints) == end - first
+    assert [t.truth is None for t in truths] == [True, False, False, True], "of whole clips alone"
+    assert has_caption(dataset)[where].tolist() == [True, True, False, True]
+    assert set(spread(dataset, 10)) == set(where) - {where[2]}
+
+
+@pytest.mark.parametrize("face", [False, True])
+def test_clips_without_a_caption_are_left_out(tmp_path: Path, face: bool) -> None:
+    some: list[list[Caption]] = [[ALL], [], [WALKS], [], []]
+    everywhere = [[ALL]] * 5
+    dataset = dataset_of(tmp_path, Convert(everywhere if face else some, some if face else everywhere))
+    clips, store, net = clips_of(dataset, face=face)
+    assert clips.uncaptioned == 3 and set(clips.texts) == {"everything", "walks"}
+    assert len(clips.store.groups) == len(clips.captions) == 2
+    for row, clip in enumerate(sorted([places(dataset)[0], places(dataset)[2]])):
+        assert torch.equal(codes_of(clips.store, row)["body"], codes_of(store, clip)["body"])
+    assert batches_of(clips, net)[0]["tokens"].shape[0] == 4
+
+
+def test_no_caption_at_all_is_refused(tmp_path: Path) -> None:
+    dataset = dataset_of(tmp_path, Convert([[ALL], [WALKS]]))
+    with pytest.raises(UserError, match=r"'train' .*face caption"):
+        clips_of(dataset, face=True)
+    silent = dataset_of(tmp_path / "silent", Convert([[], []]))
+    with pytest.raises(UserError, match=r"'train' .*a caption"):
+        clips_of(silent)
+    with pytest.raises(UserError, match=r"'train' .*a caption"):
+        spread(silent, 4)
+
+
+def test_a_tokenizer_without_a_hand_stream_needs_hands(tmp_path: Path) -> None:
+    dataset = dataset_of(tmp_path, Convert([[ALL]] * 3, present=(3, 2, 3)))
+    config = VqConfig(width=8, depth=1, code_dim=8, num_codes=8)
+    clips, _, _ = clips_of(dataset, config=config)
+    assert len(clips.captions) == 2 and clips.present is None and clips.uncaptioned == 0
+    bare = dataset_of(tmp_path / "bare", Convert([[ALL]] * 2, present=(2, 2)))
+    with pytest.raises(UserError, match="the tokenizer models"):
+        clips_of(bare, config=VqConfig(width=8, depth=1, code_dim=8, num_codes=8, part="bodyhand"))
+
+
+def test_tokens_of_another_tokenizer_are_refused(tmp_path: Path) -> None:
+    clips, store, net = clips_of(dataset_of(tmp_path, Convert([[SITS]])))
+    store.codes["hand"][3] = 8
+    with pytest.raises(UserError, match=r"'hand'.*8 codes.*tokens stage"):
+        batches_of(clips, net)
+
+
+def codes_of(store: TokenStore, clip: int) -> dict[str, torch.Tensor]:
+    """The codes of one clip."""
+    return store.of(np.arange(len(store.groups)) == clip).codes
+
+
+def sequence_by_sequence(batches: TokenBatches, k: int) -> dict[str, torch.Tensor]:
+    """The slow obvious way: one row after the other, token by token, padded to the longest."""
+    captions, pattern, names = batches.captions, batches.pattern, stream_names(batches.pattern)
+    turns, items = batches._plan.local(k, batches.rank, batches.world)
+    rows, texts = [], []
+    for turn, item in zip(turns.tolist(), items.tolist(), strict=True):
+        rng = np.random.default_rng([batches.seed, turn, item])
+        own = range(captions.starts[item], captions.starts[item + 1])
+        chosen = own[int(rng.integers(len(own)))]
+        first, count = int(captions.first[chosen]), int(captions.count[chosen])
+        most = min(count, batches.max_groups)
+        first += int(rng.integers(count - most + 1)) if count > most else 0
+        per_group, tokens = batches.store.per_group, []
+        codes = {n: c[first * per_group[n] :].tolist() for n, c in codes_of(batches.store, item).items()}
+        for _ in range(most):
+            tokens += [(codes[name].pop(0), names.index(name)) for name in pattern]
+        tokens += [(batches.ends[name], names.index(name)) for name in names] if most == count else []
+        rows.append(tokens)
+        texts.append(int(captions.rows[chosen]))
+    size = max(map(len, rows))
+    padded = torch.tensor([row + [(-1, 0)] * (size - len(row)) for row in rows])
+    return {
+        "tokens": padded[..., 0],
+        "kinds": padded[..., 1],
+        "length": torch.tensor([len(row) for row in rows]),
+        "text": batches.prior[texts],
+        "similarity": batches.similarity[texts],
+    }
+
+
+@pytest.mark.parametrize("most", [5, 40])
+@pytest.mark.parametrize("config", [None, VqConfig(width=8, depth=1, code_dim=8, num_codes=8)])
+def test_batches_hold_what_one_sequence_after_the_other_gives(
+    tmp_path: Path, most: int, config: TokenizerConfig | None
+) -> None:
+    texts = [[WALKS, SITS, ALL], [SITS], [WALKS, BLINK], [ALL, WALKS], [WALKS]]
+    clips, _, net = clips_of(dataset_of(tmp_path, Convert(texts)), config=config)
+    for rank in range(2):
+        batches = replace(batches_of(clips, net, most=most), rank=rank, world=2, seed=most**30)
+        for k in range(6):
+            wanted, batch = sequence_by_sequence(batches, k), batches[k]
+            assert batch.keys() == wanted.keys()
+            for name, values in wanted.items():
+                assert batch[name].dtype == values.dtype and torch.equal(batch[name], values), (k, name)
+
+
+def test_loader_workers_share_tokens_and_embeddings(tmp_path: Path) -> None:
+    clips, _, net = clips_of(dataset_of(tmp_path, Convert([[ALL], [WALKS]])))
+    batches = batches_of(clips, net)
+    mp.reducer.ForkingPickler.dumps(batches)  # as `spawn` sends them
+    tables = (*batches.store.codes.values(), batches.prior, batches.similarity)
+    assert all(table.is_shared() for table in tables)

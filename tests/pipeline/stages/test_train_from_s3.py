@@ -11,9 +11,8 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+from shard_samples import write_made
 
-from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
-from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
 
 pytestmark = pytest.mark.slow
@@ -44,14 +43,9 @@ def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Synthetic clips in small shards."""
     out = tmp_path_factory.mktemp("shards")
     config = SynthConfig(clips=60, min_seconds=2.0, max_seconds=5.0)
-    write_dataset(
-        out,
-        [(split_of(number, config), number) for number in range(config.clips)],
-        partial(make_sample, config=config),
-        DatasetFacts("made", config.motion_layout, "CC0", converter="test", converter_version=1, options={}),
-        WriteOptions(clips_per_shard=8, progress=False),
-    )
-    return out
+    items = [(split_of(number, config), number) for number in range(config.clips)]
+    make = partial(make_sample, config=config)
+    return write_made(out, items, make, config.motion_layout, clips_per_shard=8)
 
 
 def recipe(folder: Path, name: str, data: dict[str, Any]) -> Path:

@@ -221,10 +221,7 @@ Piece = tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]
 def cut_of(
     config: BodyConfig, piece: Piece, start: float, seconds: float
 ) -> tuple[NDArray[np.float32] | None, Wav | None]:
-    """The part of a piece from second `start` on that is `seconds` long.
-
-    Audio features [T, 438], a row for each frame of the motion, and the sound itself.
-    """
+    """Part of a piece, `seconds` from `start` on: audio features [T, 438] and the sound."""
     features, samples = piece
     rows: NDArray[np.float32] | None = None
     if features is not None:

@@ -30,9 +30,7 @@ _SHORTEST = 1e-6
 
 
 def rotvecs_of_rows(rows: NDArray[np.float64], label: str) -> NDArray[np.float64]:
-    """Six columns [T, N, 6], the first two rows of a rotation matrix, -> axis-angles [T, N, 3] in radians, by
-    Gram and Schmidt; `UserError` for rows of no length.
-    """
+    """First two rows of matrices [T, N, 6] -> axis-angles [T, N, 3]; `UserError` for rows of length 0."""
     from scipy.spatial.transform import Rotation
 
     first, second = rows[..., :3], rows[..., 3:]

@@ -14,15 +14,13 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from shard_samples import facts
+from shard_samples import write_made
 from torch import Tensor, nn
 
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption
-from motionloom.datasets.shards.options import WriteOptions
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.shards.writer import write_dataset
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 
@@ -115,7 +113,7 @@ def shards(out: Path, walk: Callable[..., Any]) -> None:
         return Sample(meta, motion, texts=[Caption(text="a person walks")])
 
     items = [(split, number) for number, split in enumerate(SPLITS)]
-    write_dataset(out, items, clip, facts(layout=LAYOUT), WriteOptions(progress=False))  # type: ignore[arg-type]
+    write_made(out, items, clip, LAYOUT)  # type: ignore[arg-type]
 
 
 RECIPE = """
