@@ -10,12 +10,14 @@ import faulthandler
 import math
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO
 
 import torch
 import torch.distributed as dist
+from rich.console import Console
 
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.checksums import state_of
@@ -25,6 +27,7 @@ from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.launch.process import JointError, TeamError
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.files import open_own
+from motionloom.pipeline.store.training_log import optional
 from motionloom.pipeline.training.telemetry import all_ranks
 
 
@@ -157,22 +160,23 @@ class ShardWatch:
 class StallTimer:
     """Ends this process, with the tracebacks of all threads, if it makes no progress for some time."""
 
-    def __init__(self, path: Path, seconds: float) -> None:
-        self.path, self.seconds = path, seconds
+    def __init__(self, path: Path, seconds: float, console: Console) -> None:
+        self.path, self.seconds, self.console = path, seconds, console
         self._armed = -math.inf
+        self._file: IO[str] | int = 2  # standard error, where `path` cannot be written
 
     @contextmanager
     def running(self) -> Iterator[None]:
         if not self.seconds:
             yield
             return
-        with open_own(self.path, "w") as self._file:
-            try:
-                self.progress()
-                yield
-            finally:
-                faulthandler.cancel_dump_traceback_later()
-        self.path.unlink(missing_ok=True)
+        with ExitStack() as stack:
+            with optional(str(self.path), self.console):
+                self._file = stack.enter_context(open_own(self.path, "w"))
+                stack.callback(self.path.unlink, missing_ok=True)
+            stack.callback(faulthandler.cancel_dump_traceback_later)
+            self.progress()
+            yield
 
     def progress(self) -> None:
         """A step, a validation batch or a checkpoint is done."""

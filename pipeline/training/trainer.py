@@ -137,7 +137,7 @@ class Training:
         self.failures = FailureGuard(name, module)
         self.shards = ShardWatch(context.inputs.values())
         stalled = self.log.folder / f"stalled_rank_{rank()}.txt"
-        self.stall = StallTimer(stalled, hardware.stall_seconds)
+        self.stall = StallTimer(stalled, hardware.stall_seconds, console)
 
     def run(self) -> None:
         self.log.open()

@@ -138,7 +138,7 @@ def test_a_week(week: Week, tmp_path: Path) -> None:
     )
     for mine, theirs in zip(*logs, strict=True):
         exact = mine["step"] <= first  # later steps round to bfloat16, other shares of the batch otherwise
-        assert mine["train/loss"] == pytest.approx(theirs["train/loss"], rel=1e-6 if exact else 0.02)
+        assert mine["train/loss"] == pytest.approx(theirs["train/loss"], rel=1e-5 if exact else 0.02)
     weights = [load_file(stage / "model.safetensors") for stage in stages]
     for name, value in weights[0].items():
         torch.testing.assert_close(value, weights[1][name], rtol=0, atol=0.005)

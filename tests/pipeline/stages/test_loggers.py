@@ -144,6 +144,17 @@ def test_a_logger_that_fails_is_dropped(fails: str, tmp_path: Path, monkeypatch:
     assert sent[-1] == 30 and (fails == "save" or len(sent) == 5)
 
 
+def test_logs_that_cannot_be_written_end_no_training(tmp_path: Path) -> None:
+    (tmp_path / "logs").write_text("")
+    said = StringIO()
+    train(tmp_path, hardware=FILES, console=Console(file=said, width=500), **STEPS)
+    left_out = [line.split(" is left out")[0] for line in said.getvalue().splitlines() if "left out" in line]
+    assert len(left_out) == 3 and {"logger csv", "logger tensorboard"} < {
+        " ".join(line.split()[:2]) for line in left_out
+    }
+    assert [row["step"] for row in read_training_log(tmp_path)] == [10, 12, 20, 24, 30]
+
+
 def test_a_server_knows_a_training_that_goes_on(tmp_path: Path) -> None:
     console = Console(quiet=True)
     first, again = (MetricLog(tmp_path, (), "p", "t", console).identity("wandb") for _ in range(2))
