@@ -6,9 +6,9 @@ Notable choices:
   depends on its text, its seed and the settings, and on nothing else in the batch. Batched matrix products
   round in their own way, so a draw within 1e-6 of a boundary of the distribution can still differ.
 - Guidance runs the conditional and the unconditional half in one forward.
-- On a GPU a token of the GPT is one CUDA graph. Matrix products have the type they have in training: of the
-  weights, float32 in every bundle, or that of autocast around the call. Half precision is not the default
-  there, since the same seed then makes another motion than on a CPU.
+- On a GPU each token of the GPT is one CUDA graph. Matrix products are computed in the type of the weights,
+  float32 in every bundle, or as `torch.autocast` around the call says. Half precision is not the default:
+  with it, the same seed makes another motion than on a CPU.
 
 Legend: B batch, V vocabulary, G groups, P slots of a group, D width.
 """

@@ -33,6 +33,9 @@ SECOND = torch.device("second_device", 0)
 Watch = Callable[[str, Sequence[Any], Any], None]
 """Gets every operation's name, such as "aten::add", its arguments and its result."""
 
+WAITS = {"_local_scalar_dense", "item", "nonzero", "masked_select", "is_nonzero", "_unique2"}
+"""Operations that read from the device."""
+
 _COPIES = {"aten::copy_", "aten::_to_copy", "aten::to"}
 _INDEXED = {"aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_"}
 """As with a GPU, their indices may lie anywhere."""

@@ -76,6 +76,12 @@ def random_codes(groups: Sequence[int], streams: Sequence[Stream] = STREAMS) -> 
     return Codes(codes, number)
 
 
+def row_of(codes: Codes, index: int) -> dict[str, list[int]]:
+    """The codes of one row by stream, without what is behind them."""
+    count = int(codes.groups[index])
+    return {s.name: codes.codes[s.name][index, : count * s.per_group].tolist() for s in STREAMS}
+
+
 def encoded(batch: int, lengths: list[int] | None = None, *, timed: bool = False) -> Encoded:
     """Conditions of a UTT, at most five positions long."""
     draws = torch.Generator().manual_seed(1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from toy_gpt import STREAMS, toy_gpt
+from toy_gpt import STREAMS, row_of, toy_gpt
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.network import InterleavedGPT
@@ -14,18 +14,6 @@ from motionloom.models.gpt.sampling import Drawing, filter_logits, generate, sam
 @pytest.fixture
 def gpt() -> InterleavedGPT:
     return toy_gpt(std=0.5)
-
-
-def rows_equal(one: object, row: int, many: object, at: int) -> bool:
-    groups = int(one.groups[row])
-    if groups != int(many.groups[at]):
-        return False
-    return all(
-        torch.equal(
-            one.codes[s.name][row, : groups * s.per_group], many.codes[s.name][at, : groups * s.per_group]
-        )
-        for s in STREAMS
-    )
 
 
 @pytest.mark.parametrize("scale", [1.0, 2.5])
@@ -38,11 +26,11 @@ def test_alone_equals_in_a_batch(gpt: InterleavedGPT, scale: float) -> None:
     assert len(set(together.groups.tolist())) > 1
     for row in range(7):
         alone = generate(gpt, text[row : row + 1], seed=[seeds[row]], cfg_scale=scale)
-        assert rows_equal(alone, 0, together, row)
+        assert row_of(alone, 0) == row_of(together, row)
     chunk = generate(gpt, text[4:], seed=seeds[4:], cfg_scale=scale)
-    assert all(rows_equal(chunk, row, together, row + 4) for row in range(3))
+    assert all(row_of(chunk, row) == row_of(together, row + 4) for row in range(3))
     other = generate(gpt, text, seed=4, cfg_scale=scale)
-    assert not all(rows_equal(other, row, together, row) for row in range(7))
+    assert not all(row_of(other, row) == row_of(together, row) for row in range(7))
     assert sample_seeds(3, 2) == seeds[:2]
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import torch
-from toy_gpt import PATTERN, STREAMS, encoded, random_codes
+from toy_gpt import PATTERN, STREAMS, encoded, random_codes, row_of
 
 from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Encoded
@@ -40,11 +40,6 @@ conditions = partial(encoded, timed=True)
 def null(batch: int) -> Encoded:
     zero = torch.full((batch, 6), 0.3, dtype=torch.float64)
     return Encoded(zero, zero.new_zeros(batch, 0, 6), torch.zeros(batch, 0, dtype=torch.bool))
-
-
-def row(codes: Codes, index: int) -> dict[str, list[int]]:
-    count = int(codes.groups[index])
-    return {s.name: codes.codes[s.name][index, : count * s.per_group].tolist() for s in STREAMS}
 
 
 @torch.no_grad()
@@ -122,8 +117,8 @@ def test_continues_given_tokens_of_different_lengths(utt: Utt) -> None:
         expected = slow(utt, mine, seeds[index], int(groups[index]), start=before)
         assert new.tokens[index, : int(new.length[index])].tolist() == expected
     other = generate(utt, condition, groups=groups, seed=5)
-    assert any(row(other, i) != row(out, i) for i in (0, 1, 3))
-    assert row(other, 2) == row(out, 2)  # the row that has no start
+    assert any(row_of(other, i) != row_of(out, i) for i in (0, 1, 3))
+    assert row_of(other, 2) == row_of(out, 2)  # the row that has no start
 
 
 def test_context_limits_what_is_read_of_the_start(utt: Utt) -> None:
@@ -135,9 +130,9 @@ def test_context_limits_what_is_read_of_the_start(utt: Utt) -> None:
     )  # fmt: skip
     a = generate(utt, condition, start=start, context=2, groups=groups, seed=1)
     b = generate(utt, condition, start=short, groups=groups, seed=1)
-    assert all(row(a, i) == row(b, i) for i in range(2))
+    assert all(row_of(a, i) == row_of(b, i) for i in range(2))
     c = generate(utt, condition, start=start, context=0, groups=groups, seed=1)
-    assert all(row(c, i) == row(generate(utt, condition, groups=groups, seed=1), i) for i in range(2))
+    assert all(row_of(c, i) == row_of(generate(utt, condition, groups=groups, seed=1), i) for i in range(2))
 
 
 def test_join_of_rows_of_different_lengths() -> None:
@@ -145,8 +140,8 @@ def test_join_of_rows_of_different_lengths() -> None:
     both = join(a, b, PATTERN)
     assert both.groups.tolist() == [6, 6, 3]
     for index in range(3):
-        assert row(both, index) == {
-            name: values + row(b, index)[name] for name, values in row(a, index).items()
+        assert row_of(both, index) == {
+            name: values + row_of(b, index)[name] for name, values in row_of(a, index).items()
         }
     assert (both.codes["body"][2, 6:] == 0).all()
 
@@ -166,10 +161,10 @@ def test_alone_equals_in_a_batch(utt: Utt, scale: float | list[float]) -> None:
         own = scale[index] if isinstance(scale, list) else scale
         settings |= {"null": null(1), "start": codes, "cfg_scale": own}
         alone = generate(utt, condition.rows(mine), seed=[seeds[index]], **settings)
-        assert row(alone, 0) == row(together, index)
+        assert row_of(alone, 0) == row_of(together, index)
     settings |= {"null": null(6), "start": start, "cfg_scale": scale}
     other = generate(utt, condition, seed=4, **settings)
-    assert any(row(other, i) != row(together, i) for i in range(6))
+    assert any(row_of(other, i) != row_of(together, i) for i in range(6))
 
 
 def test_z_makes_samples_differ_and_is_the_seeds_alone(utt: Utt) -> None:
@@ -182,8 +177,8 @@ def test_z_makes_samples_differ_and_is_the_seeds_alone(utt: Utt) -> None:
             utt.frame_condition_in.weight.mul_(0.1)
     noisy = generate(utt, condition, groups=groups, how=Drawing(0))
     still = generate(utt, condition, groups=groups, how=Drawing(0), inject_z=False)
-    assert len({str(row(noisy, i)) for i in range(8)}) > 2
-    assert len({str(row(still, i)) for i in range(8)}) == 1
+    assert len({str(row_of(noisy, i)) for i in range(8)}) > 2
+    assert len({str(row_of(still, i)) for i in range(8)}) == 1
     seeds = sample_seeds(0, 8)
     assert torch.equal(draw_z(seeds, 3)[5:], draw_z(seeds[5:], 3))
     many = draw_z(sample_seeds(1, 4000), 2)

@@ -15,7 +15,7 @@ from lightning.fabric import Fabric
 from lightning.fabric.accelerators import CPUAccelerator
 from lightning.fabric.strategies.single_device import SingleDeviceStrategy
 from rich.console import Console
-from second_device import SECOND, Far, second_device
+from second_device import SECOND, WAITS, Far, second_device
 from toy_training import ToyBatches, toy_recipe
 
 from motionloom.datasets.schema import ShardInfo, UserError
@@ -137,9 +137,6 @@ ANY_ORDER = {
 }  # fmt: skip
 """Operations that `torch.use_deterministic_algorithms` refuses on a GPU or turns into slow ones; sums of
 gradients that a gather or an index gives (scatter_add, index_put) it sorts."""
-
-WAITS = {"_local_scalar_dense", "item", "nonzero", "masked_select", "is_nonzero", "_unique2"}
-"""Operations that read from the device."""
 
 MAY_WAIT = {"ActorCriticModule"}
 """Its rewards are beats of dances, which numpy finds."""
