@@ -49,7 +49,7 @@ from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.training_log import read_flight
 from motionloom.pipeline.store.yaml import dump_yaml
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import LAUNCHES, Execution, launch, repeatable
+from motionloom.pipeline.training.execution import LAUNCHES, Execution, deterministic, launch
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}
@@ -183,7 +183,7 @@ class Benchmark:
             self.synchronize()
             return (time.perf_counter() - begin) / count
 
-        with repeatable(hardware):
+        with deterministic(hardware):
             first, second = timed(1), timed(3)
             seconds = timed(max(3, min(100, int(2 / second))))
         cells = {"ms a step": f"{1000 * seconds:.1f}", "first, s": f"{first:.1f}"}

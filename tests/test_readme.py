@@ -295,7 +295,6 @@ def said(script: str, environment: dict[str, str]) -> list[str]:
 
 # Options, commands, settings, recipes and memory that a page, a message or a help text names are there.
 
-
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "models/pretrained").glob("*/*.md")]
 SOURCES = [path for room in ("datasets", "models", "pipeline") for path in (ROOT / room).rglob("*.py")]
 OF_SLURM = "cpus-per-task dependency gpus-per-node gpus-per-task jobs kill-on-bad-exit kill-on-invalid-dep"

@@ -96,9 +96,7 @@ def on_one_thread(work: Callable[[T], R], task: T) -> R:
 
 @contextmanager
 def _starting() -> Iterator[None]:
-    """Start workers that leave Ctrl-C to their parent, and where the program came from standard input, which
-    no worker can read again, do not look for it.
-    """
+    """Start workers that leave Ctrl-C to their parent and never import a program read from stdin."""
     program = sys.modules["__main__"]
     file = getattr(program, "__file__", None)
     lost = file is not None and not Path(file).exists()

@@ -43,7 +43,7 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
     if there.place.startswith("http"):
         raise UserError(f"{target}: a web server is only read; name a folder, s3://… or hf://datasets/…")
     manifest, digest = read_manifest(here)
-    _make_way(there, manifest, digest)
+    _remove_older(there, manifest, digest)
     sums = {shard.name: shard.sha256 for shard in manifest.shards}
     # Without the others of these a data set can be read; `data convert` and `data clean` go on with them. Who
     # was removed is nothing to publish, though it is hashed: names can be tried.
@@ -54,7 +54,7 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
     with tempfile.TemporaryDirectory() as folder, Meter("copying", len(names), shown=progress) as meter:
         for name in names:
             try:
-                new = _carry(here, there, name, sums.get(name), Path(folder))
+                new = _send_file(here, there, name, sums.get(name), Path(folder))
             except MissingFileError:
                 if name in needed:
                     raise
@@ -64,7 +64,7 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
     return Copied(sent, kept)
 
 
-def _make_way(there: Store, manifest: Manifest, digest: str) -> None:
+def _remove_older(there: Store, manifest: Manifest, digest: str) -> None:
     """Delete an older manifest at the target, after the files that it alone names."""
     if _digest(there, MANIFEST_FILE) in (None, digest):
         return
@@ -77,7 +77,7 @@ def _make_way(there: Store, manifest: Manifest, digest: str) -> None:
             persist(there.where(name), partial(there.system().rm_file, there.where(name)))
 
 
-def _carry(here: Store, there: Store, name: str, wanted: str | None, folder: Path) -> bool:
+def _send_file(here: Store, there: Store, name: str, wanted: str | None, folder: Path) -> bool:
     """Send a file unless the target has it, compare it there, and return whether it was sent."""
     if wanted is not None and _digest(there, name) == wanted:
         return False

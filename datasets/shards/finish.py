@@ -60,7 +60,7 @@ class Planned(Config):
         )
 
 
-def leave_record(out: Path, part: Part, planned: Planned) -> None:
+def write_record(out: Path, part: Part, planned: Planned) -> None:
     """Write a part's record, unless the set is joined already."""
     if not (out / MANIFEST_FILE).exists():
         write_json(out / PARTS_FOLDER / f"{part.number}-of-{part.count}.json", planned.dump())

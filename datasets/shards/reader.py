@@ -237,7 +237,7 @@ class ShardDataset:
             raise UserError(f"{self._where(i, 'audio.flac')}: not readable sound ({error})") from None
         return signal, int(rate)
 
-    def let_go(self) -> None:
+    def unmap(self) -> None:
         """Unmap the shards, to free memory after all clips were read once."""
         self._access.maps.clear()
 

@@ -40,9 +40,9 @@ from motionloom.datasets.shards.finish import (
     Planned,
     differences,
     finish,
-    leave_record,
     remove_strays,
     shards_in,
+    write_record,
 )
 from motionloom.datasets.shards.index import ShardIndex, index_path
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
@@ -191,7 +191,7 @@ class DatasetWriter(Generic[T]):
         part = self._how.part
         if part is None:
             return finish(self.out, self._planned, self._shards(convert))
-        leave_record(self.out, part, self._planned)
+        write_record(self.out, part, self._planned)
         return self._planned.with_results(self._shards(convert))
 
     def _shards(self, convert: Convert[T]) -> list[Result]:

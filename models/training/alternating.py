@@ -150,7 +150,7 @@ class AlternatingModule(StageModule):
         for number, turn in enumerate(self._turns):
             if not turn.group.steps_at(self.step):
                 continue
-            with self._alone_trains(turn):
+            with self._train_only(turn):
                 turn.optimizer.zero_grad()
                 for place, part in enumerate(parts):
                     self.seed_draws(place, number)
@@ -186,7 +186,7 @@ class AlternatingModule(StageModule):
         optimizer.step()
 
     @contextmanager
-    def _alone_trains(self, turn: _Turn) -> Iterator[None]:
+    def _train_only(self, turn: _Turn) -> Iterator[None]:
         """Context in which parameters of other groups get no gradients; those of no group are not touched."""
         others = [param for other in self._turns if other is not turn for param in other.params]
         for param in others:

@@ -20,7 +20,7 @@ from motionloom.datasets.conditions import Condition
 GRAPHS = 64
 """Graphs that one function may have: shapes of batches, training and validation, each kind of stage."""
 
-PLACES = 16
+WORD_MULTIPLE = 16
 """Captions of a batch are padded to a multiple of so many words: a CUDA graph has one shape, and each length
 would need its own."""
 
@@ -47,7 +47,7 @@ class Compiled:
         if self.graphs:
             torch.compiler.cudagraph_mark_step_begin()  # type: ignore[no-untyped-call]
         try:
-            filled = map(_of_few_shapes, arguments) if self.graphs else arguments
+            filled = map(_pad_conditions, arguments) if self.graphs else arguments
             return self.compiled(*filled)
         except (failures, exc.FailOnRecompileLimitHit) as error:
             if self.graphs:  # which may have drawn
@@ -80,17 +80,17 @@ class Compiled:
         return torch.compile(self.losses, fullgraph=True, options=options)
 
 
-def _of_few_shapes(argument: object) -> object:
-    """Return a batch with its captions padded to a multiple of `PLACES` words; anything else unchanged."""
+def _pad_conditions(argument: object) -> object:
+    """Return a batch with captions padded to a multiple of `WORD_MULTIPLE` words; others unchanged."""
     if not isinstance(argument, dict) or not isinstance(argument.get("conditions"), dict):
         return argument
-    filled = {name: _filled_up(condition) for name, condition in argument["conditions"].items()}
+    filled = {name: _pad_words(condition) for name, condition in argument["conditions"].items()}
     return {**argument, "conditions": filled}
 
 
-def _filled_up(condition: Condition) -> Condition:
+def _pad_words(condition: Condition) -> Condition:
     """Return a text condition padded with masked words; conditions timed by frames are returned unchanged."""
-    more = -condition.mask.shape[1] % PLACES
+    more = -condition.mask.shape[1] % WORD_MULTIPLE
     if condition.pooled is None or not more:
         return condition
     return condition._replace(

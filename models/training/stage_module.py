@@ -221,12 +221,12 @@ class StageModule(L.LightningModule, ABC):
         buffers = [(buffer, buffer.clone()) for buffer in self.buffers()]
         figures, sums = list(self.figures), dict(self._sums)
 
-        def put_back() -> None:
+        def restore() -> None:
             for buffer, before in buffers:
                 buffer.copy_(before)
             self.figures, self._sums = figures, sums
 
-        return put_back
+        return restore
 
     def take_row(self) -> dict[str, Tensor]:
         """Means since the last row, "train/NAME" -> scalar; the next row begins."""

@@ -218,7 +218,7 @@ def _embedded(
             meter.advance(len(motions))
             del motion, motions
             for dataset in splits.values():
-                dataset.let_go()
+                dataset.unmap()
 
 
 def _stored(path: Path, made_from: str, shape: tuple[int, int]) -> Vectors | None:

@@ -70,9 +70,7 @@ def perform(
     seed: int = 0,
     sampling: SamplingConfig | None = None,
 ) -> list[GeneratedMotion]:
-    """Motions for the captions of clips, each as long as its clip where neither `seconds` nor the model says
-    more.
-    """
+    """Motions for clips' captions, as long as the clips unless `seconds` or the model decides."""
     maker = bundle.generator
     return bundle.generate(
         [truth.caption for truth in truths],

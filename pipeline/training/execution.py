@@ -53,7 +53,7 @@ def set_threads(module: nn.Module, hardware: Hardware) -> None:
 
 
 @contextmanager
-def repeatable(hardware: Hardware) -> Iterator[None]:
+def deterministic(hardware: Hardware) -> Iterator[None]:
     """Context in which a GPU uses deterministic kernels alone (`hardware.deterministic`); others raise."""
     if not hardware.deterministic or hardware.resolved_accelerator() == "cpu":
         yield
@@ -181,12 +181,12 @@ class Execution:
         losses = self.module.losses
         if not (isinstance(losses, Compiled) and losses.graphs):
             return self._add_gradients(batch, number)
-        put_back = self.module.saved_state()
+        restore = self.module.saved_state()
         try:
             return self._add_gradients(batch, number)
         except RuntimeError as error:
             losses.leave(error)
-            put_back()
+            restore()
             self.optimizers[0].zero_grad()  # graphs are for steps of one part
             return self._add_gradients(batch, number)
 

@@ -19,7 +19,7 @@ from motionloom.models.training.stage_module import Batch
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import end_with_parent
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.training.preemption import unsignalled
+from motionloom.pipeline.training.preemption import signals_blocked
 
 
 class TrainingData:
@@ -67,7 +67,7 @@ class _Loader(DataLoader[Batch]):
         if self.num_workers:
             # Started with the first process of all, it would let SIGTERM through to that one.
             resource_tracker.ensure_running()
-        with unsignalled():
+        with signals_blocked():
             return super().__iter__()
 
     def close(self) -> None:

@@ -75,11 +75,8 @@ class Signals:
 
 
 @contextmanager
-def unsignalled() -> Iterator[None]:
-    """Context in which started processes ignore the signals, so that loader workers survive them.
-
-    They end with their parent, or when it asks them to.
-    """
+def signals_blocked() -> Iterator[None]:
+    """Context in which started processes (loader workers) ignore signals and end with their parent."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

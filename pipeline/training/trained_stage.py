@@ -131,10 +131,7 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
         return net
 
     def release(self, net: N) -> Release | None:
-        """Return the published names of the network's tensors, by which `published` loads them.
-
-        None where no such weights are published, or not with these settings.
-        """
+        """Return the published names of the network's tensors; None if these settings have none."""
         return None
 
     def gives(self, config: C) -> frozenset[str]:

@@ -45,7 +45,7 @@ from motionloom.pipeline.training.checkpointing import (
     weights_of,
 )
 from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.training.execution import Execution, launch, repeatable, set_threads
+from motionloom.pipeline.training.execution import Execution, deterministic, launch, set_threads
 from motionloom.pipeline.training.failures import FailureGuard, ShardWatch, StallTimer
 from motionloom.pipeline.training.loaders import TrainingData, on_device
 from motionloom.pipeline.training.metric_log import MetricLog
@@ -73,7 +73,7 @@ def fit(
         context, module, config, fabric, TrainingData(train, validation, config, hardware), resume
     )
     try:
-        with repeatable(hardware):
+        with deterministic(hardware):
             training.run()
     except OSError as error:
         if error.errno is not None and error.filename is None:

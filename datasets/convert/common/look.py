@@ -258,9 +258,7 @@ def look_at(
 def _choose(
     items: Sequence[T], subset_of: Callable[[T], str], count: int, label: Callable[[T], str]
 ) -> tuple[list[tuple[str, T]], int, int]:
-    """(subset, item) of the clips to look at and of others in place of damaged ones, how many are wanted of
-    each subset, and how many subsets there are.
-    """
+    """(subset, item) of clips to look at and spare ones, clips wanted of each subset, number of subsets."""
     by_subset: dict[str, list[T]] = defaultdict(list)
     for item in items:
         by_subset[subset_of(item)].append(item)

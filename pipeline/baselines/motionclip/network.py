@@ -95,9 +95,7 @@ class MotionClipConfig(StackConfig):
 
 
 class MotionClipLossConfig(Config):
-    """Weights; the defaults are the published ones, which are of 6-D rotations and metres. Normalised columns
-    have larger errors.
-    """
+    """Loss weights; the defaults are the published ones, for 6-D rotations and metres."""
 
     features: float = Field(default=100.0, ge=0)
     joints: float = Field(default=100.0, ge=0)

@@ -175,9 +175,7 @@ class EvaluationUnits(Evaluation):
         return NearestClip(self.train)
 
     def reconstruct(self, truths: Sequence[Truth]) -> Arrays:
-        """Errors of clips through the tokenizer, whether they still do what is said, and errors of
-        faces where a tokenizer models them.
-        """
+        """Errors of clips and faces through the tokenizer, and whether they still do what is said."""
         tokenizer = self.tokenizer
         assert tokenizer is not None
         bodies = [reconstruct_truth(tokenizer, truth) for truth in truths]

@@ -211,7 +211,6 @@ def test_librosa_is_compiled_by_one_process_at_a_time(
 
 # Beats are found in music and not in noise; decoding is the best path, by an obvious and slow version.
 
-
 RATE = 16_000
 
 

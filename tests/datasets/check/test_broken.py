@@ -101,7 +101,6 @@ def test_the_table_has_every_file(broken: Path) -> None:
 
 # Files that ask for memory or time without end: each is refused with one sentence before it is read.
 
-
 HEAD = "HIERARCHY\nROOT {name}\n{{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Xrotation Yrotation\n"
 MOTION = "MOTION\nFrames: 1\nFrame Time: 0.05\n{}\n"
 

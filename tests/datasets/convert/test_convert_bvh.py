@@ -171,7 +171,6 @@ def test_retarget_limit_and_empty_sources(copy: Path, tmp_path: Path) -> None:
 
 # `where`: what an expression chooses, and what is said of one that cannot be read.
 
-
 FACTS: dict[str, Any] = {
     "category": "Dance and Music", "seconds": 12.5, "is_mirror": "False", "task": ("text", "dance"),
     "age": "31",

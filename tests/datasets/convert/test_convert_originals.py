@@ -199,7 +199,6 @@ def test_real_trials_of_cmu(shared: Path, tmp_path: Path) -> None:
 
 # Clips taken out of a data set for good: no name is left, others are untouched, killed and made again.
 
-
 PEOPLE = ("anna", "bert", "carla", "dora")
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
 

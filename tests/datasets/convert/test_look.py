@@ -162,7 +162,6 @@ def test_few_clips_of_many_subsets_are_chosen(source: Path) -> None:
 
 # Where captions and splits come from: several files at once, files that are not used, links, subjects.
 
-
 NAMES = ("walk_a", "jump", "sub/turn")
 
 

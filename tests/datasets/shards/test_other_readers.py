@@ -219,7 +219,7 @@ def test_a_damaged_byte_at_either_end_is_found(aws: Any, data: Path) -> None:
 KILLED = """
 import os, signal, sys
 from motionloom.datasets.shards import copy
-carry, count = copy._carry, 0
+carry, count = copy._send_file, 0
 def killed(here, there, name, *rest):
     global count
     count += 1
@@ -227,7 +227,7 @@ def killed(here, there, name, *rest):
         there.system().pipe_file(there.where(name), b"half")
         os.kill(os.getpid(), signal.SIGKILL)
     return carry(here, there, name, *rest)
-copy._carry = killed
+copy._send_file = killed
 copy.copy_dataset(sys.argv[1], sys.argv[2])
 """
 

@@ -65,10 +65,6 @@ def test_damage_is_named(root: Path) -> None:
     shard.write_bytes(content[:-10240])
     with pytest.raises(UserError, match=r"made-train-000002\.tar: \d+ bytes"):
         ShardDataset.open(root, "train")
-    flipped = bytearray(content)
-    flipped[len(content) // 2] ^= 4
-    shard.write_bytes(flipped)
-    assert any("sha256" in problem.message for problem in check(root))
     shard.unlink()
     with pytest.raises(UserError, match=r"made-train-000002\.tar: "):
         ShardDataset.open(root, "train")
@@ -90,7 +86,7 @@ def test_every_flipped_bit_of_a_shard_is_found(made: ModuleType, tmp_path: Path)
             flipped = bytearray(content)
             flipped[rng.integers(len(content))] ^= 1 << rng.integers(8)
             path.write_bytes(flipped)
-        found = {problem.where for problem in check(root)}
+        found = {problem.where for problem in check(root) if "sha256" in problem.message}
         assert found >= {path.name for path in shards}
     for path, content in shards.items():
         path.write_bytes(content)

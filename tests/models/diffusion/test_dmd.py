@@ -143,7 +143,6 @@ def test_mistakes_are_named(net: Dmd) -> None:
 
 # The DMD learns in its tokenizer's coordinates, and what it makes comes back to the motion's own units.
 
-
 LAYOUT = MotionLayout.named("wholebody363")
 TINY = DmdConfig(dim=8, ff=8, encoder_layers=1, decoder_layers=1, heads=2, dropout=0.0, attention_dropout=0.0)
 

@@ -92,7 +92,6 @@ def test_a_row_of_the_log_is_the_mean_since_the_last(parts: int) -> None:
 
 # Columns that a clip does not hold change no loss, gradient or codebook, whatever stands in them.
 
-
 LAYOUT = MotionLayout.named("wholebody363")
 SMALL: dict[str, Any] = {"width": 8, "depth": 1, "code_dim": 8, "velocity_weight": 0.5}
 BOOK: dict[str, Any] = {**SMALL, "num_codes": 8, "reset_below": 0.1}
@@ -208,7 +207,6 @@ def test_missing_columns_are_not_reconstructed(kind: str) -> None:
 
 
 # Every tokenizer kind: shapes, padding, encode/decode contract, freezing, checkpoints, errors.
-
 
 NET: dict[str, Any] = {"width": 16, "depth": 2, "code_dim": 8, "num_codes": 16}
 NETS = {

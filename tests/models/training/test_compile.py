@@ -98,7 +98,7 @@ def test_a_graph_that_fails_in_its_third_backward_pass_is_left(monkeypatch: pyte
     def third_fails(losses: Any, **_: Any) -> Any:
         def called(batch: Any) -> Any:
             values, texts = losses(batch), batch.get("conditions", {})
-            assert all(text.mask.shape[1] % compiled.PLACES == 0 for text in texts.values())
+            assert all(text.mask.shape[1] % compiled.WORD_MULTIPLE == 0 for text in texts.values())
             if next(calls) == 3:
                 values["loss"].register_hook(failing)
             return values

@@ -116,7 +116,6 @@ def test_what_does_not_fit_is_refused_before_anything_runs(change: str, says: st
 
 # FACT and Bailando from a recipe to figures and files: trained, measured after their seed, exported.
 
-
 TRAIN = "train: {steps: 4, batch_size: 8, checkpoint_every: 4, validate_every: 4}"
 DANCES = f"""
 extends: ude-small

@@ -232,7 +232,6 @@ def test_an_export_draws_as_it_recommends(small_run: Any, call: Any, tmp_path: P
 
 # Exported models bring their text encoder along, whether it was a folder or a model of the hub.
 
-
 RECIPE = """
 extends: t2m-gpt-tiny
 name: own-encoder

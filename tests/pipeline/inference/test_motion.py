@@ -110,7 +110,6 @@ def test_formats_are_names_of_the_table() -> None:
 
 # One figure in every output: page, npz, BVH, GLB and SMPL-X files of one motion agree.
 
-
 LAYOUT = MotionLayout.named("wholebody363")
 
 

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import json
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +21,10 @@ import soundfile
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import DrivenSegment, Script, sound_of
+from motionloom.pipeline.inference.shown import shown
+from motionloom.pipeline.store.yaml import read_yaml
 
 Write = Callable[..., Path]
 
@@ -143,3 +153,203 @@ def test_sounds_of_several_rates_meet_at_the_highest() -> None:
     inner = whole.samples[4_000:28_000]
     np.testing.assert_allclose(inner, tune(1.0, 32_000)[4_000:28_000], atol=0.01)
     assert not whole.samples[96_100:].any(), "music that ends before its segment is followed by silence"
+
+
+# A trained UDE from the command line and from Python: songs, scripts, several samples, exports, refusals.
+
+FPS = 20
+Call = Callable[..., Any]
+
+
+def song(seconds: float, rate: int = 22_050, beat: float = 0.5) -> np.ndarray:
+    """A soft tone with a click on every beat."""
+    t = np.arange(round(seconds * rate)) / rate
+    since = t % beat
+    click = 0.7 * np.sin(2 * np.pi * 1500 * since) * np.exp(-since * 400)
+    return (0.1 * np.sin(2 * np.pi * 220 * t) + click).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two songs and a script of them."""
+    place = tmp_path_factory.mktemp("songs")
+    soundfile.write(place / "slow.wav", song(5.0), 22_050)
+    soundfile.write(place / "fast.mp3", np.stack([song(4.0, 44_100, 0.3)] * 2, 1), 44_100)
+    (place / "show.yaml").write_text("""
+segments:
+  - {text: a person walks forward, seconds: 2}
+  - {music: slow.wav@1-4.5}
+  - {music: fast.mp3@0-2, text: a person waves}
+  - {text: a person squats, seconds: 1}
+""")
+    return place
+
+
+@pytest.fixture(scope="module")
+def model(ude_run: Any) -> MotionModel:
+    return MotionModel.from_pretrained(ude_run.folder, device="cpu")
+
+
+def joints_of(path: Path) -> np.ndarray:
+    with np.load(path, allow_pickle=False) as file:
+        found: np.ndarray = file["joints"]
+    return found
+
+
+def page_of(folder: Path) -> dict[str, Any]:
+    text = (folder / "index.html").read_text("utf-8")
+    found: dict[str, Any] = json.loads(re.search(r'id="viewer-data">(.*?)</script>', text, re.S)[1])  # type: ignore[index]
+    return found
+
+
+def loud(samples: np.ndarray, start: float, end: float) -> float:
+    return float(np.abs(samples[round(start * 44_100) : round(end * 44_100)]).max())
+
+
+BANDS = [
+    [0.0, 2.0, "a person walks forward", "text"],
+    [2.0, 5.6, "slow", "music"],
+    [5.6, 7.6, "a person waves + fast", "music"],
+    [7.6, 8.6, "a person squats", "text"],
+]
+"""3.5 s of music are 17.5 groups of four frames at 20 a second: 18."""
+
+
+@pytest.mark.slow
+def test_a_script_becomes_files_and_a_page(
+    ude_run: Any, folder: Path, tmp_path: Path, call: Call, model: MotionModel
+) -> None:
+    out = tmp_path / "out"
+    words = (folder / "show.yaml", "--samples", 2, "-f", "npz,bvh,html")
+    done = call("generate", ude_run.folder, *words, "-o", out)
+    assert done.code == 0, done.err
+    stem = "a-person-walks-forward-slow-a-person-waves-fast"
+    names = {f"0{k}-{stem}" for k in range(2)}
+    expected = {f"{name}.{kind}" for name in names for kind in ("npz", "bvh")} | {"index.html"}
+    assert {path.name for path in out.iterdir() if path.suffix} == expected
+    frames = round(BANDS[-1][1] * FPS)  # type: ignore[operator]
+    made = [joints_of(out / f"{name}.npz") for name in sorted(names)]
+    assert all(joints.shape == (frames, 52, 3) and np.isfinite(joints).all() for joints in made)
+    assert np.abs(made[0] - made[1]).max() > 1e-3
+    for name in names:
+        assert f"Frames: {frames}\n" in (out / f"{name}.bvh").read_text()
+    page = page_of(out)
+    assert [m["sound"] for m in page["motions"]] == [0, 0], "one sound, carried once"
+    heard, rate = soundfile.read(io.BytesIO(base64.b64decode(page["sounds"][0]["data"])))
+    assert rate == 44_100 and len(heard) / rate == pytest.approx(8.6, abs=0.05)
+    # Text is silent, music is not.
+    assert loud(heard, 0, 1.9) < 1e-3 and loud(heard, 7.75, 8.6) < 1e-3
+    assert loud(heard, 2.1, 5.4) > 0.1 and loud(heard, 5.7, 7.5) > 0.1
+    (score,) = page["scores"]  # of both
+    assert [[pytest.approx(a), pytest.approx(b), *rest] for a, b, *rest in BANDS] == score["segments"]
+    with chdir(folder):  # where a script from Python looks for its files
+        (alone,) = model.perform(Script.parse(read_yaml(Path("show.yaml")), "show"))
+    np.testing.assert_allclose(shown(alone).joints, made[0], atol=1e-4)  # other samples play no part
+
+
+@pytest.mark.slow
+def test_songs_become_dances_as_long_as_they_are(
+    ude_run: Any, folder: Path, tmp_path: Path, call: Call, model: MotionModel
+) -> None:
+    out = tmp_path / "out"
+    words = ("--audio", folder / "slow.wav", "--audio", folder / "fast.mp3", "--samples", 2, "--seed", 5)
+    done = call("generate", ude_run.folder, *words, "-o", out, "-f", "npz,html")
+    assert done.code == 0, done.err
+    made = [joints_of(path) for path in sorted(out.glob("*.npz"))]
+    assert [len(joints) for joints in made] == [100, 100, 80, 80]
+    assert np.abs(made[0] - made[1]).max() > 1e-3
+    assert [m["sound"] for m in page_of(out)["motions"]] == [0, 0, 1, 1]
+    sounds = [Sound.read(folder / name) for name in ("slow.wav", "slow.wav", "fast.mp3", "fast.mp3")]
+    again = model.generate(sounds=sounds, seed=5)
+    for ours, theirs in zip(made, again, strict=True):
+        np.testing.assert_allclose(ours, shown(theirs).joints, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_words_beside_a_song_and_words_alone(model: MotionModel, folder: Path) -> None:
+    sound = Sound.read(folder / "slow.wav")
+    # Twelve steps have learnt little of words: of many draws some differ.
+    spins, others = (model.generate([w] * 16, sounds=[sound] * 16, seed=1) for w in ("a person spins", "x"))
+    both = spins[0]
+    assert both.prompt.modalities == {"text", "audio"} and len(both.joints) == 100
+    apart = [np.abs(a.joints - b.joints).max() for a, b in zip(spins, others, strict=True)]
+    assert max(apart) > 1e-6, "the words are read too"
+    free = model.generate(["a person walks"], seed=1)[0]
+    assert 4 <= len(free.joints) <= 64 and free.prompt.sound is None
+    some = model.generate(["a person walks", ""], sounds=[None, sound], seconds=2.0, seed=2)
+    assert [len(motion.joints) for motion in some] == [40, 40]
+
+
+@pytest.mark.slow
+def test_an_export_gives_the_same_motions(
+    ude_run: Any, folder: Path, tmp_path: Path, call: Call, model: MotionModel
+) -> None:
+    assert call("export", ude_run.folder, "-o", tmp_path / "model").code == 0
+    there = {path.parent.name for path in (tmp_path / "model").glob("*/model.safetensors")}
+    assert there == {"tokenizer", "utt", "dmd"}
+    assert (tmp_path / "model/audio/audio.safetensors").is_file()
+    shutil.move(tmp_path / "model", tmp_path / "elsewhere")
+    exported = MotionModel.from_pretrained(tmp_path / "elsewhere", device="cpu")
+    pairs = [
+        (m.perform(folder / "show.yaml", seed=4)[0], m.generate(["a person walks"], seed=4)[0])
+        for m in (model, exported)
+    ]
+    for ours, theirs in zip(*pairs, strict=True):
+        assert np.array_equal(ours.features, theirs.features)
+
+
+def refused(done: Any) -> str:
+    """The one sentence on standard error."""
+    assert done.code == 2 and done.err.count("\n") == 1, done.err
+    return str(done.err)
+
+
+@pytest.mark.slow
+def test_models_of_one_modality_refuse_the_other(
+    small_run: Any, ude_run: Any, folder: Path, tmp_path: Path, call: Call
+) -> None:
+    words = ("generate", small_run.folder, "-o", tmp_path / "out")
+    assert "conditioned on text only" in refused(call(*words, "--audio", folder / "slow.wav"))
+    assert "scripts need a UDE model" in refused(call(*words, folder / "show.yaml"))
+    run = tmp_path / "run"
+    shutil.copytree(ude_run.folder, run)
+    shutil.rmtree(run / "stages/utt")
+    only = ("--set", "utt.modalities=[audio]", "--until", "ude")
+    done = call("run", ude_run.recipe, "--out", run, *only)
+    assert done.code == 0, done.err
+    words = ("generate", run, "-o", tmp_path / "out", "-f", "npz")
+    assert "conditioned on audio only" in refused(call(*words, "a person walks"))
+    assert "conditioned on audio only" in refused(call(*words, folder / "show.yaml"))
+    assert not (tmp_path / "out").exists()
+    assert call(*words, "--audio", folder / "slow.wav").code == 0
+
+
+LONG = """
+import resource, sys
+from pathlib import Path
+from motionloom.datasets.audio.sound import Sound
+from motionloom.pipeline.inference.outputs import write_motions
+from motionloom.pipeline.inference.model import MotionModel
+
+model, folder = MotionModel.from_pretrained(sys.argv[1], device="cpu"), Path(sys.argv[2])
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+model.generate(sounds=[Sound.read(folder / "short.wav")])
+before = peak()
+motions = model.generate(sounds=[Sound.read(folder / "long.wav")])
+write_motions(folder / "out", motions, ["npz", "html"], title="t")
+print(len(motions[0].joints), (peak() - before) // 1024)
+"""
+
+
+@pytest.mark.slow
+def test_a_song_of_five_minutes_takes_little_memory(ude_run: Any, tmp_path: Path) -> None:
+    for name, seconds in (("short", 3.0), ("long", 300.0)):
+        soundfile.write(tmp_path / f"{name}.wav", song(seconds), 22_050)
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", LONG, str(ude_run.folder), str(tmp_path)],
+        capture_output=True, text=True, timeout=280,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    frames, grown = map(int, done.stdout.split()[-2:])
+    assert frames == 6000
+    assert grown < 1500, f"{grown} MiB more than for three seconds"

@@ -224,7 +224,6 @@ def test_devices_that_are_not_here_are_refused(
 
 # One process of a run dies, stops or hangs: the launcher, or a time-out, ends them all.
 
-
 TORCHRUN = (sys.executable, "-P", "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
 
 

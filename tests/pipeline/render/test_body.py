@@ -211,7 +211,6 @@ def test_bases_are_read_and_wrong_ones_refused(tmp_path: Path) -> None:
 
 # GLB files: what they hold against the figure, and Khronos' validator.
 
-
 SKELETON = Skeleton.named("smplx52")
 FPS = 20.0
 

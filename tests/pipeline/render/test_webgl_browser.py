@@ -192,7 +192,6 @@ def test_without_webgl2_there_are_sticks(
 
 # Figures and music in step, and the time line, in a real headless Chromium.
 
-
 PARENTS = Skeleton.named("smplx52").parents
 FPS = 20
 NASTY = "</script><img src=x onerror='window.hacked=1'>"

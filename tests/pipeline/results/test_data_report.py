@@ -139,7 +139,6 @@ def test_commands(call: Callable[..., Any], nasty: Path, tmp_path: Path) -> None
 
 # `data clean` as a command and as a page: suspects listed and shown, decisions saved, applied and undone.
 
-
 CLEANED = SynthConfig(clips=6, seed=3, layout="body133", max_seconds=5)
 CURSED = "</script><img src=x onerror=hacked=1>"
 

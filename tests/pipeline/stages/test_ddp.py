@@ -122,7 +122,6 @@ def test_an_error_of_the_lead_ends_those_who_wait(
 
 # Stages whose work all processes share: the same files, bit for bit, by one process and by two.
 
-
 FIGURES = {"evaluate": "metrics.json"}
 CAPTIONS = """
 extends: small
@@ -199,7 +198,6 @@ def test_two_processes_make_what_one_makes(
 
 
 # Two ranks of one training: killed together they go on bit for bit.
-
 
 STEPS = 40
 

@@ -189,7 +189,6 @@ def test_matching_is_that_of_the_public_code(
 
 # The trained evaluator: it judges, and refuses.
 
-
 OWN = """
 name: judge
 seed: 1
@@ -275,7 +274,6 @@ def test_other_layouts_and_words_are_refused(run: Path) -> None:
 
 
 # Faces judged by a TMA of faces, motion beside what was recorded for its caption.
-
 
 FACES = """
 extends: small

@@ -163,7 +163,6 @@ def test_faces_count_where_there_are_any(data: Data) -> None:
 
 # What a GPT trains on: captions about a part of a clip, clips without captions, clips without hands.
 
-
 LAYOUT = MotionLayout.named("wholebody363")  # 30 fps
 FRAMES = 90
 WALKS = Caption(text="walks", start=0.0, end=1.0)

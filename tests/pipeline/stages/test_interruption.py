@@ -27,7 +27,7 @@ from motionloom.pipeline.cli import main as program
 from motionloom.pipeline.launch.process import SAVED, Interrupted
 from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.training import preemption as interruption
-from motionloom.pipeline.training.preemption import SIGNALS, Agreement, Signals, unsignalled
+from motionloom.pipeline.training.preemption import SIGNALS, Agreement, Signals, signals_blocked
 
 # Rows end with every tenth step, so none of these borders and interruptions lies where a row does.
 FULL: dict[str, Any] = {"ema": 0.9, "accumulate": 2, "checkpoint_every": 7, "validate_every": 7}
@@ -105,7 +105,7 @@ def test_a_signal_that_comes_too_late_is_passed_on() -> None:
 
 def test_processes_started_unsignalled_outlive_their_group() -> None:
     with Signals() as signals:
-        with unsignalled():
+        with signals_blocked():
             child = subprocess.Popen(["sleep", "60"], stdin=subprocess.DEVNULL)
             signal.raise_signal(USR1)
             assert signals.number == 0
@@ -165,7 +165,6 @@ def test_the_program_says_how_to_go_on(
 
 
 # A GPT stage that starts from another's weights and aligns the motions it samples, as a user runs it.
-
 
 MORE: dict[str, Any] = {
     "kind": "gpt",

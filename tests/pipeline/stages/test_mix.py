@@ -150,7 +150,6 @@ stages:
 
 # Seeds: the recipe's where a stage names none, and its own otherwise; 0 is one.
 
-
 SEEDED = """
 name: seeds
 seed: 7

@@ -180,7 +180,6 @@ def test_a_half_export_generates(small_run: Any, call: Any, tmp_path: Path) -> N
 
 # Published weights in place of a training: read under their names, refused where they differ.
 
-
 LAYERS = Release({"weight": Rows("joined", (7, 4, 5, 6), 12), "bias": "below"}, unread=("pe", "clip.*"))
 
 
@@ -279,7 +278,6 @@ def test_a_release_of_mdm_is_run_and_generates(tmp_path: Path, call: Callable[..
 
 
 # A text stage read by another run: words that its own data did not say, and an export exported again.
-
 
 CPU = torch.device("cpu")
 

@@ -30,7 +30,7 @@ from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.training_log import rise_of_loss
 from motionloom.pipeline.training import trainer
 from motionloom.pipeline.training.config import TrainedStageConfig
-from motionloom.pipeline.training.execution import Execution, repeatable
+from motionloom.pipeline.training.execution import Execution, deterministic
 from motionloom.pipeline.training.failures import Failure, NotFiniteError, first_failure
 
 FAILS = 13
@@ -117,7 +117,6 @@ def test_the_rank_whose_own_loss_failed_comes_first() -> None:
 
 
 # Every stage of the baselines on a GPU, as far as a machine without one can show it (`second_device.py`).
-
 
 STARTS = {
     "utt": ["utt.loss.adversarial_start=1"],
@@ -248,8 +247,8 @@ def test_the_watch_sees_any_order_and_reading() -> None:
 def test_a_gpu_repeats_itself_unless_told_otherwise() -> None:
     on = torch.are_deterministic_algorithms_enabled
     for hardware, wanted in ((Hardware(accelerator="gpu"), True), (Hardware(accelerator="cpu"), False)):
-        with repeatable(hardware):
+        with deterministic(hardware):
             assert on() == wanted
         assert not on()
-    with repeatable(Hardware(accelerator="gpu", deterministic=False)):
+    with deterministic(Hardware(accelerator="gpu", deterministic=False)):
         assert not on()

@@ -154,7 +154,6 @@ def test_the_next_batch_is_copied_while_one_is_computed(monkeypatch: pytest.Monk
 
 # `lightning.Trainer` and the pipeline's own loop train every kind of module to the same bits.
 
-
 STEPS = 6
 Opened = tuple[StageModule, Callable[[int], dict[str, Any]]]
 

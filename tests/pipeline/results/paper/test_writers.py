@@ -106,7 +106,6 @@ def test_mistakes_are_one_sentence(
 
 # Names of the tables' figures against what real runs write, and evaluations of a tokenizer alone.
 
-
 OTHER_STAGES = (
     "evaluator.",
     "face_evaluator.",
@@ -189,7 +188,6 @@ def test_figures_of_dances(ude_run: Any, tmp_path: Path, call: Call) -> None:
 
 
 # The files of the tables: they parse, they are all there, and their numbers are the papers'.
-
 
 NAMES = list(shipped_tables())
 
