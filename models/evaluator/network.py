@@ -57,7 +57,7 @@ class EvaluatorConfig(Config):
     dropout: float = Field(default=0.2, ge=0, lt=1)
     """Dropout of the movement encoder while it is trained."""
     root_gain: float = Field(default=5.0, gt=0)
-    """How much more the root's columns and foot contacts count than others."""
+    """Weight of the root's columns and foot contacts relative to others."""
 
 
 class MovementEncoder(nn.Module):

@@ -1,4 +1,4 @@
-"""How near sentences about a motion are to what people said of it: BLEU, ROUGE-L, CIDEr-D, BERTScore.
+"""Similarity of sentences about a motion to captions by people: BLEU, ROUGE-L, CIDEr-D, BERTScore.
 
 Each is defined as the evaluation code of COCO's captions computes it, which the papers on motion captions
 use: every motion has one sentence to be judged and one or more references. Words are `words_of` a caption.
@@ -19,7 +19,7 @@ from torch.nn import functional
 ORDER = 4
 """Longest word sequences that BLEU and CIDEr-D count."""
 _BETA = 1.2
-"""How much more recall counts than precision in ROUGE-L."""
+"""Weight of recall relative to precision in ROUGE-L."""
 _SIGMA = 6.0
 """Words by which a sentence may differ in length, in CIDEr-D."""
 _WORD = re.compile(r"[^\W_]+(?:['’-][^\W_]+)*")

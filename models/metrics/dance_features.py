@@ -158,7 +158,7 @@ class _Poses:
         return np.asarray(np.linalg.norm(self.now[p] - self.before[p], axis=-1) / MANUAL_SECONDS > limit)
 
     def _seen(self, a: str, p: str) -> Array:
-        """How far p moved since the frame before, as seen from a."""
+        """Displacement of p since the frame before, as seen from a."""
         return np.asarray((self.now[p] - self.now[a]) - (self.before[p] - self.before[a]))
 
 

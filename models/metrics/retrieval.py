@@ -19,7 +19,7 @@ from torch import Tensor
 RECALLS = (1, 2, 3, 5, 10)
 
 Distance = Literal["cosine", "euclidean"]
-"""How latents are compared: TMA's by cosine (D.2), those of the evaluator of Guo et al. as they are."""
+"""Similarity of latents: TMA's by cosine (D.2), those of the evaluator of Guo et al. as they are."""
 
 
 def ranks(distance: Tensor, positive: Tensor | None = None) -> Tensor:

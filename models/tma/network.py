@@ -42,7 +42,7 @@ class TmaConfig(StackConfig):
     frame_stride: int = Field(default=1, ge=1)
     """Every n-th frame is fed and reconstructed; 1 is the paper."""
     root_gain: float = Field(default=1.0, gt=0)
-    """How much more the root's columns count than others [ours]; see `layers/basis.py`."""
+    """Weight of the root's columns relative to others [ours]; see `layers/basis.py`."""
     finger_gain: float = Field(default=0.0, ge=0)
     """Above 0, fingers count by how they bend, in bone lengths times this [ours]; see `layers/basis.py`."""
     text_dropout: float | None = Field(default=None, ge=0, lt=1)

@@ -52,7 +52,7 @@ class TokenizerConfig(Config):
     velocity_weight: float = Field(default=0.0, ge=0)
     """Weight of the same reconstruction error between frame-to-frame differences."""
     root_gain: float = Field(default=1.0, gt=0)
-    """How much more the root's columns count than others [ours]; see `layers/basis.py`."""
+    """Weight of the root's columns relative to others [ours]; see `layers/basis.py`."""
     finger_gain: float = Field(default=0.0, ge=0)
     """Above 0, fingers count by how they bend, in bone lengths times this [ours]; see `layers/basis.py`."""
 

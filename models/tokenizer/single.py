@@ -86,7 +86,7 @@ class MqConfig(TokenizerConfig):
     code_dim: int = Field(default=1024, ge=1)
     num_codes: int = Field(default=2048, ge=2)
     quantizer: Literal["gradient", "ema"] = "gradient"
-    """How the codebook is learnt: by gradient (the paper), or by moving averages with Code Reset [ours]."""
+    """Learning of the codebook: by gradient (the paper), or by moving averages with Code Reset [ours]."""
     codebook_weight: float = Field(default=1.0, gt=0)
     """beta_1 of equation 2; moving averages need none."""
     commitment_weight: float = Field(default=1.0, ge=0)

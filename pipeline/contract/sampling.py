@@ -34,7 +34,7 @@ class SamplingConfig(Config):
     face_cfg_scale: float | None = Field(None, ge=1)
     """Guidance of the face's GPT or diffusion model; None takes `cfg_scale`."""
     face_model: str | None = None
-    """Which face generator, by its method (gpt, vae, diffusion) or its stage; by default the first."""
+    """The face generator, by its method (gpt, vae, diffusion) or its stage; by default the first."""
     sampler: Sampler | None = None
     """Sampler of diffusion models: ddpm, ddim or dpm++; None takes the model's own (ddpm, of UDE its
     stage's)."""

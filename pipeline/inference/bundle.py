@@ -76,7 +76,7 @@ class Bundle:
         """Licences and credits of all data that it was made from."""
         self.stage_cache = stage_cache
         self.recommended = recommended or SamplingConfig()
-        """How its motions are best drawn; fields that are not set here are nobody's recommendation."""
+        """Recommended sampling settings; fields that are not set have no recommendation."""
         self._generators: dict[Path, MotionGenerator] = {}
         for stage in (*self.stages, *self.captioners):
             self._open(stage)
@@ -189,7 +189,7 @@ class Bundle:
         require_used(self.generator, faces, face, face_captions, sampling)
 
     def drawing(self, sampling: SamplingConfig | None = None) -> SamplingConfig:
-        """How to draw: the fields that are set, else those that the model recommends."""
+        """Return the sampling settings, unset fields as the model recommends."""
         return self.recommended if sampling is None else sampling.over(self.recommended)
 
     def in_effect(self, sampling: SamplingConfig | None = None) -> dict[str, object]:

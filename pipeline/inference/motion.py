@@ -95,6 +95,6 @@ class EditedMotion(GeneratedMotion):
     original: GeneratedMotion = field(kw_only=True)
     """The clip, at the model's frame rate."""
     report: EditReport = field(kw_only=True)
-    """How near it is to its task."""
+    """Errors against its task."""
     remarks: tuple[str, ...] = ()
     """Remarks on how the clip was read."""

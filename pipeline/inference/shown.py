@@ -23,7 +23,7 @@ FAR_MM = 20.0
 
 
 class FigureOptions(Config):
-    """How the figure follows the generated joints."""
+    """Ways in which the figure follows the generated joints."""
 
     plant_feet: bool = True
     """Hold feet still where they stand (`datasets/motion/body/feet.py`)."""
@@ -53,12 +53,12 @@ class ShownMotion:
 
     @property
     def remark(self) -> str:
-        """How far the figure is from the generated joints, where that is far; else nothing."""
+        """A note on the figure's distance from the generated joints where it is large; else empty."""
         error = self.figure.error
         return f"the figure is {error} from the generated joints" if error.mean_mm > FAR_MM else ""
 
     def facts(self) -> dict[str, object]:
-        """How far it is from the generated joints, and what its feet did, for metadata."""
+        """Distance from the generated joints and sliding of the feet, for metadata."""
         error = self.figure.error
         out: dict[str, object] = {
             "fit_mean_mm": round(error.mean_mm, 3),

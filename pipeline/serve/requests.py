@@ -113,7 +113,7 @@ class MotionRequest(Config):
 
     @property
     def sampling(self) -> SamplingConfig:
-        """How to draw; only what was asked for counts as set."""
+        """The sampling settings; only fields of the request are set."""
         names = {"cfg_scale", "temperature", "top_p"} & self.model_fields_set
         return SamplingConfig.parse({name: getattr(self, name) for name in names}, "request")
 

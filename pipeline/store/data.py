@@ -106,7 +106,7 @@ class Data:
         return [split for split in ("train", "val", "test") if split in filled]
 
     def clips(self, split: str) -> int:
-        """How many clips a split holds, of all data sets; 0 of a kind that is not ours."""
+        """Return the number of clips of a split, over all data sets; 0 of a kind that is not ours."""
         if not self._is_ours:
             return 0
         shards = [shard for _, manifest in self._sources() for shard in manifest.shards]

@@ -130,7 +130,7 @@ class TokenCaptions:
 
 @dataclass(frozen=True)
 class PresentTokens:
-    """Which tokens and columns of n clips were recorded, by the bits of `ClipMeta.present`."""
+    """Recorded tokens and columns of n clips, by the bits of `ClipMeta.present`."""
 
     bits: Tensor
     """Bits of each clip, int64 [n]."""
@@ -258,7 +258,7 @@ class GptClips:
     texts: list[str]
     """Texts of all different captions, [m]."""
     present: PresentTokens | None
-    """Which of their tokens were recorded; None when all were."""
+    """Mask of their recorded tokens; None if all were recorded."""
     sources: tuple[Source, ...]
     ids: tuple[str, ...]
     """Ids of the clips."""

@@ -1,4 +1,4 @@
-"""How tools name the joints of their figures (`tools.csv`), and a skeleton's joints by such words.
+"""Joint names of common tools (`tools.csv`), and a skeleton's joints found by such names.
 
 To know another tool, add a row. Words are what is left of a name: no side, prefix, punctuation, capitals or
 leading zeros, so `mixamorig:LeftUpLeg` is `upleg`, `DEF-upper_arm.L` is `upperarm` and `neck_01` is `neck1`.

@@ -56,7 +56,7 @@ class MotionColumns(nn.Module):
         self.dim = _ZEROS + 3 + 9 * ((self.dim - 3) // 3)
 
     def learn(self, mean: Tensor, std: Tensor) -> None:
-        """How columns are normalised, [C] each."""
+        """Statistics that normalise the columns, [C] each."""
         if self.matrices:
             self.mean.copy_(mean)
             self.std.copy_(std)

@@ -43,7 +43,7 @@ class SixD(nn.Module):
 
     @torch.no_grad()
     def learn(self, mean: NDArray[np.floating], std: NDArray[np.floating]) -> None:
-        """How the columns were normalised, each [75]; saved with the weights."""
+        """Statistics that normalise the columns, [75] each; saved with the weights."""
         self.mean.copy_(torch.as_tensor(mean))
         self.std.copy_(torch.as_tensor(std))
 

@@ -286,7 +286,7 @@ class CriticConfig(Config):
 
 
 class CaptionLossConfig(Config):
-    """How words are counted, and what of the tokens is hidden."""
+    """Weights of words, and shares of tokens that are masked."""
 
     summed: bool = False
     """Add the words' errors of a batch up, as TM2T does: then all gradients are cut to `optim.grad_clip`."""

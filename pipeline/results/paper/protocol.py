@@ -1,4 +1,4 @@
-"""How figures of runs were measured, beside what the paper says of its own."""
+"""Protocols of measured figures, beside those that the paper states."""
 
 from __future__ import annotations
 

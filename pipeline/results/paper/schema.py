@@ -117,7 +117,7 @@ class Column(Config):
 
 
 class Ours(Config):
-    """Which models of a run are this row: conditions on what an evaluation measures, by role."""
+    """Conditions on a run's models that belong to this row, by the role that an evaluation gives them."""
 
     tokenizer: StageMatch | None = None
     face_tokenizer: StageMatch | None = None

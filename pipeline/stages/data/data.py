@@ -63,7 +63,7 @@ class ShardsStage(DataStage):
         return {"manifest": config.manifest()[1]}
 
     def settle(self, config: ShardsStageConfig, folder: Path) -> None:
-        """How to read changes no result, so it is written anew whenever the recipe runs."""
+        """Write settings of reading anew whenever the recipe runs: they change no result."""
         write_json(folder / READER, Reader(cache=config.cache).dump())
 
 

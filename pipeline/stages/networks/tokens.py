@@ -36,7 +36,7 @@ from motionloom.pipeline.training.trained_stage import Batches
 
 
 class TokensConfig(StageConfig):
-    """How clips are encoded."""
+    """Settings of encoding clips."""
 
     batch_frames: int = Field(16384, ge=64)
     """Frames (padding included) in one encoder call."""
@@ -102,7 +102,7 @@ class TokensStage(StageKind[TokensConfig]):
         return Tokens(stage.folder, tuple(given["tokenizer"].net.streams))
 
     def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
-        """How often each code is used by the training clips."""
+        """Usage of each code by the training clips."""
         out: list[Showing] = []
         tokens = self.load(stage, given, torch.device("cpu"))
         store = tokens.open("train").whole_clips()

@@ -15,7 +15,7 @@ _AT_ONCE = 32
 
 
 class EvaluateCaptionsConfig(StageConfig):
-    """How much is measured."""
+    """Extent of the measurement."""
 
     clips: int | None = Field(400, ge=1)
     """At most this many clips of the test split; null takes all."""

@@ -57,7 +57,7 @@ _AT_ONCE = 16
 
 
 class EvaluateDancesConfig(StageConfig):
-    """How much is measured."""
+    """Extent of the measurement."""
 
     clips: int | None = Field(100, ge=2)
     """At most this many clips with music of the test split, different songs first; null takes all."""

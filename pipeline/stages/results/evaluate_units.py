@@ -44,7 +44,7 @@ LATENT = {"tma": "latent", "evaluator": "latent_evaluator", "face_evaluator": "l
 
 
 class EvaluateConfig(StageConfig):
-    """How much is measured."""
+    """Extent of the measurement."""
 
     clips: int | None = Field(400, ge=1)
     """At most this many clips of the test split; null takes all."""

@@ -102,7 +102,7 @@ class Evaluation:
         return seed, None if self.config.decodings == 1 else seed + 104_729 * (decoding + 1)
 
     def drawn_as(self, bundle: Bundle) -> dict[str, Fact]:
-        """How motions are drawn, and how often, for the protocol of their figures."""
+        """Return sampling settings and number of draws, for the protocol of the figures."""
         config = self.config
         nested = {} if config.decodings == 1 else {"decodings": config.decodings}
         if nested and "sampler" not in bundle.generator.settings:

@@ -28,7 +28,7 @@ from motionloom.pipeline.store.artifact import Terms
 
 
 class GenerateConfig(StageConfig):
-    """Which captions, how drawn, written as what."""
+    """Captions, sampling settings and output formats."""
 
     captions: list[str] = Field(default_factory=list)
     """Captions to perform; empty takes `count` from the test split."""
@@ -43,7 +43,7 @@ class GenerateConfig(StageConfig):
     sampling: SamplingConfig = SamplingConfig()
     formats: list[Format] = Field(default_factory=default_formats)
     figure: FigureOptions = FigureOptions()
-    """How the shown figure follows the generated joints."""
+    """Way in which the shown figure follows the generated joints."""
 
 
 class GenerateStage(StageKind):
