@@ -1,14 +1,14 @@
-"""Motion editing: diffusion under a mask, with a gradient towards places and pins.
+"""Motion editing: diffusion under a mask, with a gradient towards places.
 
 At every denoising step the predicted clean motion is replaced by the known one where there is one (MDM's
 editing). The prediction is corrected near the boundary of known frames and smoothed [ours], and a gradient
-step reduces its distance to the root's known places and headings and to pinned joints, recovered in metres
-(`observed.py`) [ours]. The in-betweener also observes all that is known but the pins.
+step reduces its distance to the root's known places and headings, in metres (`observed.py`) [ours]. The
+in-betweener also observes all that is known.
 
 Motions longer than the training's are made in overlapping windows that agree at every step: a frame is the
 mean of the predictions for it, weighed by how much it belongs to each window.
 
-Legend: n motions of one task, T frames, D features, K windows of W frames, M pins.
+Legend: n motions of one task, T frames, D features, K windows of W frames.
 """
 
 from __future__ import annotations
@@ -22,25 +22,13 @@ from torch import Tensor
 from torch.func import jvp
 
 from motionloom.models.diffusion.network import InBetweener
-from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, tangent, turned_back
+from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, turned_back
 from motionloom.models.diffusion.sampling import blend_weights, window_starts
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.layers.frozen import evaluating
 
 HEADING_METRES = 0.5
 """Metres that a radian of heading counts as: how far it moves a hand [ours]."""
-
-
-@dataclass(frozen=True)
-class Pins:
-    """Joints at known positions, in metres, in the frame of `Places`."""
-
-    frames: Tensor
-    """int64 [M]."""
-    joints: Tensor
-    """int64 [M]."""
-    positions: Tensor
-    """[M, 3]."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +41,6 @@ class KnownMotion:
     """bool [T, D]."""
     places: Places
     """One row."""
-    pins: Pins | None = None
 
 
 class Filling:
@@ -138,18 +125,12 @@ class Filling:
         return torch.where(self.known.mask, self.known.motion, motion)
 
     def _errors(self, motion: Tensor) -> Tensor:
-        """Return the errors of motions [n, T, D] in places, headings and pins, in metres [n, ...]."""
-        places, pins = self.known.places, self.known.pins
-        anchor = places.anchor.expand(len(motion))
-        heading, place = self.recovery.way(motion, anchor)
-        errors = [
-            (place - places.place)[:, places.place_known[0]].flatten(1),
-            HEADING_METRES * (heading - places.heading)[:, places.heading_known[0]],
-        ]
-        if pins is not None:
-            joints = self.recovery.world(motion, anchor)[:, pins.frames, pins.joints]
-            errors.append((joints - pins.positions).flatten(1))
-        return torch.cat(errors, dim=1)
+        """Return the errors of motions [n, T, D] in places and headings, in metres [n, ...]."""
+        places = self.known.places
+        heading, place = self.recovery.way(motion, places.anchor.expand(len(motion)))
+        away = (place - places.place)[:, places.place_known[0]].flatten(1)
+        turned = (heading - places.heading)[:, places.heading_known[0]]
+        return torch.cat([away, HEADING_METRES * turned], dim=1)
 
     def _gradient_step(self, motion: Tensor) -> Tensor:
         """Return motions moved in their free values against the gradient of the squared errors."""
@@ -208,13 +189,8 @@ def _places_of_window(places: Places, inside: slice) -> Places:
     heading_known, place_known = places.heading_known[:, inside], places.place_known[:, inside]
     both = heading_known & place_known
     first = (both if bool(both.any()) else place_known).byte().argmax(1)
+    heading_known = heading_known.clone()
+    heading_known[0, first] |= place_known[0, first]
     angle, origin = heading[0, first], place[0, first]
-    if not bool(both.any()) and bool(place_known.any()):
-        # A path without headings faces where it goes.
-        angle = tangent(place[0], place_known[0])
-        heading_known = heading_known.clone()
-        heading_known[0, first] = True
-        heading = heading.clone()
-        heading[0, first] = angle
     relative = turned_back(place - origin, angle)
     return Places(first, heading - angle, relative, heading_known, place_known)

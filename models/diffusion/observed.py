@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from motionloom.datasets.motion.features.torch_joints import torch_joints_of, torch_way
+from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.layout import LOWER, PIECES, ROOT, MotionLayout, piece_columns, step_columns
 from motionloom.datasets.schema import UserError
 
@@ -32,8 +32,8 @@ def observed_width(motion_dim: int) -> int:
 
 
 class Recovery:
-    """Recovers joints from the `columns` of a layout, which must hold the root; `mean` and `std` [D] of the
-    layout's columns normalise them.
+    """Recovers the root's way from the `columns` of a layout, of which its own are the first; `mean` and
+    `std` [D] of the layout's columns normalise them.
     """
 
     def __init__(
@@ -46,44 +46,19 @@ class Recovery:
         root = [column for field in ROOT if layout.has(field) for column in np.r_[layout.slice(field)]]
         if layout.family == "raw" or not root or not np.isin(root, columns).all():
             raise UserError(f"layout {layout.name}: an in-betweener is of columns that hold the root's way")
-        self.layout, self.columns = layout, columns
-        self._mean, self._std = torch.from_numpy(mean[columns]), torch.from_numpy(std[columns])
-        self._body = self.layout.without_face()
-        own = self.layout.part("bodyhand")
-        known = np.isin(own, columns)
-        self._into = torch.from_numpy(np.flatnonzero(known))
-        self._from = torch.from_numpy(np.flatnonzero(np.isin(columns, own)))
+        self.layout = layout
+        self.mean, self.std = torch.from_numpy(mean[columns]), torch.from_numpy(std[columns])
 
     def way(self, features: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
         """Heading in radians [B, T], and z and x of the root in metres [B, T, 2], of normalised features
         [B, T, D]. Each row's frame `anchor` (int64 [B]) stands at the origin, facing +Z.
         """
-        heading, x, z = torch_way(self._own_units(features), self._body)
+        own = features * self.std.to(features) + self.mean.to(features)
+        heading, x, z = torch_way(own, self.layout)
         rows = torch.arange(len(features), device=features.device)
         first = heading[rows, anchor][:, None]
         place = torch.stack([z, x], dim=-1)
         return heading - first, turned_back(place - place[rows, anchor][:, None], first)
-
-    def world(self, features: Tensor, anchor: Tensor) -> Tensor:
-        """Joints [B, T, N, 3] in metres, seen as by `way`; those that the columns do not hold lie in the root
-        of their frame, on the floor.
-        """
-        own = self._own_units(features)
-        joints = torch_joints_of(own, self._body)
-        heading, _, _ = torch_way(own, self._body)
-        rows = torch.arange(len(features), device=features.device)
-        root = joints[rows, anchor, 0][:, None, None]
-        away = turned_back(
-            torch.stack([joints[..., 2] - root[..., 2], joints[..., 0] - root[..., 0]], dim=-1),
-            heading[rows, anchor][:, None, None],
-        )
-        return torch.stack([away[..., 1], joints[..., 1], away[..., 0]], dim=-1)
-
-    def _own_units(self, features: Tensor) -> Tensor:
-        """The columns of body and hands [B, T, D'], 0 where these are none."""
-        own = features * self._std.to(features) + self._mean.to(features)
-        full = own.new_zeros(*own.shape[:-1], self._body.dim)
-        return full.index_copy(-1, self._into.to(own.device), own[..., self._from.to(own.device)])
 
 
 def turned_back(place: Tensor, heading: Tensor) -> Tensor:
@@ -93,25 +68,13 @@ def turned_back(place: Tensor, heading: Tensor) -> Tensor:
     return torch.stack([z * cosine + x * sine, x * cosine - z * sine], dim=-1)
 
 
-def tangent(place: Tensor, known: Tensor) -> Tensor:
-    """Return the heading [1] from the first known place to the next that is half a metre off, or the last.
-
-    Nearer points say little of a direction: a step to the side is a few decimetres.
-    """
-    points = place[known]
-    away = points - points[0]
-    far = away.norm(dim=-1) > 0.5
-    towards = away[far.byte().argmax() if bool(far.any()) else -1]
-    return torch.atan2(towards[1], towards[0])[None]
-
-
 class Places(NamedTuple):
     """The root's place and heading where they are known, relative to each row's `anchor` frame."""
 
     anchor: Tensor
     """int64 [B]."""
     heading: Tensor
-    """Radians [B, T]."""
+    """Radians [B, T]; likely ones where they are not known."""
     place: Tensor
     """z and x in metres [B, T, 2]."""
     heading_known: Tensor

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.chain_solver import solve_poses
+from motionloom.datasets.motion.body.landing import between_known, smooth
 from motionloom.datasets.motion.bvh.joint_map import JointMap, Up
 from motionloom.datasets.motion.bvh.motion import BvhMotion, channel_columns, read_bvh
 from motionloom.datasets.motion.bvh.text import Floats, find_motion
@@ -85,7 +86,7 @@ class OwnBvh:
         made, values = np.flatnonzero(~held.all(axis=1)), posed.values.copy()
         if not len(made):
             return self._with_rows(values, source, held, made)
-        first, last, share = _between(own | ~own.any(axis=0), made)
+        first, last, share = between_known(own | ~own.any(axis=0), made)
         local = _eased(np.moveaxis(posed.local_rotations(range(len(parents))), 0, 1), first, last, share)
         for joint, _, column in positions:
             start, end = (posed.values[side[:, joint], column] for side in (first, last))
@@ -117,10 +118,10 @@ class OwnBvh:
         away = wanted[:, mapped] - made
         shift = np.median(away[named], axis=0)
         away = (away - shift) * named[..., None]
-        first, last, _ = _between(named | ~named.any(axis=0), rows)
+        first, last, _ = between_known(named | ~named.any(axis=0), rows)
         fade: Floats = np.where(first == last, np.inf, last - first).clip(max=_FADE * posed.fps)
         for end, counts in ((first, True), (last, first != last)):
-            near = (1 - _smooth(np.abs(rows[:, None] - end) / fade)) * counts
+            near = (1 - smooth(np.abs(rows[:, None] - end) / fade)) * counts
             made += near[..., None] * np.take_along_axis(away, end[..., None], axis=0)
         wanted[:, mapped] = made + shift
         return wanted
@@ -182,24 +183,6 @@ def _above(motion: BvhMotion, joint: int) -> list[int]:
     """The joints that carry another."""
     parent = motion.parents[joint]
     return [] if parent < 0 else [parent, *_above(motion, parent)]
-
-
-def _smooth(share: Floats) -> Floats:
-    """From 0 to 1, leaving and arriving level."""
-    share = np.clip(share, 0.0, 1.0)
-    return np.asarray(share * share * (3 - 2 * share))
-
-
-def _between(known: Mask, rows: Rows) -> tuple[Rows, Rows, Floats]:
-    """The known rows [R, J] before and after some rows, and how far these are on the way between them.
-
-    Where there is none on one side, both are that of the other.
-    """
-    number, count = np.arange(len(known))[:, None], len(known)
-    first = np.maximum.accumulate(np.where(known, number, -1), axis=0)[rows]
-    last = np.minimum.accumulate(np.where(known, number, count)[::-1], axis=0)[::-1][rows]
-    first, last = np.where(first < 0, last, first), np.where(last == count, first, last)
-    return first, last, _smooth((rows[:, None] - first) / np.maximum(last - first, 1))
 
 
 def _eased(local: Floats, first: Rows, last: Rows, share: Floats) -> Floats:
@@ -275,7 +258,10 @@ def _fit(bones: Floats, aims: Floats) -> Floats:
 def _write_angles(
     values: Floats, made: Rows, local: Floats, turns: list[tuple[str, list[int]]], held: Mask
 ) -> None:
-    """Put the angles of made rows [R, J, 3, 3] into the values, each triple the nearest to the row before."""
+    """Put the angles of made rows [R, J, 3, 3] into the values, each triple the nearest to the row before: no
+    angle steps by more than half a turn. Where they arrive a whole turn away from the kept row after them,
+    the step is there.
+    """
     from scipy.spatial.transform import Rotation
 
     joints = [joint for joint, (order, _) in enumerate(turns) if len(order) == 3]

@@ -28,7 +28,7 @@ from motionloom.datasets.motion.layout import (
     step_columns,
 )
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.observed import Places, tangent
+from motionloom.models.diffusion.observed import Places
 from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 
@@ -54,7 +54,7 @@ class EditFrames:
     """A task in frames: T frames of a result, n of them the clip's.
 
     All positions are seen from the clip's first frame: its root above the origin, facing +Z, the floor at
-    height 0. `features`, `places` and `model_pins` are on the model's figure, the rest in the clip's size.
+    height 0. `features` and `places` are on the model's figure, the rest in the clip's size.
     """
 
     task: EditTask
@@ -72,7 +72,7 @@ class EditFrames:
     pieces: NDArray[np.bool_]
     """Which `layout.PIECES` are kept [T, P]."""
     anchor: RootPath
-    """The anchor frame: the one that `places` and `model_pins` are seen from."""
+    """The anchor frame: the one that `places` are seen from."""
     places: Places
     """Known values of the root, one row."""
     path: NDArray[np.complex128]
@@ -138,15 +138,6 @@ class EditFrames:
     def of_file(self, joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
         """Joints [R, M, 3] of a file of the result, in the result's frames [T, M, 3]."""
         return between_rows(joints, self.rows(fps).clip(0, len(joints) - 1))
-
-    @property
-    def model_pins(self) -> list[tuple[float, float, float]]:
-        """The positions of `pins` on the model's figure, seen from the anchor."""
-        out = []
-        for x, y, z in self.pins.values():
-            away = (complex(z, x) - self.anchor.place[0]) * np.exp(-1j * self.anchor.heading[0]) * self.scale
-            out.append((float(away.imag), (y - self.lift) * self.scale, float(away.real)))
-        return out
 
 
 def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> EditFrames:
@@ -342,8 +333,8 @@ def _known_places(
     """Known values of the root, on the model's figure and seen from an anchor; and that anchor's frame, in
     the clip's size.
 
-    The anchor is the first frame whose root is kept. Without one it is where the path begins, facing along
-    it, and without a path the clip's first frame.
+    The anchor is the first frame whose root is kept. Without one it is where the path begins, and without a
+    path the clip's first frame.
     """
     heading, place = np.zeros(len(rooted)), np.zeros(len(rooted), dtype=np.complex128)
     inside = slice(lead, lead + len(clip.heading))
@@ -360,18 +351,12 @@ def _known_places(
         walks[max(0, frame - round(_TURNS * fps)) : frame + round(_TURNS * fps) + 1] = False
     heading[walks] = np.angle(way[walks]) + np.pi * backwards
     heading_known |= walks
-    heading[heading_known] = np.unwrap(heading[heading_known])
-    if rooted.any():
-        first = int(np.flatnonzero(rooted)[0])
-    elif on_path.any():
-        first = int(np.flatnonzero(on_path)[0])
-        points = torch.from_numpy(np.stack([place.real, place.imag], axis=-1))
-        if not heading_known[first]:
-            heading[first] = float(tangent(points, torch.from_numpy(on_path)))
-            heading_known[first] = True
-    else:
-        first = lead
-        heading_known[first] = place_known[first] = True
+    if heading_known.any():  # in between it turns evenly
+        at = np.flatnonzero(heading_known)
+        heading = np.interp(np.arange(len(heading)), at, np.unwrap(heading[at]))
+    seen_from = np.flatnonzero(rooted if rooted.any() else on_path)
+    first = int(seen_from[0]) if len(seen_from) else lead
+    heading_known[first] = place_known[first] = True
     anchor = RootPath(heading[first : first + 1], place[first : first + 1])
     seen = (place - anchor.place) * np.exp(-1j * anchor.heading) * scale
     known = Places(

@@ -15,7 +15,7 @@ from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.canonical import runs
 from motionloom.datasets.schema import UserError
-from motionloom.models.diffusion.editing import Filling, KnownMotion, Pins
+from motionloom.models.diffusion.editing import Filling, KnownMotion
 from motionloom.models.diffusion.network import InBetweener, TextDenoiser
 from motionloom.models.diffusion.observed import Places, Recovery, known_columns
 from motionloom.models.diffusion.sampling import sample_motions
@@ -103,16 +103,13 @@ class DiffusionMotion(DenoisedMotion):
                 f"{most / layout.fps:g} s at a time: give fewer seconds, keep more or draw a path, and go on "
                 f"from the result"
             )
-        places, pins = Places(*(values.to(device) for values in frames.places)), None
-        if frames.pins:
-            at, joints = torch.tensor(list(frames.pins), device=device).T
-            pins = Pins(at, joints, torch.tensor(frames.model_pins, device=device))
+        places = Places(*(values.to(device) for values in frames.places))
         text = words.get("text")
         pooled = None if text is None or text.pooled is None else text.pooled[0].float().to(device)
         normal = torch.from_numpy(stats.normalize(features.numpy(), columns))
         filling = Filling(
             self.net,
-            KnownMotion(normal.to(device), known.to(device), places, pins),
+            KnownMotion(normal.to(device), known.to(device), places),
             pooled,
             Recovery(layout, columns, stats.mean, stats.std),
             window=self.window,

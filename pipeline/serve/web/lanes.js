@@ -95,7 +95,7 @@ export function buildLanes(root, rows, fps, act) {
     for (const lane of lanes) {
       lane.node.setAttribute("aria-valuemax", String(state.frames - 1));
       lane.node.replaceChildren(...runsOf(valuesOf(lane)).map(([from, to, value]) => {
-        const words = value === 1 ? STAYS : value ? PARTLY : NEW, wide = (to - from) / state.frames > 0.16;
+        const words = value === 1 ? STAYS : value ? PARTLY : NEW, wide = ((to - from) / state.frames) * box.clientWidth > 90;
         const run = element("div", { className: `edit-run ${value === 1 ? "edit-stays" : value ? "edit-partly" : "edit-new"}`, textContent: wide ? words : "", title: words });
         place(run, from, to);
         return run;

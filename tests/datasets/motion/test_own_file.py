@@ -40,6 +40,7 @@ def file_of(rng: np.random.Generator, up: str, added: int) -> tuple[OwnBvh, np.n
     phase, speed = rng.uniform(0, 6, width), rng.uniform(0.5, 3, width)
     values = 20 * np.sin(np.arange(FRAMES)[:, None] / FPS * speed + phase)
     values[:, :3] *= scale / 20
+    values[:, 3] += np.linspace(0, float(rng.choice([0, -1100, 1100])), FRAMES)  # a spin
     rows = [" ".join(f"{value:.9g}" for value in row) for row in values]
     data = "\n".join([*text, *rows, ""]).encode()
     names = JointMap("map", BODY, tuple((name,) for name in BODY.joints))
@@ -64,6 +65,10 @@ def test_kept_rows_stay_text_and_made_rows_pose_the_joints(seed: int, up: str, a
     found = made.joint_map.apply(made.motion, unit=own.unit, up=own.up)[added::3]
     away = np.linalg.norm(found - joints, axis=-1).max(axis=1)
     assert np.delete(away, slice(17, 22)).max() < 0.003 and away.max() < 0.2, "behind kept rows"
+    angles = made.motion.values[added + 50 : added + 97, 3:]
+    steps = np.abs(np.diff(angles, axis=0))
+    assert steps[:-1].max() < 180, "no made row spins"
+    assert np.abs(steps[-1] - 360 * np.round(steps[-1] / 360)).max() < 30, "a turn or none"
     # Kept legs keep their numbers in every row, where they are the file's.
     legs = kept | np.isin(np.arange(22), [0, 1, 2, 4, 5, 7, 8, 10, 11])
     legs_made = own.edited(joints, 20.0, 0, legs, None).motion
