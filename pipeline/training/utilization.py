@@ -47,6 +47,7 @@ def pass_flops(module: StageModule, batch: Batch) -> int:
     with FakeTensorMode(allow_non_fake_inputs=True) as fake:
         with FakeCopyMode(fake):
             module, batch = copy.deepcopy((module, batch))
+        module.eval()  # a group that begins later in the training counts from the first step on
         # Fused attention of CPUs is in no table of the counter; its parts are.
         with FlopCounterMode(display=False) as counter, sdpa_kernel(SDPBackend.MATH):
             torch.autograd.backward(_loss(module, module.losses(batch)))

@@ -19,6 +19,7 @@ from motionloom.models.tokenizer.single import MqConfig
 from motionloom.models.training.optim import OptimConfig
 from motionloom.models.utt.module import UttModule
 from motionloom.models.utt.network import ConditionedUtt, UttConfig, UttLossConfig
+from motionloom.pipeline.training.utilization import pass_flops
 
 # ---- the weight
 
@@ -160,6 +161,8 @@ def test_turns_begin_with_the_adversarial_term() -> None:
     values = module.losses_of("tokens", toy_batch(module), shared)
     assert "adversarial" not in values and not shared
     torch.testing.assert_close(values["loss"], values["ce"])
+    at_once = toy_module(loss={"adversarial": {"weight": 0.5}})
+    assert pass_flops(module, toy_batch(module)) == pass_flops(at_once, toy_batch(at_once))
     module.eval()  # in validation the figure is there, and not in the loss
     values = module.losses(toy_batch(module))
     assert {"tokens_adversarial", "critic_loss", "critic_accuracy"} <= set(values)
