@@ -16,6 +16,7 @@ TMA. Differences are paired: captions and seeds are drawn anew together (bootstr
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +46,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "predictions": {"align_weight": 0.1, "threshold": None},
     "samples": {"align_on": "samples", "align_weight": 2.0, "threshold": None},
 }
-WAYS = {
-    "drawn": SamplingConfig(top_p=1.0),
-    "as the model recommends": SamplingConfig(top_p=0.8, cfg_scale=1.25),
-}
+SAMPLING = SamplingConfig(top_p=1.0)
 SEEDS, BATCH, CLIPS, SIZE, DRAWS = (1, 2, 3), 16, 600, 32, 10_000
 """Of the continuations; clips of a step; judged clips; candidates of TMA's recall; draws of the bootstrap."""
 COLUMNS = (
@@ -124,8 +122,8 @@ def main() -> None:
         ]
         return {"counts": [[sum(one), len(one), int(all(one))] for one in found], "tma": float(np.mean(hits))}
 
-    def made(stage: str, way: str) -> dict[str, Any]:
-        motions = perform(Bundle([finished[stage]], cache), truths, seed=0, sampling=WAYS[way])
+    def made(stage: str) -> dict[str, Any]:
+        motions = perform(Bundle([finished[stage]], cache), truths, seed=0, sampling=SAMPLING)
         return judged([motion.joints for motion in motions])
 
     def row(title: str, found: Sequence[dict[str, Any]], **more: Any) -> Record:
@@ -133,22 +131,17 @@ def main() -> None:
         cells = {"every": every, "whole": whole, "tma": [one["tma"] for one in found]}
         return {"title": title, "cells": cells, **more}
 
-    rows = []
-    for way, sampling in WAYS.items():
-        facts = {"split": "val", "clips": len(truths), "batch": BATCH, "top_p": sampling.top_p}
-        facts["guidance"] = sampling.cfg_scale
-        names = {"base": ["base"]} | {arm: [f"{arm}_{seed}" for seed in SEEDS] for arm in ARMS}
-        counts = {}
-        for arm, stages in names.items():
-            found = [kept(args.work / f"{way}-{s}.json", lambda s=s, way=way: made(s, way)) for s in stages]
-            counts[arm] = np.array([one["counts"] for one in found], float)
-            steps = f"{args.base:,}" if arm == "base" else f"{args.base:,} and {args.more:,} more"
-            rows.append(row(f"{way}: {arm}", found, protocol={**facts, "steps": steps}))
-            if arm != "base":
-                rows[-1]["seeds"] = list(SEEDS)
-            if arm in ("predictions", "samples"):
-                both = gains(counts[arm], counts["tokens"])
-                rows[-1]["cells"] |= {"every_gain": both[0], "whole_gain": both[1]}
+    steps = f"{args.base:,} and {args.more:,} more"
+    facts = {"split": "val", "clips": len(truths), "batch": BATCH, "steps": steps}
+    rows, counts = [], {}
+    for arm in ARMS:
+        names = [f"{arm}_{seed}" for seed in SEEDS]
+        found = [kept(args.work / f"{name}.json", partial(made, name)) for name in names]
+        counts[arm] = np.array([one["counts"] for one in found], float)
+        rows.append(row(arm, found, seeds=list(SEEDS), protocol=facts))
+        if arm != "tokens":
+            both = gains(counts[arm], counts["tokens"])
+            rows[-1]["cells"] |= {"every_gain": both[0], "whole_gain": both[1]}
     rows.append(row("recorded", [judged([truth.joints for truth in truths])]))
     near = kept(
         args.work / "nearest.json",
