@@ -12,8 +12,7 @@ recording takes as long as two steps do.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 import torch
 
@@ -31,43 +30,25 @@ def recorded(step: Callable[[], None], device: torch.device) -> Callable[[], Non
     current, graph = torch.cuda.current_stream(device), torch.cuda.CUDAGraph()
     side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
     side.wait_stream(current)
+    # A place that is written once a step needs no sorting of indices, as places do in deterministic mode.
+    deterministic = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(False)
     try:
         # The outer context puts the stream back where the inner one fails, which does not do so itself.
-        with torch.cuda.device(device), torch.cuda.stream(side), _unrestrained():
+        with torch.cuda.device(device), torch.cuda.stream(side):
             step()  # libraries choose kernels and tensors get their places, which no graph could hold
+            # Whoever records graphs of compiled code frees the workspaces of matrix products, and this graph
+            # would go on writing to them: those that are made while it is recorded are its own.
+            torch._C._cuda_clearCublasWorkspaces()
             # Loaders copy batches to the device in other threads meanwhile.
-            record = torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local")
-            with _own_workspaces(), record:
+            with torch.cuda.graph(graph, stream=side, capture_error_mode="thread_local"):
                 step()
+            torch._C._cuda_clearCublasWorkspaces()
     except RuntimeError as error:
         first = next(iter(str(error).strip().splitlines()), type(error).__name__)
         warnings.warn(f"no CUDA graph of a step was made, it goes on without: {first}", stacklevel=2)
         return step
     finally:
+        torch.use_deterministic_algorithms(deterministic)
         current.wait_stream(side)
     return graph.replay
-
-
-@contextmanager
-def _unrestrained() -> Iterator[None]:
-    """Inside, no operation is replaced by one that is deterministic for any input: a place that is written
-    once a step needs no sorting of indices, which takes several kernels in every layer.
-    """
-    before = torch.are_deterministic_algorithms_enabled()
-    torch.use_deterministic_algorithms(False)
-    try:
-        yield
-    finally:
-        torch.use_deterministic_algorithms(before)
-
-
-@contextmanager
-def _own_workspaces() -> Iterator[None]:
-    """Inside, matrix products allocate workspaces anew, which are then the graph's memory: those outside are
-    freed by whoever records graphs of compiled code, and a graph would go on writing to them.
-    """
-    torch._C._cuda_clearCublasWorkspaces()
-    try:
-        yield
-    finally:
-        torch._C._cuda_clearCublasWorkspaces()
