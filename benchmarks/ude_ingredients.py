@@ -64,7 +64,6 @@ DRAWS = 20
 """Motions of each caption whose geometry is checked."""
 COLUMNS = (
     Column("cross-entropy", "log:train/tokens_ce", 2),
-    Column("right tokens, %", "log:train/tokens_accuracy_code", 0, 100),
     Column("critic is right, %", "log:train/critic_accuracy", 0, 100),
     Column("Top-1 among {candidates}, %", "tma.top-1", 1, 100),
     Column("FID_k", "movement.fid_k"),
