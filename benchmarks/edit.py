@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from results import page, read_records
 
 from motionloom.datasets.actions.measure import agrees
-from motionloom.datasets.motion.body.landing import eased, landed
+from motionloom.datasets.base.easing import eased
+from motionloom.datasets.motion.body.landing import landed
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.canonical import ground, heading, resample
 from motionloom.datasets.motion.features.joints import local_joints_of

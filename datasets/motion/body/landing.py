@@ -7,16 +7,14 @@ its limb along, and what the limb does not reach the rest of the body gives.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.easing import eased
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.canonical import ground
-
-Number = TypeVar("Number", np.float64, np.complex128)
 
 _PINNED, _FREE, _BENDS = 1000.0, 1.0, 0.05
 """Weights of joints: that must be somewhere, of the rest, and of knees and elbows, which may bend."""
@@ -25,38 +23,6 @@ _ROUNDS = 3
 
 Pinned = Mapping[tuple[int, int], Sequence[float]]
 """Places of pinned joints, in metres, by frame and joint."""
-
-
-def smooth(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares, held within 0 to 1, that leave and arrive level."""
-    share = np.clip(share, 0.0, 1.0)
-    return np.asarray(share * share * (3 - 2 * share))
-
-
-def between_known(
-    known: NDArray[np.bool_], rows: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """The rows [R, J] of known [T, J] before, or at, and after, or at, some rows, and how far these are on
-    the `smooth` way between them. Where there is none on one side, both are that of the other.
-    """
-    number, count = np.arange(len(known))[:, None], len(known)
-    first = np.maximum.accumulate(np.where(known, number, -1), axis=0)[rows]
-    last = np.minimum.accumulate(np.where(known, number, count)[::-1], axis=0)[::-1][rows]
-    first, last = np.where(first < 0, last, first), np.where(last == count, first, last)
-    return first, last, smooth((rows[:, None] - first) / np.maximum(last - first, 1))
-
-
-def eased(values: NDArray[Number], known: NDArray[np.bool_]) -> NDArray[Number]:
-    """Values [T, ...], between known ones, bool [T], along a curve that leaves and arrives level; 0 where
-    nothing is known.
-
-    Before the first and after the last known one they stay as these are.
-    """
-    if not known.any():
-        return np.zeros_like(values)
-    first, last, share = (one[:, 0] for one in between_known(known[:, None], np.arange(len(values))))
-    share = share.reshape(-1, *[1] * (values.ndim - 1))
-    return np.asarray(values[first] * (1 - share) + values[last] * share)
 
 
 def landed(

@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.base.easing import eased
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
-from motionloom.datasets.motion.body.landing import eased, landed, reached
+from motionloom.datasets.motion.body.landing import landed, reached
 from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
 from motionloom.datasets.motion.bvh.own_file import OwnBvh, between_rows, own_rows
 from motionloom.datasets.motion.canonical import facing, ground, retarget

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motionloom.datasets.motion.body.landing import eased, landed, reached
+from motionloom.datasets.base.easing import eased
+from motionloom.datasets.motion.body.landing import landed, reached
 from motionloom.datasets.motion.body.rigid import fit_rigid
 from motionloom.datasets.motion.layout import (
     PIECES,
