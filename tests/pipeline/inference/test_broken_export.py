@@ -291,10 +291,10 @@ def test_an_export_gives_the_runs_motions_when_nothing_else_is_left(
         np.testing.assert_array_equal(made, first)
     files = [path for path in (exported / "text/encoder").rglob("*") if path.is_file()]
     assert {path.suffix for path in files} <= {".safetensors", ".json", ".txt"} and files
-    assert str(tmp_path) not in (exported / "bundle.json").read_text(), "a place on the maker's machine"
+    assert str(tmp_path) not in (exported / "bundle.json").read_text()
     with pytest.raises(UserError, match=r"cannot be copied .*put the model back"):
         write_bundle(kept, tmp_path / "second")
-    assert list((tmp_path / "second").iterdir()) == [], "nothing that looks like a model is left"
+    assert list((tmp_path / "second").iterdir()) == []
 
 
 def test_the_hub_is_asked_when_its_cache_lacks_the_model(
@@ -321,6 +321,6 @@ def test_another_model_at_the_same_place_is_refused(tmp_path: Path) -> None:
     encoder = tiny_distilbert(tmp_path)
     build_text_cache(tmp_path / "text/cache", CAPTIONS, str(encoder), progress=False)
     tiny_distilbert(tmp_path, seed=1)
-    with pytest.raises(UserError, match="its weights are not those that encoded this run's captions"):
+    with pytest.raises(UserError, match="are not those that encoded"):
         text_source.copy_encoder(str(encoder), tmp_path / "text", tmp_path / "copy")
     assert not (tmp_path / "copy").exists()
