@@ -321,6 +321,6 @@ def test_another_model_at_the_same_place_is_refused(tmp_path: Path) -> None:
     encoder = tiny_distilbert(tmp_path)
     build_text_cache(tmp_path / "text/cache", CAPTIONS, str(encoder), progress=False)
     tiny_distilbert(tmp_path, seed=1)
-    with pytest.raises(UserError, match="are not those that encoded"):
+    with pytest.raises(UserError, match="weights are not those"):
         text_source.copy_encoder(str(encoder), tmp_path / "text", tmp_path / "copy")
     assert not (tmp_path / "copy").exists()
