@@ -11,10 +11,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.easing import eased
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.canonical import ground
+from motionloom.datasets.motion.easing import eased
 
 _PINNED, _FREE, _BENDS = 1000.0, 1.0, 0.05
 """Weights of joints: that must be somewhere, of the rest, and of knees and elbows, which may bend."""

@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from motionloom.datasets.base.easing import eased
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
 from motionloom.datasets.motion.body.landing import landed, reached
 from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
 from motionloom.datasets.motion.bvh.own_file import OwnBvh, between_rows, own_rows
 from motionloom.datasets.motion.canonical import facing, ground, retarget
+from motionloom.datasets.motion.easing import eased
 from motionloom.datasets.motion.features.codec import encode, place
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motionloom.datasets.base.easing import eased
 from motionloom.datasets.motion.body.landing import landed, reached
 from motionloom.datasets.motion.body.rigid import fit_rigid
+from motionloom.datasets.motion.easing import eased
 from motionloom.datasets.motion.layout import (
     PIECES,
     FigurePart,
