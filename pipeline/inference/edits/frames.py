@@ -354,8 +354,8 @@ def _known_places(
     if heading_known.any():  # in between it turns evenly
         at = np.flatnonzero(heading_known)
         heading = np.interp(np.arange(len(heading)), at, np.unwrap(heading[at]))
-    seen_from = np.flatnonzero(rooted if rooted.any() else on_path)
-    first = int(seen_from[0]) if len(seen_from) else lead
+    seen_from = np.flatnonzero(rooted if rooted.any() else on_path).tolist()
+    first = seen_from[0] if seen_from else lead
     heading_known[first] = place_known[first] = True
     anchor = RootPath(heading[first : first + 1], place[first : first + 1])
     seen = (place - anchor.place) * np.exp(-1j * anchor.heading) * scale
