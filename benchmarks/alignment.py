@@ -48,7 +48,7 @@ ARMS: dict[str, dict[str, Any]] = {
 }
 SAMPLING = SamplingConfig(top_p=1.0)
 SEEDS, BATCH, CLIPS, SIZE, DRAWS = (1, 2, 3), 16, 600, 32, 10_000
-"""Of the continuations; clips of a step; judged clips; candidates of TMA's recall; draws of the bootstrap."""
+"""Seeds of the continuations; clips of a step; judged clips; candidates of TMA's recall; bootstrap draws."""
 COLUMNS = (
     Column("every, %", "every"),
     Column("less `tokens`", "every_gain"),
@@ -111,7 +111,7 @@ def main() -> None:
     text = judge.texts(truths)
 
     def judged(motions: Sequence[Joints]) -> dict[str, Any]:
-        """What a motion for each clip has right, and TMA's recall."""
+        """Return what a motion for each clip has right, and TMA's recall."""
         layout = judge.motions.layout
         columns = layout.part(judge.motions.part)
         latent = embed_motions(judge.motions, [encode(canonicalize(j), layout)[:, columns] for j in motions])

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from motionloom.datasets.loading.order import shares
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.order import Source, shares
+from motionloom.datasets.shards.clips import ClipDataset, Source
 
 Kind = frozenset[str]
 NONE = "none"

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import require_layout
 from motionloom.datasets.schema import Caption, ClipMeta, UserError
-from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.order import Source
+from motionloom.datasets.shards.clips import ClipDataset, Source
 
 
 class MixedDataset:

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.randomness import permutation
+from motionloom.datasets.loading.order import mixed_order, shares, source_order
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.order import Source, mixed_order, shares, source_order
+from motionloom.datasets.shards.clips import Source
 
 POOL = 8
 """Batches sorted by length together. More of them mean less padding, fewer mix lengths better."""

@@ -1,8 +1,12 @@
-"""`ClipDataset`: the interface of a data set for batches, statistics and stages: a folder, a URL or a mix."""
+"""`ClipDataset`: the interface of a data set for batches, statistics and stages: a folder, a URL or a mix.
+
+`Source` is what a plan of batches knows of it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -10,7 +14,21 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption, ClipMeta, Split
-from motionloom.datasets.shards.order import Source
+
+
+@dataclass(frozen=True)
+class Source:
+    """The items `first .. first + count` of a plan: those of one data set."""
+
+    first: int
+    count: int
+    weight: float = 1.0
+    """Share of the batches, relative to the other sources."""
+    shards: NDArray[np.int32] | None = None
+    """Shard of each item, [count], for the streamed order; None for the global one."""
+    group: int = 1
+    """Shards whose items are shuffled together in the streamed order."""
+    name: str = ""
 
 
 class ClipDataset(Protocol):

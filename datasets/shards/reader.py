@@ -39,10 +39,9 @@ from motionloom.datasets.schema import (
     parse_json,
 )
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
-from motionloom.datasets.shards.clips import ClipDataset
+from motionloom.datasets.shards.clips import ClipDataset, Source
 from motionloom.datasets.shards.index import SplitIndex, read_index
 from motionloom.datasets.shards.options import Reading
-from motionloom.datasets.shards.order import Source
 from motionloom.datasets.shards.sample import MEMBERS, captions_from_json, meta_from_json
 from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store
 from motionloom.datasets.shards.tar import npy_from_bytes

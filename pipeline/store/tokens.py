@@ -30,8 +30,7 @@ from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.order import Source
+from motionloom.datasets.shards.clips import ClipDataset, Source
 from motionloom.models.gpt.tokens import TokenSequence, interleave, stream_names
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.store.data import captions_of

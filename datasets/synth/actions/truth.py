@@ -65,7 +65,7 @@ ACTIONS = {
     "then": Action(hand="relaxed"),
 }
 SEATED = ("punch", "wave", "clap", "raise", "point")
-"""What somebody who sat down before does without getting up."""
+"""Actions of the arms, which somebody who sat down before does without getting up."""
 BASIC = tuple(ACTIONS)[:14]
 """The actions of a config that asks for none; the others are for models that shall know more."""
 

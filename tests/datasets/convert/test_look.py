@@ -173,7 +173,7 @@ def captioned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_no_clip_moves_when_subjects_come_and_go(seed: int) -> None:
-    """Of random subjects some leave and others come: everyone else stays, all clips of a person together."""
+    """Some random subjects leave and others come: everyone else stays, all clips of a person together."""
     draw = random.Random(seed)
     config = BvhConfig(source=Path("x"), splits=Path(draw.choice(["subjects", "subjects:7", "clips:2"])))
 

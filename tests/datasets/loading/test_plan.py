@@ -22,12 +22,13 @@ from motionloom.datasets.base.randomness import permutation, uniform
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
 from motionloom.datasets.loading.mix import MixedDataset
+from motionloom.datasets.loading.order import shares
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import Source
 from motionloom.datasets.shards.options import Reading
-from motionloom.datasets.shards.order import Source, shares
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.text.build import build_with_encoder
 

@@ -24,9 +24,9 @@ from motionloom.datasets.check.dataset import check
 from motionloom.datasets.loading.plan import BatchPlan
 from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards import tasks
+from motionloom.datasets.shards.clips import Source
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, kind_of_reason, tally, write_left_out
 from motionloom.datasets.shards.options import Part
-from motionloom.datasets.shards.order import Source
 from motionloom.datasets.shards.reader import ShardDataset
 
 

@@ -124,7 +124,7 @@ STARTS = {
     "actor_critic": ["actor_critic.reward.actor_steps=1", "actor_critic.reward.critic_steps=1"],
     "evaluator": ["evaluator.movement_steps=1"],
 }
-"""What begins later than the first steps, by the name of kind and stage."""
+"""Settings that have a part begin later than the first steps, by the name of kind and stage."""
 
 ANY_ORDER = {
     "index_add", "scatter_reduce", "put", "bincount", "histc", "kthvalue", "median", "nll_loss2d_forward",

@@ -7,32 +7,17 @@ shuffle touches every shard all the time, the streamed order finishes one group 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.randomness import permutation, words
 from motionloom.datasets.schema import UserError
+from motionloom.datasets.shards.clips import Source
 
 # Last elements of keys. `BatchPlan` draws its pools by (seed, epoch, n >= 1), so a zero in the third place
 # keeps these apart from them; no key may end in zero (numpy pads keys with zeros).
 _SHARDS, _WITHIN, _MIX = 1, 2, 3
-
-
-@dataclass(frozen=True)
-class Source:
-    """The items `first .. first + count` of a plan: those of one data set."""
-
-    first: int
-    count: int
-    weight: float = 1.0
-    """Share of the batches, relative to the other sources."""
-    shards: NDArray[np.int32] | None = None
-    """Shard of each item, [count], for the streamed order; None for the global one."""
-    group: int = 1
-    """Shards whose items are shuffled together in the streamed order."""
-    name: str = ""
 
 
 def source_order(source: Source, *key: int) -> NDArray[np.int64]:
