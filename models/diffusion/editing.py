@@ -1,8 +1,8 @@
 """Motion editing: diffusion under a mask, with a gradient towards places.
 
 At every denoising step the predicted clean motion is replaced by the known one where there is one (MDM's
-editing). The prediction is corrected near the boundary of known frames and smoothed [ours], and a gradient
-step reduces its distance to the root's known places and headings, in metres (`observed.py`) [ours]. The
+editing). The prediction is fitted to the known frames and smoothed [ours], and a gradient step reduces its
+distance to the root's known places and headings, in metres (`observed.py`) [ours]. The
 in-betweener also observes all that is known.
 
 Motions longer than the training's are made in overlapping windows that agree at every step: a frame is the
@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 from torch.func import jvp
 
+from motionloom.datasets.motion.canonical import runs
 from motionloom.models.diffusion.network import InBetweener
 from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, turned_back
 from motionloom.models.diffusion.sampling import blend_weights, window_starts
@@ -144,22 +145,27 @@ class Filling:
         return motion - size[:, None, None] * slope
 
     def _smoothed(self, motion: Tensor) -> Tensor:
-        """Return motions [n, T, D] with known values in place and free values corrected towards them.
+        """Return motions [n, T, D] with known values in place and free values fitted to them.
 
-        Networks do not quite begin where the known part ends, and small ones tremble. The error at known
-        values is therefore subtracted from the free ones too, less and less away from the boundary and with
-        as little bending as that needs; then each column becomes the nearest with small second differences.
+        Networks do not quite begin where the known part ends, least of all with people unlike those of their
+        training, and small ones tremble. In gaps between known frames the prediction is therefore `_carried`;
+        elsewhere the error at known values is subtracted from the free ones too, less and less away from the
+        boundary and with as little bending as that needs. Then each column becomes the nearest with small
+        second differences.
         """
         out = self._with_known(motion)
         error = out - motion
-        for columns, correction, smoother in self._boundaries:
+        for columns, gaps, correction, smoother in self._boundaries:
             corrected = out[..., columns] + torch.einsum("ts,nsd->ntd", correction, error[..., columns])
+            for gap in gaps:
+                corrected[:, gap] = _carried(motion[:, gap, columns], out[..., columns], gap)
             out[..., columns] = torch.einsum("ts,nsd->ntd", smoother, corrected)
         return out
 
-    def _boundary_filters(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """Return, for columns that are known in the same frames: the columns, and the matrices [T, T] that
-        spread the error at known frames over free ones and that smooth the result.
+    def _boundary_filters(self) -> list[tuple[Tensor, list[slice], Tensor, Tensor]]:
+        """Return, for columns that are known in the same frames: the columns, the gaps in which they are
+        carried, and the matrices [T, T] that spread the error at known frames over other free ones and that
+        smooth the result.
         """
         known, like = self.known.mask, self.known.motion
         one = torch.eye(len(known), dtype=torch.float64)
@@ -172,9 +178,37 @@ class Filling:
             free = torch.from_numpy(~pattern)[:, None]
             correction = torch.linalg.inv(torch.where(free, bending + _DECAY * one, one)) * free
             smoother = torch.linalg.inv(one + _STIFFNESS * bending * free)
-            columns = torch.from_numpy(np.flatnonzero(of.reshape(-1) == number))
-            out.append((columns.to(like.device), correction.to(like), smoother.to(like)))
+            columns = np.flatnonzero(of.reshape(-1) == number)
+            # Two known frames on either side tell how fast the figure enters and leaves. Steps of the root
+            # follow its places instead, by the gradient.
+            gaps = [
+                slice(start, stop)
+                for start, stop in runs(~pattern)
+                if pattern[max(start - 2, 0) : start].sum() == pattern[stop : stop + 2].sum() == 2
+                and not self.recovery.steps[columns].all()
+            ]
+            out.append(
+                (torch.from_numpy(columns).to(like.device), gaps, correction.to(like), smoother.to(like))
+            )
         return out
+
+
+def _carried(predicted: Tensor, known: Tensor, gap: slice) -> Tensor:
+    """Return predicted motions [n, G, D] of a gap in known ones [n, T, D], moved to meet these [ours].
+
+    Shifts that change evenly along the gap bring its first and last frame to where the known ones lead. Of
+    what the prediction then adds to the straight line between the known frames the less is taken the larger
+    the shifts had to be: a Wiener filter, whose noise they are. So gaps of people unlike those of training
+    are bridged rather by straight lines.
+    """
+    before, after = known[:, gap.start - 1, None], known[:, gap.stop, None]
+    first, last = 2 * before - known[:, gap.start - 2, None], 2 * after - known[:, gap.stop + 1, None]
+    share = torch.linspace(0, 1, predicted.shape[1] + 2).to(known)[1:-1, None]
+    shift = torch.lerp(first - predicted[:, :1], last - predicted[:, -1:], share)
+    line = torch.lerp(before, after, share)
+    added = predicted + shift - line
+    signal, noise = added.square().mean(1, keepdim=True), shift.square().mean(1, keepdim=True)
+    return line + added * signal / (signal + noise).clamp(min=1e-12)
 
 
 _STIFFNESS = 1.0

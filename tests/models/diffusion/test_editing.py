@@ -140,12 +140,13 @@ def test_known_values_are_kept_and_errors_fall(monkeypatch: pytest.MonkeyPatch) 
 
 
 class Aside(InBetweener):
-    """Makes what is given, all of it off by 1."""
+    """Makes what is given, all of it off by as much as it says."""
 
     wanted: torch.Tensor
+    off = 1.0
 
     def forward(self, noisy: torch.Tensor, *more: object, **named: object) -> torch.Tensor:
-        return self.wanted.expand_as(noisy) + 1
+        return self.wanted.expand_as(noisy) + self.off
 
 
 def test_what_the_network_misses_of_the_kept_part_is_led_off() -> None:
@@ -156,9 +157,20 @@ def test_what_the_network_misses_of_the_kept_part_is_led_off() -> None:
     )
     still = KnownMotion(torch.zeros_like(given.motion), given.mask, nowhere)
     net.wanted = still.motion
-    made = filled(net, still)[0]
-    off = made[8:16, given.mask[0] & ~given.mask[8]].mean(1)
+    led = given.mask[0] & ~given.mask[8]
+    off = filled(net, still)[0][8:16, led].mean(1)
     assert off[0] < 0.2 and off[-1] < 0.2  # half a smoothed jump would be left otherwise
+    # What it adds to straight lines counts the less the more it misses; their ends are met in any case.
+    net.wanted = (torch.arange(FRAMES) * 0.3).sin()[:, None].expand_as(still.motion)
+    carried = led & torch.from_numpy(~recovery().steps)
+    waves = KnownMotion(net.wanted, given.mask, nowhere)
+    line = torch.lerp(net.wanted[7], net.wanted[16], torch.linspace(0, 1, 10)[1:-1, None])[:, carried]
+    whole = (net.wanted[8:16, carried] - line).norm()
+    shares = []
+    for net.off in (0.0, 1.0, 5.0):
+        shares.append(float((filled(net, waves)[0][8:16, carried] - line).norm() / whole))
+    # Smoothing alone bends the line towards how the known frames lead on.
+    assert shares[0] > 0.9 and 0.6 > shares[1] > shares[2]
 
 
 def test_windows_share_frames_and_a_caption_counts() -> None:
