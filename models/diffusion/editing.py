@@ -80,6 +80,7 @@ class Filling:
         self.text = known.motion.new_zeros(net.text_dim) if text is None else text
         self.conditioned = text is not None
         self.observed = torch.stack([self._observed(start) for start in self.starts])
+        self._legs = recovery.legs.to(known.motion.device)
         self._boundaries = self._boundary_filters()
 
     def __call__(self, seeds: Sequence[int], sampler: Sampler, steps: int) -> Tensor:
@@ -158,7 +159,8 @@ class Filling:
         for columns, gaps, correction, smoother in self._boundaries:
             corrected = out[..., columns] + torch.einsum("ts,nsd->ntd", correction, error[..., columns])
             for gap in gaps:
-                corrected[:, gap] = _carried(motion[:, gap, columns], out[..., columns], gap)
+                predicted, legs = motion[:, gap, columns], self._legs[columns]
+                corrected[:, gap] = _carried(predicted, out[..., columns], gap, legs)
             out[..., columns] = torch.einsum("ts,nsd->ntd", smoother, corrected)
         return out
 
@@ -193,13 +195,13 @@ class Filling:
         return out
 
 
-def _carried(predicted: Tensor, known: Tensor, gap: slice) -> Tensor:
+def _carried(predicted: Tensor, known: Tensor, gap: slice, legs: Tensor) -> Tensor:
     """Return predicted motions [n, G, D] of a gap in known ones [n, T, D], moved to meet these [ours].
 
     Shifts that change evenly along the gap bring its first and last frame to where the known ones lead. Of
     what the prediction then adds to the straight line between the known frames the less is taken the larger
     the shifts had to be: a Wiener filter, whose noise they are. So gaps of people unlike those of training
-    are bridged rather by straight lines.
+    are bridged rather by straight lines. Of columns of `legs`, bool [D], all is taken: half a step glides.
     """
     before, after = known[:, gap.start - 1, None], known[:, gap.stop, None]
     first, last = 2 * before - known[:, gap.start - 2, None], 2 * after - known[:, gap.stop + 1, None]
@@ -208,7 +210,7 @@ def _carried(predicted: Tensor, known: Tensor, gap: slice) -> Tensor:
     line = torch.lerp(before, after, share)
     added = predicted + shift - line
     signal, noise = added.square().mean(1, keepdim=True), shift.square().mean(1, keepdim=True)
-    return line + added * signal / (signal + noise).clamp(min=1e-12)
+    return line + added * torch.where(legs, 1.0, signal / (signal + noise).clamp(min=1e-12))
 
 
 _STIFFNESS = 1.0

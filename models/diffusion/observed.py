@@ -47,8 +47,13 @@ class Recovery:
         if layout.family == "raw" or not root or not np.isin(root, columns).all():
             raise UserError(f"layout {layout.name}: an in-betweener is of columns that hold the root's way")
         self.layout = layout
+        legs = piece_columns(layout) == LOWER
+        if layout.has("root_height"):
+            legs[layout.slice("root_height")] = False
         self.steps = step_columns(layout)[columns]
         """Which columns are steps to the next frame, bool [D]."""
+        self.legs = torch.from_numpy(legs[columns])
+        """Which columns pose the legs or lead the root along the floor, bool [D]."""
         self.mean, self.std = torch.from_numpy(mean[columns]), torch.from_numpy(std[columns])
 
     def way(self, features: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:

@@ -162,7 +162,7 @@ def test_what_the_network_misses_of_the_kept_part_is_led_off() -> None:
     assert off[0] < 0.2 and off[-1] < 0.2  # half a smoothed jump would be left otherwise
     # What it adds to straight lines counts the less the more it misses; their ends are met in any case.
     net.wanted = (torch.arange(FRAMES) * 0.3).sin()[:, None].expand_as(still.motion)
-    carried = led & torch.from_numpy(~recovery().steps)
+    carried = led & ~recovery().legs & torch.from_numpy(~recovery().steps)
     waves = KnownMotion(net.wanted, given.mask, nowhere)
     line = torch.lerp(net.wanted[7], net.wanted[16], torch.linspace(0, 1, 10)[1:-1, None])[:, carried]
     whole = (net.wanted[8:16, carried] - line).norm()
