@@ -80,7 +80,6 @@ class Filling:
         self.text = known.motion.new_zeros(net.text_dim) if text is None else text
         self.conditioned = text is not None
         self.observed = torch.stack([self._observed(start) for start in self.starts])
-        self._legs = recovery.legs.to(known.motion.device)
         self._boundaries = self._boundary_filters()
 
     def __call__(self, seeds: Sequence[int], sampler: Sampler, steps: int) -> Tensor:
@@ -156,18 +155,18 @@ class Filling:
         """
         out = self._with_known(motion)
         error = out - motion
-        for columns, gaps, correction, smoother in self._boundaries:
-            corrected = out[..., columns] + torch.einsum("ts,nsd->ntd", correction, error[..., columns])
+        for columns, legs, gaps, correction, smoother in self._boundaries:
+            known = out[..., columns]
+            corrected = known + torch.einsum("ts,nsd->ntd", correction, error[..., columns])
             for gap in gaps:
-                predicted, legs = motion[:, gap, columns], self._legs[columns]
-                corrected[:, gap] = _carried(predicted, out[..., columns], gap, legs)
+                corrected[:, gap] = _carried(motion[:, gap, columns], known, gap, legs)
             out[..., columns] = torch.einsum("ts,nsd->ntd", smoother, corrected)
         return out
 
-    def _boundary_filters(self) -> list[tuple[Tensor, list[slice], Tensor, Tensor]]:
-        """Return, for columns that are known in the same frames: the columns, the gaps in which they are
-        carried, and the matrices [T, T] that spread the error at known frames over other free ones and that
-        smooth the result.
+    def _boundary_filters(self) -> list[tuple[Tensor, Tensor, list[slice], Tensor, Tensor]]:
+        """Return, for columns that are known in the same frames: the columns, which of them are of legs, the
+        gaps in which they are carried, and the matrices [T, T] that spread the error at known frames over
+        other free ones and that smooth the result.
         """
         known, like = self.known.mask, self.known.motion
         one = torch.eye(len(known), dtype=torch.float64)
@@ -189,9 +188,8 @@ class Filling:
                 if pattern[max(start - 2, 0) : start].sum() == pattern[stop : stop + 2].sum() == 2
                 and not self.recovery.steps[columns].all()
             ]
-            out.append(
-                (torch.from_numpy(columns).to(like.device), gaps, correction.to(like), smoother.to(like))
-            )
+            own = torch.from_numpy(columns).to(like.device), self.recovery.legs[columns].to(like.device)
+            out.append((*own, gaps, correction.to(like), smoother.to(like)))
         return out
 
 

@@ -160,15 +160,21 @@ def test_what_the_network_misses_of_the_kept_part_is_led_off() -> None:
     led = given.mask[0] & ~given.mask[8]
     off = filled(net, still)[0][8:16, led].mean(1)
     assert off[0] < 0.2 and off[-1] < 0.2  # half a smoothed jump would be left otherwise
-    # What it adds to straight lines counts the less the more it misses; their ends are met in any case.
-    net.wanted = (torch.arange(FRAMES) * 0.3).sin()[:, None].expand_as(still.motion)
-    carried = led & ~recovery().legs & torch.from_numpy(~recovery().steps)
-    waves = KnownMotion(net.wanted, given.mask, nowhere)
+
+
+def test_gaps_are_bridged_rather_by_straight_lines_the_more_the_network_misses() -> None:
+    net, given = Aside(TINY, len(COLUMNS), 4), task()
+    nowhere = torch.zeros(1, FRAMES, dtype=torch.bool)
+    places = given.places._replace(heading_known=nowhere, place_known=nowhere)
+    net.wanted = (torch.arange(FRAMES) * 0.3).sin()[:, None].expand_as(given.motion)
+    carried = given.mask[0] & ~given.mask[8] & ~recovery().legs & torch.from_numpy(~recovery().steps)
     line = torch.lerp(net.wanted[7], net.wanted[16], torch.linspace(0, 1, 10)[1:-1, None])[:, carried]
-    whole = (net.wanted[8:16, carried] - line).norm()
     shares = []
     for net.off in (0.0, 1.0, 5.0):
-        shares.append(float((filled(net, waves)[0][8:16, carried] - line).norm() / whole))
+        made = filled(net, KnownMotion(net.wanted, given.mask, places))[0][8:16, carried]
+        shares.append(float((made - line).norm() / (net.wanted[8:16, carried] - line).norm()))
+        # It leaves and arrives as the known frames lead, by .3 a frame at most, however far off it was made.
+        assert (made[[0, -1]] - net.wanted[[7, 16]][:, carried]).abs().max() < 0.5
     # Smoothing alone bends the line towards how the known frames lead on.
     assert shares[0] > 0.9 and 0.6 > shares[1] > shares[2]
 
