@@ -2,14 +2,16 @@
 
     python benchmarks/speed.py [--only audio batches] [--record speed]
 
-All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
-turns.
+Two ways of one case take turns on one core, in CPU seconds, which other programs on the machine hardly
+change.
+`workers` is in wall time, for a quiet machine.
 """
 
 from __future__ import annotations
 
 import itertools
 import tempfile
+import time
 import warnings
 from argparse import Namespace
 from collections.abc import Callable, Sequence
@@ -20,11 +22,13 @@ import numpy as np
 import torch
 from bench import Column, Record, arguments, command_line, cpu_seconds, report
 from numpy.typing import NDArray
+from torch.utils.data import DataLoader
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features, fitting_octaves
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatches
 from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.datasets.loading.steps import Numbered, Steps
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import Caption
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
@@ -33,7 +37,10 @@ from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.encoder import EncodedText
+from motionloom.models.training.stage_module import Batch
+from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.tokens import TokenBatches, TokenCaptions, TokenStore
+from motionloom.pipeline.training.loaders import ROOMS, loader
 
 COLUMNS = (Column("ours", "ours"), Column("the usual way", "usual"), Column("times faster", "ratio", 1))
 CAPTIONS = ("a person walks forward", "a person waves with the left hand", "a person squats")
@@ -119,27 +126,32 @@ def noise(folder: str, layout: MotionLayout, clips: int, least: int) -> tuple[Sh
     return dataset, compute(dataset)
 
 
-def batches(args: Namespace) -> Record:
-    """Batches of 256 as the paper trains on them, of 512 whole-body clips of 196 frames."""
+def paper_batches(folder: str) -> dict[str, Numbered[Batch]]:
+    """Batches of 256 as the paper trains on them, of 512 whole-body clips of 196 frames in `folder`."""
     layout, count, groups = MotionLayout.named("wholebody363"), 512, 49
     columns, draw = layout.part("bodyhand"), torch.Generator().manual_seed(0)
+    dataset, stats = noise(folder, layout, count, 196)
+    texts = [caption.text for i in range(count) for caption in dataset.texts(i)]
+    cache = build_with_encoder(Path(folder, "text"), texts, NoiseText(), progress=False)
+    per_group = {"body": 2, "hand": 1}
+    codes = {k: torch.randint(512, (count * groups * n,), generator=draw) for k, n in per_group.items()}
+    store = TokenStore(codes, np.arange(count + 1) * groups, per_group, np.ones(count, bool))
+    captions = TokenCaptions.of([[(3 * i + k, 0, groups) for k in range(3)] for i in range(count)])
+    latents, alike = torch.zeros(3 * count, 256), torch.zeros(3 * count, NoiseText.dim)
+    pattern, ends = ("body", "body", "hand"), dict.fromkeys(per_group, 512)
+    clips = {"max_frames": 196, "captioned": "body", "columns": columns, "batch_size": BATCH}
+    return {
+        "tokenizer": WindowBatches(dataset, stats, window=WINDOW, batch_size=BATCH, columns=columns),
+        "TMA": ConditionBatches(dataset, stats, {"text": cache}, **clips),
+        "GPT": TokenBatches(store, captions, latents, alike, pattern, ends, groups, BATCH, 0),
+    }
+
+
+def batches(args: Namespace) -> Record:
+    """CPU time of one batch."""
     with tempfile.TemporaryDirectory() as folder:
-        dataset, stats = noise(folder, layout, count, 196)
-        texts = [caption.text for i in range(count) for caption in dataset.texts(i)]
-        cache = build_with_encoder(Path(folder, "text"), texts, NoiseText(), progress=False)
-        per_group = {"body": 2, "hand": 1}
-        codes = {k: torch.randint(512, (count * groups * n,), generator=draw) for k, n in per_group.items()}
-        store = TokenStore(codes, np.arange(count + 1) * groups, per_group, np.ones(count, bool))
-        captions = TokenCaptions.of([[(3 * i + k, 0, groups) for k in range(3)] for i in range(count)])
-        latents, alike = torch.zeros(3 * count, 256), torch.zeros(3 * count, NoiseText.dim)
-        pattern, ends = ("body", "body", "hand"), dict.fromkeys(per_group, 512)
-        clips = {"max_frames": 196, "captioned": "body", "columns": columns, "batch_size": BATCH}
-        made = {
-            "tokenizer": WindowBatches(dataset, stats, window=WINDOW, batch_size=BATCH, columns=columns),
-            "TMA": ConditionBatches(dataset, stats, {"text": cache}, **clips),
-            "GPT": TokenBatches(store, captions, latents, alike, pattern, ends, groups, BATCH, 0),
-        }
-        step, motion = itertools.count(), np.zeros((2, BATCH, 196, len(columns)), dtype=np.float32)
+        step, made = itertools.count(), paper_batches(folder)
+        motion = np.zeros((2, *made["TMA"][0]["motion"].shape), dtype=np.float32)
         calls: dict[str, Callable[[], object]] = {
             name: lambda own=own: own[next(step)] for name, own in made.items()
         }
@@ -149,7 +161,27 @@ def batches(args: Namespace) -> Record:
     return row("a training batch of 256 at the paper's size", times, copied)
 
 
-CASES = {case.__name__: case for case in (audio, batches)}
+def workers(args: Namespace) -> Record:
+    """Wall time from batch to batch of one loader process, as for a GPU, and as torch alone sends them."""
+    begins, count, ours, usual = 10, 60, [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, own in paper_batches(folder).items():
+            steps = Steps(lambda rank, world, own=own: own, begins + count)
+            packed = loader(steps, Hardware(accelerator="cpu", workers=1))
+            packed.dataset.rooms = ROOMS
+            plain = DataLoader(steps, batch_size=None, num_workers=1, multiprocessing_context="spawn")
+            for load, times in ((packed, ours), (plain, usual)):
+                coming = iter(load)
+                for k in range(begins + count):
+                    if k == begins:
+                        began = time.perf_counter()
+                    next(coming)
+                times.append(f"{name} {1e3 * (time.perf_counter() - began) / count:.0f} ms")
+            packed.close()
+    return row("such a batch from one loader process", ", ".join(ours), f"sent by torch: {', '.join(usual)}")
+
+
+CASES = {case.__name__: case for case in (audio, batches, workers)}
 
 
 def main() -> None:

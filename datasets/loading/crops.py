@@ -162,8 +162,8 @@ class Crops:
         more if there is one.
 
         Neither numpy nor malloc keeps 32 MB or more for the next time, and the first writing to new pages
-        takes nearly as long as the copy: 256 x 196 x 313 numbers 18.5 ms instead of 11, in a loader worker 67
-        instead of 60. A ring of arrays would write over batches that a caller still holds.
+        takes nearly as long as the copy: 256 x 196 x 313 numbers 18.5 ms instead of 11. A ring of arrays
+        would write over batches that a caller still holds.
         """
         size = math.prod(shape)
         for n in range(len(self._rooms)):

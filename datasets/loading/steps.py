@@ -11,8 +11,6 @@ from functools import cached_property
 from typing import Protocol, TypeVar
 
 import torch.distributed as dist
-from torch import Tensor
-from torch.utils._pytree import tree_leaves
 from torch.utils.data import IterableDataset, get_worker_info
 
 T_co = TypeVar("T_co", covariant=True)
@@ -50,14 +48,7 @@ class Steps(IterableDataset[T_co]):
         # A loader takes one item of each worker in turn: worker w of n reads every n-th batch from w on.
         begin, stride = (self.first, 1) if worker is None else (self.first + worker.id, worker.num_workers)
         for k in range(begin, self.last, stride):
-            batch = self.batches[k]
-            if worker is not None:
-                # Here a full /dev/shm ends the training. Left to the thread of the worker that sends batches,
-                # the error is printed there, the batch is lost, and the training waits for it for ever.
-                for value in tree_leaves(batch):
-                    if isinstance(value, Tensor):
-                        value.share_memory_()  # type: ignore[no-untyped-call]
-            yield batch
+            yield self.batches[k]
 
     def __getstate__(self) -> dict[str, object]:
         """Workers get the rank's batches; they know nothing of the process group."""

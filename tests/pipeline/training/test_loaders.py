@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import resource
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,17 +25,19 @@ from plain_training import take_steps
 from rank_cases import CASES
 from same_stage import assert_equal
 from tiny_adversaries import Duel, Vectors
+from torch.utils._pytree import tree_flatten
 from torch.utils.data import DataLoader
 from two_ranks import pair_of, work
 
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.conditions import Condition
+from motionloom.datasets.loading.steps import Steps
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.lightning_data import StageData
-from motionloom.pipeline.training.loaders import TrainingData, on_device
+from motionloom.pipeline.training.loaders import SharedBatches, TrainingData, on_device
 from motionloom.pipeline.training.trained_stage import Batches
 
 GIB = 2**30
@@ -100,6 +104,35 @@ def test_shared_memory_that_takes_no_batch_ends_the_training_and_its_workers() -
     assert "hardware.workers" in str(sentence_of(caught.value))
     data.close()  # while the error still holds the iterator
     assert not multiprocessing.active_children()
+
+
+@pytest.mark.parametrize("rooms", [0, 2])
+def test_batches_of_a_worker_lie_in_one_piece_of_shared_memory(rooms: int) -> None:
+    """Of any types, shapes and nesting; written over only where they may be."""
+    draw = torch.Generator().manual_seed(0)
+
+    def batch(rows: int) -> dict[str, Any]:
+        text = Condition(torch.randn(rows, 3, 5, generator=draw), torch.ones(rows, 3) > 0, None)
+        return {
+            "motion": torch.randn(rows, 7, generator=draw).mT, "present": torch.rand(rows, 3) > 0.5,
+            "length": torch.arange(rows), "none": torch.empty(0, 4), "one": torch.tensor(2.5).double(),
+            "caption": ["a", "b"], "full": True, "conditions": {"text": text},
+        }  # fmt: skip
+
+    given = [batch(rows) for rows in (3, 2, 1, 5, 4)]
+    seen = []
+    for wanted, packed in zip(given, SharedBatches(Steps(lambda *_: given, 5), rooms), strict=True):
+        sent = pickle.loads(ForkingPickler.dumps(packed)).unpacked()
+        seen.append(packed.memory)
+        assert packed.memory.is_shared()
+        (leaves, shape), (expected, expected_shape) = tree_flatten(sent), tree_flatten(wanted)
+        assert shape == expected_shape, "a condition is one again"
+        for value, own in zip(leaves, expected, strict=True):
+            equal = value == own if not isinstance(own, torch.Tensor) else value.equal(own)
+            assert equal and type(value) is type(own)
+            assert getattr(value, "dtype", None) is getattr(own, "dtype", None)
+    assert (seen[0].data_ptr() == seen[2].data_ptr()) is bool(rooms), "the third fits where the first was"
+    assert seen[2].data_ptr() != seen[4].data_ptr()
 
 
 def test_the_next_batch_is_copied_while_one_is_computed(monkeypatch: pytest.MonkeyPatch) -> None:
