@@ -1,7 +1,7 @@
 """How well clips are edited: gaps filled and pins met, beside what needs no model.
 
-    python benchmarks/edit.py inbetween work --record edit
-    python benchmarks/edit.py inbetween work_real --real clips --record edit_real --card
+    python benchmarks/edit.py work inbetween second third --record edit
+    python benchmarks/edit.py work_real inbetween second third --real clips --record edit_real --card
 
 Test clips are made here, from the data settings of the recipe, or are the middle five seconds of BVH files.
 Of each the middle 40 % is taken away and made again: by the model, along straight lines, along splines
@@ -10,8 +10,9 @@ between them. Then the model fills the same gap with the left wrist pinned in it
 gap's begin does what the words of another test clip say, by the rules that judge synthetic clips; beside the
 clip as it was.
 
-Intervals of a row are over three draws of one training, differences between rows over clips. What is measured
-is kept in the folder `work`, so that a killed run goes on. `--card` writes the card of a shipped model.
+Intervals of a row are over three draws, each of another training where several models are given; differences
+between rows are over clips. What is measured is kept in the folder `work`, so that a killed run goes on.
+`--card` writes the card of the first model.
 """
 
 from __future__ import annotations
@@ -148,17 +149,18 @@ def asked_of(clip: Joints, fps: float, gap: slice, words: Truth) -> dict[str, di
 
 
 def figures_of(
-    model: MotionModel, clip: RecordedClip, task: dict[str, object], gap: slice, words: Truth
+    models: Sequence[MotionModel], clip: RecordedClip, task: dict[str, object], gap: slice, words: Truth
 ) -> list[dict[str, float]]:
     """Figures of each draw of a task; none where the clip does not allow it, such as a pin out of reach."""
-    fps, out, drawing = model.fps, [], SamplingConfig()
+    fps, out, drawing, asked = models[0].fps, [], SamplingConfig(), EditTask.parse(task, "task")
     try:
-        draws = edit_clip(
-            model.bundle, clip, EditTask.parse(task, "task"), samples=DRAWS, seed=0, sampling=drawing
-        )
+        draws = [
+            edit_clip(models[draw % len(models)].bundle, clip, asked, samples=1, seed=draw, sampling=drawing)
+            for draw in range(DRAWS)
+        ]
     except UserError:
         return []
-    for made in draws:
+    for (made,) in draws:
         near, figures = made.report, measured(made.joints, clip.joints, fps, gap)
         if "seconds" in task:
             figures = {"sliding": near.sliding, **obeyed(made.joints, words, fps, gap.start)}
@@ -169,14 +171,14 @@ def figures_of(
 
 
 def rows_of(
-    model: MotionModel,
+    models: Sequence[MotionModel],
     clips: Sequence[RecordedClip],
     words: Sequence[Truth],
     training: Sequence[Joints],
     work: Path,
 ) -> list[dict[str, object]]:
     """The rows of the record: of the model one value a draw, its mean over the clips."""
-    fps = model.fps
+    fps = models[0].fps
     rivals: dict[str, Callable[[Joints, slice], Joints]] = {
         "recorded": lambda clip, gap: clip,
         LINES: straight,
@@ -194,7 +196,7 @@ def rows_of(
         for title, task in asked_of(clip.joints, fps, gap, others).items():
             name = re.sub(r"\W+", "_", f"{Path(clip.name).stem}{title}")
             found.setdefault(title, []).append(
-                kept(work / f"{name}.json", partial(figures_of, model, clip, task, gap, others))
+                kept(work / f"{name}.json", partial(figures_of, models, clip, task, gap, others))
             )
     away = {title: np.array([[one.get("away", np.nan) for one in draws] for draws in found[title]]).T
             for title in (MODEL, LINES, NEAREST)}  # fmt: skip
@@ -249,28 +251,29 @@ def write_card(model: Path, title: str, description: str, config: SynthConfig) -
 
 def main() -> None:
     parser = command_line(__doc__)
-    parser.add_argument("model", type=Path, help="an exported folder, or the name of a model of the package")
     parser.add_argument("work", type=Path, help="folder of what is measured")
+    parser.add_argument("models", type=Path, nargs="+", help="exported folders, or models of the package")
     parser.add_argument("--real", type=Path, help="folder of BVH files, in place of synthetic test clips")
     parser.add_argument("--clips", type=int, default=60, help="synthetic test clips")
     parser.add_argument("--card", action="store_true", help="write the model's card from its records")
     args = arguments(parser)
-    model, recipe = MotionModel(args.model, "cpu"), load_recipe(RECIPE)
+    models, recipe = [MotionModel(path, "cpu") for path in args.models], load_recipe(RECIPE)
     files = sorted(args.real.glob("*.bvh")) if args.real else []
     wanted = len(files) if args.real else args.clips
     truths, config = test_clips(recipe, TRIED + 2 * wanted)
     words, truths = truths[TRIED : TRIED + wanted], truths[TRIED + wanted :]
-    clips = [RecordedClip(truth.id, truth.joints, model.fps, truth.face) for truth in truths]
+    fps = models[0].fps
+    clips = [RecordedClip(truth.id, truth.joints, fps, truth.face) for truth in truths]
     if args.real:
         clips = [read_clip(path) for path in files]
-    clips = [on_the_floor(clip, model.fps) for clip in clips]
+    clips = [on_the_floor(clip, fps) for clip in clips]
     if not clips:
         raise UserError("no clips to edit")
-    rows = rows_of(model, clips, words, training_of(config, TRAINING), args.work)
+    rows = rows_of(models, clips, words, training_of(config, TRAINING), args.work)
     kind = "recorded clips" if args.real else "synthetic test clips"
     report(f"Gaps in {kind}, filled; {recipe.name}", COLUMNS, rows, args.record)
     if args.card:
-        write_card(model_folder(args.model), args.model.name, recipe.description, config)
+        write_card(model_folder(args.models[0]), args.models[0].name, recipe.description, config)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from same_stage import assert_equal
 from tiny_adversaries import Duel, Vectors
 from torch.utils._pytree import tree_flatten
 from torch.utils.data import DataLoader
+from torch.utils.data._utils.pin_memory import pin_memory
 from two_ranks import pair_of, work
 
 from motionloom.datasets.base.os_errors import sentence_of
@@ -107,8 +108,11 @@ def test_shared_memory_that_takes_no_batch_ends_the_training_and_its_workers() -
 
 
 @pytest.mark.parametrize("rooms", [0, 2])
-def test_batches_of_a_worker_lie_in_one_piece_of_shared_memory(rooms: int) -> None:
-    """Of any types, shapes and nesting; written over only where they may be."""
+def test_batches_of_a_worker_lie_in_one_piece_of_shared_memory(
+    rooms: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of any types, shapes and nesting, sent and pinned by torch; written over only where they may be."""
+    monkeypatch.setattr(torch.Tensor, "pin_memory", torch.Tensor.clone)
     draw = torch.Generator().manual_seed(0)
 
     def batch(rows: int) -> dict[str, Any]:
@@ -122,7 +126,7 @@ def test_batches_of_a_worker_lie_in_one_piece_of_shared_memory(rooms: int) -> No
     given = [batch(rows) for rows in (3, 2, 1, 5, 4)]
     seen = []
     for wanted, packed in zip(given, SharedBatches(Steps(lambda *_: given, 5), rooms), strict=True):
-        sent = pickle.loads(ForkingPickler.dumps(packed)).unpacked()
+        sent = pin_memory(pickle.loads(ForkingPickler.dumps(packed))).unpacked()
         seen.append(packed.memory)
         assert packed.memory.is_shared()
         (leaves, shape), (expected, expected_shape) = tree_flatten(sent), tree_flatten(wanted)
