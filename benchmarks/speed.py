@@ -165,7 +165,7 @@ def workers(args: Namespace) -> Record:
     """Wall time from batch to batch of one loader process, as for a GPU, and as torch alone sends them."""
     begins, count, ours, usual = 10, 60, [], []
     with tempfile.TemporaryDirectory() as folder:
-        for name, own in paper_batches(folder).items():
+        for own in paper_batches(folder).values():
             steps = Steps(lambda rank, world, own=own: own, begins + count)
             packed = loader(steps, Hardware(accelerator="cpu", workers=1))
             packed.dataset.rooms = ROOMS
@@ -176,9 +176,9 @@ def workers(args: Namespace) -> Record:
                     if k == begins:
                         began = time.perf_counter()
                     next(coming)
-                times.append(f"{name} {1e3 * (time.perf_counter() - began) / count:.0f} ms")
+                times.append(f"{1e3 * (time.perf_counter() - began) / count:.0f}")
             packed.close()
-    return row("such a batch from one loader process", ", ".join(ours), f"sent by torch: {', '.join(usual)}")
+    return row("from one loader process", f"{', '.join(ours)} ms", f"sent by torch: {', '.join(usual)} ms")
 
 
 CASES = {case.__name__: case for case in (audio, batches, workers)}
