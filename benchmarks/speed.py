@@ -1,10 +1,9 @@
 """Speed of what runs often, beside the usual way to do the same: the table "Speed" of docs/results.md.
 
-    python benchmarks/speed.py [--only audio batches] [--record speed]
+    python benchmarks/speed.py [--only audio batches workers] [--record speed]
 
-Two ways of one case take turns on one core, in CPU seconds, which other programs on the machine hardly
-change.
-`workers` is in wall time, for a quiet machine.
+All on one core, in CPU seconds, which other programs on the machine hardly change; two ways of one case take
+turns. `workers` is wall time of a loader process and the one that reads from it, on a quiet machine.
 """
 
 from __future__ import annotations

@@ -111,7 +111,7 @@ def test_shared_memory_that_takes_no_batch_ends_the_training_and_its_workers() -
 def test_batches_of_a_worker_lie_in_one_piece_of_shared_memory(
     rooms: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of any types, shapes and nesting, sent and pinned by torch; written over only where they may be."""
+    """Any types, shapes and nesting come back from torch's sending and pinning; memory is used again."""
     monkeypatch.setattr(torch.Tensor, "pin_memory", torch.Tensor.clone)
     draw = torch.Generator().manual_seed(0)
 
