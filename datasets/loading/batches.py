@@ -54,6 +54,7 @@ class WindowBatches(Dataset[MotionBatch]):
         seed: int = 0,
         rank: int = 0,
         world: int = 1,
+        parts: int = 1,
         columns: NDArray[np.int64] | None = None,
     ) -> None:
         if window < 1:
@@ -61,7 +62,7 @@ class WindowBatches(Dataset[MotionBatch]):
         self.crops = Crops(dataset, stats, columns)
         self.dataset = dataset
         self.window = window
-        self.seed, self.rank, self.world = seed, rank, world
+        self.seed, self.share = seed, (rank, world, parts)
         self.clips = self.crops.clips
         if len(self.clips) == 0 or not self.crops.present[np.unique(dataset.present)].any(axis=0).all():
             raise UserError(
@@ -72,11 +73,11 @@ class WindowBatches(Dataset[MotionBatch]):
         self.full = bool(whole and (dataset.frames[self.clips] >= window).all())
         sources = dataset.sources(self.clips)
         self.plan = BatchPlan(len(self.clips), batch_size, seed, sources=sources)
-        self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
+        self.plan.local(0, *self.share)  # an indivisible batch is refused now, not in a loader worker
 
     def _windows(self, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Clips, first frames and lengths of batch `k`, each [n]."""
-        turns, items = self.plan.local(k, self.rank, self.world)
+        turns, items = self.plan.local(k, *self.share)
         clips = self.clips[items]
         frames = self.dataset.frames[clips]
         draws = uniform(self.seed, _WINDOW, turns, clips, 0)

@@ -187,21 +187,22 @@ class ConditionBatches(Dataset[ConditionBatch]):
         seed: int = 0,
         rank: int = 0,
         world: int = 1,
+        parts: int = 1,
         columns: NDArray[np.int64] | None = None,
     ) -> None:
         self.source = ConditionedClips(
             dataset, stats, readers, max_frames=max_frames, min_frames=min_frames, columns=columns,
             captioned=captioned,
         )  # fmt: skip
-        self.seed, self.rank, self.world = seed, rank, world
+        self.seed, self.share = seed, (rank, world, parts)
         self.drop = drop or {}
         clips = self.source.clips
         present, names = self.source.present[clips], self.source.names
         self.plan = KindPlan(dataset, clips, present, names, batch_size, seed, balance, homogeneous)
-        self.plan.local(0, rank, world)  # an indivisible batch is refused now, not in a loader worker
+        self.plan.local(0, *self.share)  # an indivisible batch is refused now, not in a loader worker
 
     def __getitem__(self, k: int) -> ConditionBatch:
-        turns, clips = self.plan.local(k, self.rank, self.world)
+        turns, clips = self.plan.local(k, *self.share)
         source = self.source
         # Each purpose draws by a counter of its own, so that a change of one leaves the others as they were.
         draws = uniform(self.seed, _DROP, turns, clips)

@@ -84,20 +84,24 @@ class BatchPlan:
         part = slice(position * self.batch_items, (position + 1) * self.batch_items)
         return turns[part], order[part]
 
-    def local(self, k: int, rank: int, world: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """(turns, items), [batch_items / world]: the rank's part of batch `k`.
+    def local(
+        self, n: int, rank: int, world: int, parts: int = 1
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(turns, items), [batch_items / world / parts]: the rank's share of part `n % parts` of global batch
+        `n // parts`.
 
-        Parts are contiguous: rows gathered in rank order stand as in the batch of a single process.
+        Shares are contiguous: rows gathered in the order of parts, then ranks, stand as in the whole batch.
         """
-        if self.batch_items % world:
+        if self.batch_items % (world * parts):
+            cut = f" in {parts} parts" * (parts > 1)
             raise UserError(
-                f"a global batch of {self.batch_items} clips does not divide over {world} ranks; "
-                f"make the batch size a multiple of the number of ranks"
+                f"a global batch of {self.batch_items} clips does not divide over {world} ranks{cut}; "
+                f"make the batch size a multiple of {world * parts}"
             )
-        turns, items = self.batch(k)
-        share = self.batch_items // world
-        part = slice(rank * share, (rank + 1) * share)
-        return turns[part], items[part]
+        turns, items = self.batch(n // parts)
+        share = self.batch_items // (world * parts)
+        first = (n % parts * world + rank) * share
+        return turns[first : first + share], items[first : first + share]
 
     def _epoch(self, epoch: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         if len(self.sources) == 1:

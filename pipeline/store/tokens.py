@@ -167,6 +167,7 @@ class TokenBatches(Dataset[dict[str, Any]]):
     seed: int
     rank: int = 0
     world: int = 1
+    parts: int = 1
     training: bool = True
     sources: tuple[Source, ...] = ()
     """Data sets and their weights, when several are mixed."""
@@ -196,7 +197,7 @@ class TokenBatches(Dataset[dict[str, Any]]):
 
     def __getitem__(self, k: int) -> dict[str, Any]:
         if self.training:
-            turns, items = self._plan.local(k, self.rank, self.world)
+            turns, items = self._plan.local(k, self.rank, self.world, self.parts)
         else:
             items = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
             turns = np.zeros(len(items), dtype=np.int64)

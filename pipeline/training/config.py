@@ -17,8 +17,9 @@ from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import RUNTIME, StageConfig
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers
 
-BatchSource = Callable[[int, int, int], Numbered[Any]]
-"""(items per global micro-batch, rank, world) -> batches; item k is this rank's batch of micro-step k."""
+BatchSource = Callable[[int, int, int, int], Numbered[Any]]
+"""(items of a step on all processes, rank, world, parts of a step) -> batches; item n is this rank's share of
+part `n % parts` of step `n // parts`."""
 
 
 class SizedBatches(Numbered[Any], Sized, Protocol):

@@ -9,7 +9,7 @@ from typing import Any
 import lightning as L
 from torch.utils.data import DataLoader
 
-from motionloom.datasets.loading.steps import Steps
+from motionloom.datasets.loading.steps import Numbered, Steps
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.contract.stage import CompletedStage, Inputs, StageCache
 from motionloom.pipeline.launch.hardware import Hardware
@@ -44,11 +44,12 @@ class StageData(L.LightningDataModule):
         module, done = (None, 0) if trainer is None else (trainer.lightning_module, trainer.global_step)
         parts = module.accumulate if isinstance(module, StageModule) else self.config.accumulate
         steps = self.config.steps if trainer is None or trainer.max_steps < 0 else trainer.max_steps
-        size = self.config.batch_size // parts
-        batches = self.batches.train
-        return loader(
-            Steps(lambda rank, world: batches(size, rank, world), steps * parts, done * parts), self.hardware
-        )
+        size, batches = self.config.batch_size, self.batches.train
+
+        def make(rank: int, world: int) -> Numbered[Batch]:
+            return batches(size, rank, world, parts)
+
+        return loader(Steps(make, steps * parts, done * parts), self.hardware)
 
     def val_dataloader(self) -> DataLoader[Batch] | list[DataLoader[Batch]]:
         validation = self.batches.validation

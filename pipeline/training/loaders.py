@@ -41,7 +41,7 @@ class TrainingData:
         self, train: BatchSource, validation: EvalSource | None, config: TrainConfig, hardware: Hardware
     ) -> None:
         self.config, self.hardware = config, hardware
-        self.train = train(config.batch_size // config.accumulate, rank(), world_size())
+        self.train = train(config.batch_size, rank(), world_size(), config.accumulate)
         self.validation = validation
         self._training: _Loader | None = None
         self._held_out: _Loader | None = None
@@ -164,7 +164,8 @@ class _Loader(DataLoader[Batch]):
 def loader(steps: Steps[Batch], hardware: Hardware) -> _Loader:
     """Return a loader of ready batches."""
     workers = hardware.workers_for(steps.last - steps.first)
-    pinned = hardware.resolved_accelerator() == "gpu"
+    # torch pins nothing where it finds no GPU, whatever was asked for.
+    pinned = hardware.resolved_accelerator() == "gpu" and torch.accelerator.is_available()
     return _Loader(
         SharedBatches(steps, ROOMS if pinned else 0) if workers else steps,  # type: ignore[arg-type]
         batch_size=None,

@@ -1,4 +1,4 @@
-"""Whether the ranks' shares of batches, one after another, are the batches of a single process."""
+"""Whether the shares of ranks and parts, one after another, are the batches of a single process."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from torch import Tensor
 
 
 def require_shares(
-    build: Callable[[int, int], Any], batches: Iterable[int] = (0, 4, 9), worlds: Iterable[int] = (2, 3)
+    build: Callable[[int, int, int], Any], batches: Iterable[int] = (0, 4, 9), worlds: Iterable[int] = (2, 3)
 ) -> None:
-    """`build(rank, world)` gives the batches by number."""
+    """`build(rank, world, parts)` gives the batches by number."""
     for k in batches:
-        whole = build(0, 1)[k]
-        for world in worlds:
-            require_rows(whole, [build(rank, world)[k] for rank in range(world)])
+        whole = build(0, 1, 1)[k]
+        for world, parts in [(1, 2), *((world, 1) for world in worlds), (2, 2)]:
+            shares = [
+                build(rank, world, parts)[k * parts + part] for part in range(parts) for rank in range(world)
+            ]
+            require_rows(whole, shares)
 
 
 def require_rows(whole: Any, parts: list[Any]) -> None:

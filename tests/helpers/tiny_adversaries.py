@@ -27,7 +27,7 @@ CRITIC = OptimConfig(lr=2e-2, grad_clip=0.2, schedule="cosine", weight_decay=0.1
 
 
 class Steps(Dataset[dict[str, Any]]):
-    """Item k is this rank's rows of a part of batch k // parts, which `made` gives whole.
+    """Item k is this rank's rows of part k % parts of batch k // parts; `made` gives the whole part.
 
     `dies_at` a step all ends with an error, at `hangs_at` nothing goes on, and with a step of `signalled`
     that signal comes.
@@ -38,14 +38,15 @@ class Steps(Dataset[dict[str, Any]]):
         batch: int,
         rank: int = 0,
         world: int = 1,
-        *,
         parts: int = 1,
+        *,
         size: int = 10**6,
         dtype: Any = torch.float32,
         dies_at: int | None = None,
         signalled: dict[int, signal.Signals] | None = None,
         hangs_at: int | None = None,
     ) -> None:
+        batch //= parts
         self.batch, self.parts, self.size, self.dtype = batch, parts, size, dtype
         self.dies_at, self.hangs_at, self.signalled = dies_at, hangs_at, signalled or {}
         self.rows = slice(rank * batch // world, (rank + 1) * batch // world)
@@ -151,9 +152,7 @@ def train(
         context(folder, console or Console(quiet=True), **(hardware or {})),
         duel,
         config,
-        lambda batch, rank, world: Vectors(
-            batch, rank, world, parts=config.accumulate, dtype=dtype, dies_at=dies_at, signalled=signalled
-        ),
+        lambda *place: Vectors(*place, dtype=dtype, dies_at=dies_at, signalled=signalled),
         lambda: Vectors(8, size=3, dtype=dtype, signalled=validation_signalled),
     )
     return duel

@@ -59,9 +59,9 @@ class ToyModule(StageModule):
 class ToyBatches(Steps):
     """Item k is this rank's rows of batch k."""
 
-    def __init__(self, config: ToyConfig, seed: int, batch: int, rank: int, world: int) -> None:
-        super().__init__(batch, rank, world)
-        self.config, self.seed, self.rank = config, seed, rank
+    def __init__(self, config: ToyConfig, seed: int, *place: int) -> None:
+        super().__init__(*place)
+        self.config, self.seed, self.rank = config, seed, place[1]
 
     def made(self, step: int, part: int) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(self.seed * 10**6 + step)

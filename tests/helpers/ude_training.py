@@ -200,9 +200,7 @@ def train(
         context(folder, Console(quiet=True), devices=devices),
         module,
         config,
-        lambda batch, number, world: Clips(
-            batch, number, world, dtype=dtype, parts=config.accumulate, dies_at=dies_at, signalled=signalled
-        ),
+        lambda *place: Clips(*place, dtype=dtype, dies_at=dies_at, signalled=signalled),
         lambda: Clips(8, size=2, dtype=dtype),
     )
     return module

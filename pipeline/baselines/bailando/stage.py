@@ -262,8 +262,8 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
             clips=window_of(net.gpt, inputs.dance_vq, config.reward.contexts), dataset=songs, balance=MUSIC,
         )  # fmt: skip
 
-        def train(batch: int, rank: int, world: int) -> Dataset[object]:
-            return BeatBatches(found.train(batch, rank, world), audio, fps)  # type: ignore[arg-type, return-value]
+        def train(*share: int) -> Dataset[object]:
+            return BeatBatches(found.train(*share), audio, fps)  # type: ignore[arg-type, return-value]
 
         assert found.validation is not None
         check = found.validation

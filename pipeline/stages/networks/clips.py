@@ -51,8 +51,8 @@ def clip_batches(
     def of(some: ClipDataset) -> FeatureStats | Crops:
         return read(some) if callable(read) else read
 
-    def train(batch: int, rank: int, world: int) -> Dataset[object]:
-        at: dict[str, Any] = {"batch_size": batch, "rank": rank, "world": world}
+    def train(batch: int, rank: int, world: int, parts: int) -> Dataset[object]:
+        at: dict[str, Any] = {"batch_size": batch, "rank": rank, "world": world, "parts": parts}
         return ConditionBatches(dataset, of(dataset), readers, seed=seed, **at, **clips, **draws)
 
     def validation() -> SizedBatches:

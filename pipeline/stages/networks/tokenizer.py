@@ -146,8 +146,8 @@ def window_batches(
     data, stats = inputs.data, inputs.stats
     dataset, window = data.split("train"), config.window
 
-    def train(batch: int, rank: int, world: int) -> Dataset[object]:
-        at = {"batch_size": batch, "rank": rank, "world": world}
+    def train(batch: int, rank: int, world: int, parts: int) -> Dataset[object]:
+        at = {"batch_size": batch, "rank": rank, "world": world, "parts": parts}
         return WindowBatches(dataset, stats, window=window, seed=seed, columns=columns, **at)
 
     return Batches(train, lambda: EvalBatches(data.held_out(), stats, columns=columns, **validation))

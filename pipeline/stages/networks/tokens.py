@@ -182,12 +182,14 @@ def token_batches(
         wrap: Makes other batches of these.
     """
 
-    def batches(split: str, training: bool, batch: int, rank: int = 0, world: int = 1) -> SizedBatches:
+    def batches(
+        split: str, training: bool, batch: int, rank: int = 0, world: int = 1, parts: int = 1
+    ) -> SizedBatches:
         clips = clips_of(split)
         found = TokenBatches(
             clips.store, clips.captions, pattern=net.pattern, ends=net.num_codes, max_groups=net.max_groups,
-            batch_size=batch, seed=seed, rank=rank, world=world, training=training, sources=clips.sources,
-            present=clips.present, **tables(clips),
+            batch_size=batch, seed=seed, rank=rank, world=world, parts=parts, training=training,
+            sources=clips.sources, present=clips.present, **tables(clips),
         )  # fmt: skip
         return wrap(clips, found)
 

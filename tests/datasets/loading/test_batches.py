@@ -92,9 +92,10 @@ def test_windows_are_normalised_to_the_byte(
 def test_any_number_of_ranks_sees_the_same_global_batch(
     train: ShardDataset, stats: FeatureStats, text: TextCache, world: int
 ) -> None:
-    def captions(rank: int, of: int) -> ConditionBatches:
+    def captions(*share: int) -> ConditionBatches:
+        place = dict(zip(("rank", "world", "parts"), share, strict=True))
         return caption_batches(
-            train, stats, text, batch_size=12, max_frames=40, min_frames=8, seed=1, rank=rank, world=of
+            train, stats, text, batch_size=12, max_frames=40, min_frames=8, seed=1, **place
         )
 
     require_shares(captions, worlds=[world])

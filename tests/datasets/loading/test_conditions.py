@@ -181,10 +181,9 @@ def test_batches_of_one_kind(data: ShardDataset, stats: FeatureStats, readers: d
 def test_any_number_of_ranks_sees_the_same_rows(
     data: ShardDataset, stats: FeatureStats, readers: dict[str, object], homogeneous: bool
 ) -> None:
-    def build(rank: int, world: int) -> ConditionBatches:
+    def build(rank: int, world: int, parts: int) -> ConditionBatches:
         return ConditionBatches(
-            data, stats, readers, batch_size=12, max_frames=20, seed=4, rank=rank,
-            world=world,
+            data, stats, readers, batch_size=12, max_frames=20, seed=4, rank=rank, world=world, parts=parts,
             balance={"text": 1, "audio": 1, "text+audio": 1, "none": 1}, drop={"text": 0.4, "audio": 0.4},
             homogeneous=homogeneous,
         )  # fmt: skip

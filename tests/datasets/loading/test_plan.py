@@ -162,6 +162,9 @@ def test_ranks_share_every_global_batch_out_alike(order: str) -> None:
                 assert {len(part) for _, part in parts} == {BATCH // world}
                 assert np.array_equal(np.concatenate([part for _, part in parts]), items)
                 assert np.array_equal(np.concatenate([turn for turn, _ in parts]), turns)
+            # A step in parts reads the same clips: else another `accumulate` would go on elsewhere.
+            cut = [plan.local(2 * k + part, rank, 2, 2) for part in range(2) for rank in range(2)]
+            assert np.array_equal(np.concatenate([part for _, part in cut]), items)
         drawn = np.concatenate(seen)
         assert len(drawn) == plan.num_items // BATCH * BATCH
         if order != "mixed":  # a lighter data set's clips come again before all of the other's have come
@@ -255,8 +258,9 @@ def test_batches_are_the_same_for_any_number_of_ranks(order: str, roots: tuple[P
     data = mixed(roots, order=order, shards_per_group=2)
     stats = compute(data)
 
-    def windows(rank: int, world: int) -> WindowBatches:
-        return WindowBatches(data, stats, window=16, batch_size=24, seed=1, rank=rank, world=world)
+    def windows(*share: int) -> WindowBatches:
+        place = dict(zip(("rank", "world", "parts"), share, strict=True))
+        return WindowBatches(data, stats, window=16, batch_size=24, seed=1, **place)
 
     require_shares(windows)
     evaluated = EvalBatches(data, stats, batch_size=16, max_frames=40)

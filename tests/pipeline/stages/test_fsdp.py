@@ -82,7 +82,7 @@ def train(folder: Path, **settings: Any) -> None:
         stage,
         module,
         TrainConfig.model_validate(given),
-        lambda batch, rank, world: Tokens(net, batch, rank, world),
+        lambda *place: Tokens(net, *place),
         lambda: Tokens(net, 4, 0, 1, size=2),
     )
     assert module.net is net

@@ -247,7 +247,7 @@ def stage_data(name: str, parts: int = 1) -> StageData:
     """As a stage gives it."""
     clips: Any = Vectors if name == "duel" else ude_training.Clips
     batches = Batches(
-        lambda batch, rank, world: clips(batch, rank, world, dtype=torch.float32, dies_at=None),
+        lambda *place: clips(*place, dtype=torch.float32, dies_at=None),
         lambda: clips(8, size=2, dtype=torch.float32, dies_at=None),
     )
     return StageData(batches, TrainConfig(steps=STEPS, batch_size=8, accumulate=parts))
