@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -30,6 +31,12 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 
 # The tests import the helper modules by their bare names, and so do spawned workers, which inherit the path.
 sys.path.append(str(Path(__file__).parent / "helpers"))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files of slow tests come first: with the last of them, one process would work and the others wait."""
+    slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
+    items.sort(key=lambda item: -slow[item.path])
 
 
 @pytest.fixture(scope="session")
