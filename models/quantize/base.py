@@ -130,10 +130,10 @@ class LearntCodebook(nn.Module):
                 counts, resets = self._update(rows, real, codes, counts)
             # The counts are global after an update: dividing by their mean per rank makes the mean over ranks
             # the penalty of the whole batch, whatever each rank's number of real vectors is.
-            number = counts.sum() * full.shape[-1] / (world_size() if update else 1)
+            number = (counts.sum() * full.shape[-1]).clamp(min=1) / (world_size() if update else 1)
 
             def mean_square(error: Tensor) -> Tensor:
-                return error.square().sum() / number.clamp(min=1)
+                return error.square().sum() / number
 
             penalty = self._penalty(latents, near, mean_square)
             metrics = {

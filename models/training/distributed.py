@@ -85,9 +85,9 @@ def masked_mean(values: Tensor, mask: Tensor, present: Tensor | None = None) -> 
         # Two masks of fewer dimensions keep the layout of `values`, hence the order of the sum.
         values = torch.where(present[:, None], values, 0.0)
         number = (mask.sum(1) * present.float().mean(1)).sum()
-    count = sum_over_ranks(number) * each / world_size()
+    count = (sum_over_ranks(number) * each).clamp(min=1) / world_size()
     full = mask[(...,) + (None,) * (values.dim() - mask.dim())]
-    return torch.where(full, values, 0.0).sum() / count.clamp(min=1)
+    return torch.where(full, values, 0.0).sum() / count
 
 
 def mean_of_rows(values: Tensor, mask: Tensor, present: Tensor | None = None) -> Tensor:

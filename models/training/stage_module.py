@@ -218,12 +218,13 @@ class StageModule(L.LightningModule, ABC):
 
     def saved_state(self) -> Callable[[], None]:
         """Return a function that restores buffers (codebooks) and figures, to repeat a part of a step."""
-        buffers = [(buffer, buffer.clone()) for buffer in self.buffers()]
+        buffers = {name: buffer.clone() for name, buffer in self.named_buffers()}
         figures, sums = list(self.figures), dict(self._sums)
 
         def restore() -> None:
-            for buffer, before in buffers:
-                buffer.copy_(before)
+            for name, buffer in self.named_buffers():
+                buffer.copy_(buffers[name])
+            self.load_state_dict(buffers, strict=False)  # codebooks read from theirs whether they have begun
             self.figures, self._sums = figures, sums
 
         return restore

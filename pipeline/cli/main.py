@@ -42,7 +42,7 @@ from motionloom.pipeline.cli.options import (
 )
 from motionloom.pipeline.cli.search import search
 from motionloom.pipeline.launch.console import SafeConsole, make_console, quiet_libraries
-from motionloom.pipeline.launch.process import LOST, Interrupted, JointError, TeamError, leave, process_rank
+from motionloom.pipeline.launch.process import Interrupted, JointError, TeamError, leave, process_rank
 
 app = Commands(
     name="motionloom",
@@ -333,7 +333,7 @@ def _exit_code() -> int:
         return 2
     except TeamError as error:
         errors.print(f"process {process_rank()}: {error}", style="red", markup=False)
-        return LOST
+        return error.exit_code
     except BrokenPipeError:  # `motionloom info | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return _CLOSED_PIPE

@@ -39,6 +39,10 @@ started: list[subprocess.Popen[bytes]] = []
 class TeamError(Exception):
     """Another process of this run has stopped; the message says which, how, and what to do."""
 
+    @property
+    def exit_code(self) -> int:
+        return _joint_exit(LOST)
+
     @classmethod
     def lost(cls, folder: Path | None = None) -> TeamError:
         """The error where a connection broke; processes that hung have left their stacks in `folder`."""
@@ -105,7 +109,8 @@ def process_rank() -> int:
 
 
 def _joint_exit(code: int) -> int:
-    """The code; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise."""
+    """The code; 0 in processes of Lightning's launcher, which kills the lead where one ends otherwise, while
+    it may write a checkpoint still."""
     return 0 if _started_by_lead() else code
 
 

@@ -61,6 +61,8 @@ class Continuation:
 
     step: int
     """Step of its newest checkpoint."""
+    differs: str
+    """What has changed, in words."""
     reason: str
     changed: tuple[Change, ...]
     knowingly: bool
@@ -95,7 +97,8 @@ def continuation(
         return f"what it is made of has changed ({what}); only {', '.join(f'{part}*' for part in free)} may"
     if step >= config.train.steps:
         return f"step {step} is its last; raise {stage.name}.{_STEPS}"
-    reason, schedule = f"{', '.join(changes)}: goes on from step {step}", config.schedule_of_length()
+    differs, schedule = ", ".join(changes), config.schedule_of_length()
+    reason = f"{differs}: goes on from step {step}"
     if _STEPS in keys and schedule is not None:
         reason += f"; {schedule} now ends with step {config.train.steps}, which is not the same as at once"
     # A change that no checkpoint has been trained with yet is replaced by the next, or taken back.
@@ -105,7 +108,7 @@ def continuation(
         first, now = begun.get(key, old.config.get(key)), wanted.config.get(key)
         if first != now:
             noted.append(Change(step=step, key=key, old=first, new=now))
-    return Continuation(step, reason, tuple(noted), bool(set(keys) - HOW - {_STEPS}))
+    return Continuation(step, differs, reason, tuple(noted), bool(set(keys) - HOW - {_STEPS}))
 
 
 def newest_step(folder: Path) -> int | None:

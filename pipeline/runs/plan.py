@@ -106,6 +106,8 @@ def make_plan(
             goes_on = continuation(stage, started.training, before, folder)
             if isinstance(goes_on, Continuation) and (stage.name in go_on or not goes_on.knowingly):
                 action, reason, changed = "resume", goes_on.reason, goes_on.changed
+            elif reason == _UNFINISHED:
+                reason += f": {goes_on if isinstance(goes_on, str) else goes_on.differs}"
         if stage.name in go_on and action == "run":
             why = "it has not begun" if goes_on is None else goes_on
             raise UserError(f"--go-on {stage.name}: {why}")
@@ -165,8 +167,6 @@ def _facts(recipe: Recipe, stage: Stage, rows: dict[str, PlannedStage]) -> Tree:
         facts["order"] = list(stage.inputs)  # the first of several generators is the default
     if code := code_of(stage.kind.modules(stage.config)):
         facts["code"] = code
-    if stage.kind.trains and getattr(getattr(stage.config, "train", None), "ema", None):
-        facts["ema"] = 2  # with a warm-up
     return facts
 
 
@@ -185,6 +185,9 @@ def _begun_again(run: Path, select: Selection, forced: set[str]) -> bool:
     return any(Artifact.find(stage_folder(run, name)) is None for name in forced)
 
 
+_UNFINISHED = "changed before it finished"
+
+
 def _decide(
     recipe: Recipe,
     stage: Stage,
@@ -201,7 +204,7 @@ def _decide(
             return "run", _difference(recipe, artifact, stage, rows)
         if before is None:
             return "run", "never run"
-        return "run", "settings changed before it finished"
+        return "run", _UNFINISHED
     gone = artifact.missing(folder)
     if gone:
         return "run", f"output {gone} is gone or has another size"

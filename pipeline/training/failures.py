@@ -10,7 +10,7 @@ import faulthandler
 import math
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -141,8 +141,11 @@ class ShardWatch:
             raise JointError(self._say(int(number)))
 
     def explain(self, error: Exception) -> Exception:
-        """Return `error`, or the error of a changed shard where this process finds one."""
-        number = self._changed(0, 1)
+        """Return `error`, or the error of a changed shard where this process finds one that `error`, which
+        not all processes have found together, may come from.
+        """
+        joint = isinstance(error, (JointError, NotFiniteError, TeamError))
+        number = None if joint else self._changed(0, 1)
         return error if number is None else UserError(self._say(number))
 
     def _changed(self, first: int, every: int) -> int | None:
@@ -173,10 +176,14 @@ class StallTimer:
         with ExitStack() as stack:
             with optional(str(self.path), self.console):
                 self._file = stack.enter_context(open_own(self.path, "w"))
-                stack.callback(self.path.unlink, missing_ok=True)
+                stack.callback(self._remove)
             stack.callback(faulthandler.cancel_dump_traceback_later)
             self.progress()
             yield
+
+    def _remove(self) -> None:
+        with suppress(OSError):  # the folder may have become one that nobody writes to
+            self.path.unlink(missing_ok=True)
 
     def progress(self) -> None:
         """A step, a validation batch or a checkpoint is done."""

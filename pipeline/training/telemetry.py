@@ -28,7 +28,7 @@ from motionloom.datasets.base.progress import Pace, bar
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
-from motionloom.pipeline.contract.stage import GENERATOR, StageContext, stage_kind
+from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.store.files import open_own
 from motionloom.pipeline.store.run_folder import owner_of
 from motionloom.pipeline.store.training_log import FLIGHT, SAMPLES, optional, read_rows
@@ -294,10 +294,9 @@ _PROGRAM = "motionloom.pipeline.runs.samples"
 class SampleProcess:
     """Starts processes that draw samples, one at a time; the training does not wait for them."""
 
-    def __init__(self, context: StageContext, kind: str, every: int) -> None:
-        """`every` is in steps; 0, or a kind that makes no motion, draws nothing."""
-        makes = every and GENERATOR in stage_kind(kind, context.name).gives(context.config)
-        self.context, self.every = context, every if makes else 0
+    def __init__(self, context: StageContext, every: int) -> None:
+        """`every` is in steps; 0, or a stage that makes no motion, draws nothing."""
+        self.context, self.every = context, every if context.draws else 0
         self._process: subprocess.Popen[bytes] | None = None
         self._failed = False
 

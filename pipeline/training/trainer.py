@@ -131,7 +131,7 @@ class Training:
             self._load(read_checkpoint(resume))
         self.writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)
         sample_every = -(-config.sample_every // self.every) * self.every
-        self.samples = SampleProcess(context, str(module.hparams.get("kind")), sample_every)
+        self.samples = SampleProcess(context, sample_every)
         self._saved, self._writing = module.step if resume else -1, False
         self.telemetry = Telemetry(context.folder, module, config.batch_size, console, at_peak)
         self.failures = FailureGuard(name, module)
@@ -328,8 +328,10 @@ class Training:
                 f"({str(error).splitlines()[-1].strip()}); give the settings that it began with, or begin "
                 f"anew with --from {name}"
             ) from None
-        if self.average is not None and state["average"] is not None:
-            self.average.load_state_dict(state["average"])
+        if self.config.ema:  # a training that goes on with an average begins it with its own weights
+            self.average = AveragedWeights(module.net, self.config.ema)
+            if state["average"] is not None:
+                self.average.load_state_dict(state["average"])
         self.log.load_state_dict(state["log"])
         load_row(module, state["row"])
         self.validation_is_due = state["validate"]

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from motionloom.models.quantize.base import QuantizerConfig, draw_rows
 from motionloom.models.quantize.ema import EmaQuantizer, ResidualQuantizer
+from motionloom.models.training import distributed
+from motionloom.models.training.stage_module import Batch, OptimConfig, StageModule
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +86,30 @@ def test_golden_after_their_initialisation_and_outside_resets(golden: dict[str, 
     same = (quantizer.codebook[reset][:, None] == batch).all(-1)
     assert (same.sum(1) == 1).all()  # each is one row of the batch,
     assert same.sum(0).max() == 1  # and all of them different ones
+
+
+def test_a_first_step_that_is_repeated_initialises_again() -> None:
+    """As where no CUDA graph of it could be made: its buffers are put back, and what mirrors them."""
+    quantizer = EmaQuantizer(QuantizerConfig(num_codes=16, dim=4))
+
+    class Bare(StageModule):
+        def losses(self, batch: Batch) -> dict[str, Tensor]:
+            return {"loss": self.net(batch["z"]).penalty}
+
+    module = Bare(quantizer, OptimConfig(), seed=0, max_steps=1)
+    restore, z = module.saved_state(), torch.randn(4, 10, 4)
+    first = quantizer(z).codes
+    restore()
+    assert not quantizer.initialised
+    assert torch.equal(quantizer(z).codes, first) and quantizer.initialised
+
+
+def test_means_of_fewer_values_than_ranks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """3 of 16 rows count, one of them on this one of 8 ranks: its share is 8 thirds of its value."""
+    monkeypatch.setattr(distributed, "world_size", lambda: 8)
+    monkeypatch.setattr(distributed, "sum_over_ranks", lambda _: torch.tensor(3.0))
+    share = distributed.masked_mean(torch.tensor([1.5, 9.0]), torch.tensor([True, False]))
+    assert float(share) == pytest.approx(1.5 * 8 / 3)
 
 
 def test_first_batch_initialises_with_its_own_distinct_rows() -> None:

@@ -25,7 +25,7 @@ from watched_training import Jobs, end_of, is_gone, pid_of, until, wait_for_step
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.launch.process import process_rank, srun_tasks
+from motionloom.pipeline.launch.process import LOST, TeamError, process_rank, srun_tasks
 from motionloom.pipeline.launch.team import Team, environment
 from motionloom.pipeline.runs.api import run_recipe
 
@@ -122,8 +122,10 @@ def test_a_script_or_a_shell_inside_a_job_is_one_process(srun: Srun, monkeypatch
         Team.start(cpu(1, nodes=2))
     monkeypatch.delenv("SLURM_PROCID")  # a shell of salloc
     assert Team.start(cpu()).world == 1
+    assert TeamError("one has gone").exit_code == LOST
     monkeypatch.setenv("LOCAL_RANK", "1")  # started by Lightning's own launcher
     assert process_rank() == 1
+    assert TeamError("one has gone").exit_code == 0, "the launcher kills the lead where one ends otherwise"
 
 
 def test_a_checkpoint_of_lightnings_requeueing_is_not_taken_up(

@@ -48,9 +48,7 @@ def run_duel(context: StageContext) -> None:
         context,
         duel,
         config.train,
-        lambda batch, rank, world: Vectors(
-            batch, rank, world, dies_at=dies_at, parts=config.train.accumulate
-        ),
+        lambda *place: Vectors(*place, dies_at=dies_at),
         lambda: Vectors(4, size=1),
     )
     torch.save(duel.state_dict(), context.folder / "model.pt")
@@ -206,6 +204,18 @@ def test_what_cannot_go_on_says_why(overrides: list[str], go_on: str, says: str,
     dies(tmp_path, 8)
     with pytest.raises(UserError, match=says):
         make_plan(recipe(tmp_path, *overrides), tmp_path / "run", go_on=[go_on])
+
+
+def test_an_average_begins_or_ends_where_it_is_asked_for(tmp_path: Path) -> None:
+    """It begins with the weights that are there, which a validation before the next step already takes."""
+    dies(tmp_path, 8)
+    go(tmp_path, "duel.train.ema=0.9", "duel.train.steps=7", go_on=["duel"])
+    folder = tmp_path / "run/stages/duel/checkpoints"
+    state = read_checkpoint(folder / name_of(7))
+    assert state["average"] is not None and state["average"]["n_averaged"] == 1
+    go(tmp_path, "duel.train.ema=null", "duel.train.steps=9", go_on=["duel"])
+    assert read_checkpoint(folder / name_of(9))["average"] is None
+    assert (7, "train.ema", 0.9, None) in changes(tmp_path)
 
 
 def test_another_network_in_the_checkpoint_is_named(tmp_path: Path) -> None:

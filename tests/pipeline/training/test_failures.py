@@ -23,6 +23,7 @@ from motionloom.datasets.shards.checksums import LocalShard
 from motionloom.models.training.stage_module import Batch, StepFigures
 from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.launch.process import JointError
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.continuation import newest_step
 from motionloom.pipeline.runs.recipe import load_recipe
@@ -31,7 +32,13 @@ from motionloom.pipeline.store.training_log import rise_of_loss
 from motionloom.pipeline.training import trainer
 from motionloom.pipeline.training.config import TrainedStageConfig
 from motionloom.pipeline.training.execution import Execution, deterministic
-from motionloom.pipeline.training.failures import Failure, NotFiniteError, first_failure
+from motionloom.pipeline.training.failures import (
+    Failure,
+    NotFiniteError,
+    ShardWatch,
+    StallTimer,
+    first_failure,
+)
 
 FAILS = 13
 """Number of the batch: of step 14, between the checkpoints of steps 10 and 15."""
@@ -80,6 +87,22 @@ def test_a_shard_that_changes_ends_the_training_before_its_next_checkpoint(
         with pytest.raises(UserError, match=str(shards[1])):
             run_recipe(recipe, run, overrides=sets, console=Console(quiet=True))
         assert newest_step(run / "stages/toy") == 10
+    # What all processes have found is said by the lead alone: it stays what it is.
+    found, watch = JointError("found by all"), ShardWatch([data])
+    shards[0].write_text("longer")
+    assert watch.explain(found) is found and isinstance(watch.explain(OSError()), UserError)
+
+
+def test_a_log_folder_that_turns_read_only_ends_no_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, **_: object) -> None:
+        raise PermissionError(30, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    path = tmp_path / "stalled_rank_0.txt"
+    with StallTimer(path, 60, Console(quiet=True)).running():
+        assert path.exists()
 
 
 def test_a_loss_that_rises_a_thousand_times_is_said() -> None:
