@@ -46,6 +46,8 @@ class Every:
 
     name: str
     gives: str
+    needed: bool = False
+    """Whether the stage is of no use without one."""
     optional: ClassVar[bool] = True
 
     def key(self, stage: str) -> str:

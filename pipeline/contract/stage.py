@@ -171,6 +171,8 @@ class StageContext:
     again: Path | None = None
     """The run, where a stage is run outside of it, finished or not (`motionloom report`); then inputs may be
     missing, and times may be shown. Within a run equal stages give equal outputs."""
+    draws: bool = False
+    """Whether motions can be drawn while it trains."""
 
     @property
     def units(self) -> Units:

@@ -13,7 +13,14 @@ from motionloom.datasets.base.files import remove_temporaries, write_text
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
-from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache, StageContext, StageKind
+from motionloom.pipeline.contract.stage import (
+    GENERATOR,
+    CompletedStage,
+    Stage,
+    StageCache,
+    StageContext,
+    StageKind,
+)
 from motionloom.pipeline.launch.console import say
 from motionloom.pipeline.launch.process import process_rank
 from motionloom.pipeline.launch.team import Team
@@ -140,7 +147,20 @@ def context_of(
         stage_cache=StageCache(recipe.hardware.device()) if stage_cache is None else stage_cache,
         rank=team.rank,
         world=team.world,
+        draws=_draws(recipe, stage),
     )
+
+
+def _draws(recipe: Recipe, stage: Stage) -> bool:
+    """Whether a stage generates, or is the last input of one that trains nothing and does (UDE's DMD)."""
+    before = {one.name for one in recipe.stages[: recipe.stages.index(stage) + 1]} | recipe.outside.keys()
+    for one in recipe.stages:
+        last = (
+            not one.kind.trains and stage.name in one.inputs.values() and before >= set(one.inputs.values())
+        )
+        if GENERATOR in one.kind.gives(one.config) and (one is stage or last):
+            return True
+    return False
 
 
 def stage_inputs(recipe: Recipe, run: Path, stage: Stage) -> dict[str, CompletedStage]:

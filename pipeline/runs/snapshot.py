@@ -8,7 +8,7 @@ the run are inputs from outside. So every command takes it as any other run, als
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Set
+from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +30,7 @@ from motionloom.pipeline.contract.stage import (
     StageContext,
 )
 from motionloom.pipeline.launch.console import make_console, say
+from motionloom.pipeline.runs.continuation import Started
 from motionloom.pipeline.runs.plan import terms_of
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.artifact import Artifact, InputStage
@@ -65,10 +66,14 @@ def run_at(run: P, at: str | None, what: str = GENERATOR) -> Iterator[P]:
     recipe, finished = load_recipe(folder / "recipe.yaml"), finished_stages(folder)
     chosen = _chosen(folder, recipe, finished, at, what)
     if not chosen:
-        yield run  # all trainings are finished
+        yield run  # all trainings that have begun are finished
         return
     with TemporaryDirectory(prefix="motionloom-") as temporary:
-        yield type(run)(_write(Path(temporary), folder, recipe, finished, chosen))
+        made = _write(Path(temporary), folder, recipe, finished, chosen)
+        try:
+            yield type(run)(made)
+        except UserError as error:  # who reads it finds the run, and no folder that is gone
+            raise UserError(str(error).replace(str(made), str(folder))) from error
 
 
 def _chosen(
@@ -93,7 +98,7 @@ def _chosen(
     else:
         having = {name: int(when) for name, own in steps.items() if when in map(str, own)}
     if not having:
-        if at == NEWEST and all(stage.name in finished for stage in recipe.stages if stage.kind.trains):
+        if at == NEWEST and any(stage.name in finished for stage in recipe.stages if stage.kind.trains):
             return {}
         listed = "; ".join(f"{name}: {', '.join(map(str, own))}" for name, own in steps.items())
         raise UserError(f"{run}: no such checkpoint for --at {at}; there is {listed or 'none yet'}")
@@ -129,11 +134,14 @@ def _write(
         elif stage.name in finished and not lacking and outside.keys() >= set(given.values()):
             names[stage.name] = str(finished[stage.name].folder.resolve())
             outside[names[stage.name]] = finished[stage.name]
-        elif not stage.kind.trains and _remains(stage, lacking):
+        elif not stage.kind.trains and _remains(stage, given, lacking):
             # The first generator is the default: one of a checkpoint comes before finished ones.
             given = dict(sorted(given.items(), key=lambda item: item[1] in outside))
             own.append(replace(stage, inputs=given))
             names[stage.name] = stage.name
+        elif not stage.kind.trains and _gives(stage, GENERATOR, CAPTIONER):
+            needed = ", ".join(sorted(stage.inputs[role] for role in lacking))
+            say(aside, f"without {stage.name}: there is no checkpoint yet of {needed}", "yellow")
     name = f"{recipe.name}-{label}"
     new = replace(recipe, name=name, stages=tuple(own), outside=outside)
     write_text(folder / "recipe.yaml", new.to_yaml(folder))
@@ -149,13 +157,15 @@ def _write(
     return folder
 
 
-def _remains(stage: Stage, lacking: Set[str]) -> bool:
+def _remains(stage: Stage, given: Iterable[str], lacking: Set[str]) -> bool:
     """Whether a stage that trains nothing is of use: a generator with all inputs, or one that reads any."""
     if _gives(stage, GENERATOR, CAPTIONER):
         return not lacking
     roles = stage.kind.roles()
     required = {role.name for role in roles if not role.optional}
-    return any(isinstance(role, Every) for role in roles) and not lacking & required
+    every = [role for role in roles if isinstance(role, Every)]
+    there = {key.partition(".")[0] for key in given}
+    return bool(every) and not lacking & required and {role.name for role in every if role.needed} <= there
 
 
 def _take(
@@ -192,7 +202,7 @@ def _take(
     places = {role: str(stage.folder.resolve()) for role, stage in given.items()}
     outside.update(zip(places.values(), given.values(), strict=True))
     stage, done = Stage(name, kind, config, places), content["global_step"]
-    _finish(stage, folder, outside, seed, done)
+    _finish(stage, folder, outside, seed, done, Started.find(source))
     averaged = "" if content["average"] is None else ", averaged weights"
     say(aside, f"{name} at step {done:,} of {content['steps']:,}{averaged}")
     return stage
@@ -214,9 +224,15 @@ def _read(folder: Path, step: int) -> tuple[Path, Checkpoint]:
 
 
 def _finish(
-    stage: Stage, folder: Path, outside: Mapping[str, CompletedStage], seed: int, step: int | None = None
+    stage: Stage,
+    folder: Path,
+    outside: Mapping[str, CompletedStage],
+    seed: int,
+    step: int | None = None,
+    started: Started | None = None,
 ) -> None:
-    """Write the artifact of a stage of the new run."""
+    """Write the artifact of a stage of the new run; of a training, with what had changed by its `step`."""
+    changed = tuple(change for change in started.changed if change.step < (step or 0)) if started else ()
     inputs = {}
     for role, name in stage.inputs.items():
         place = outside[name].folder if name in outside else stage_folder(folder, name)
@@ -229,6 +245,7 @@ def _finish(
         kind=stage.kind.name,
         version=stage.kind.version,
         fingerprint=fingerprint_of([config, seed, step, made_of]),
+        changed=changed,
         seed=seed,
         config=config,
         step=step,

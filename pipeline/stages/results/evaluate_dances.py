@@ -80,7 +80,7 @@ class EvaluateDancesStage(EvaluationStage):
     name = "evaluate_dances"
     summary = "figures of dances to held-out music"
     config = EvaluateDancesConfig
-    takes = ("data", Every("generators", GENERATOR))
+    takes = ("data", Every("generators", GENERATOR, needed=True))
 
     def evaluation(self, context: StageContext) -> _DanceEvaluation:
         return _DanceEvaluation(context)

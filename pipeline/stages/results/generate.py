@@ -53,7 +53,7 @@ class GenerateStage(StageKind):
     summary = "motions from captions and music"
     config = GenerateConfig
     offers = frozenset({"motions"})
-    takes = ("data", Every("generators", GENERATOR))
+    takes = ("data", Every("generators", GENERATOR, needed=True))
     version = 8  # notes where the clips state their truth
 
     def modules(self, config: GenerateConfig) -> Iterable[str]:

@@ -23,6 +23,8 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import StageCache, StageContext, stage_kind
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.launch.hardware import Hardware
+from motionloom.pipeline.runs.execute import _draws
+from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.samples import draw_samples
 from motionloom.pipeline.runs.snapshot import run_at
 from motionloom.pipeline.store.artifact import Artifact
@@ -85,9 +87,19 @@ def test_a_generator_of_several_trainings(ude_run: Any, tmp_path: Path, call: An
     done = call("evaluate", run, "--at", "newest", "--clips", 2)
     assert done.code == 0, done.err
     assert (run / "at/run-dmd-8/evaluate/metrics.json").is_file()
+    # Before the last of them has a checkpoint nothing dances, and the rest is measured.
+    shutil.rmtree(cut(run, tmp_path / "early", "utt") / "stages/dmd/checkpoints")
+    early = tmp_path / "early"
+    done = call("generate", early, "a person waves", "--at", "newest", "-o", tmp_path / "made")
+    assert done.code == 2 and f"error: {early}: no finished stage" in done.err and "dmd" in done.err
+    done = call("evaluate", early, "--at", "newest", "--clips", 2)
+    assert done.code == 0, done.err
 
 
 def test_every_command(begun: Path, small_run: Any, tmp_path: Path, call: Callable[..., Any]) -> None:
+    note = begun / "stages/gpt/started.json"
+    changed = [{"step": step, "key": "optim.lr", "old": 1, "new": 2} for step in (12, 24)]
+    note.write_text(json.dumps({**json.loads(note.read_text()), "changed": changed}))
     before = sorted(begun.rglob("*"))
     for command in (("generate", begun, "a person waves"), ("evaluate", begun)):
         assert (done := call(*command)).code == 2 and "--at newest" in done.err
@@ -98,6 +110,7 @@ def test_every_command(begun: Path, small_run: Any, tmp_path: Path, call: Callab
     assert "gpt at step 24 of 30" in call("export", begun, "--at", "gpt:24", "-o", tmp_path / "model").err
     artifact = Artifact.find(tmp_path / "model/gpt")
     assert artifact is not None and artifact.step == 24
+    assert [change.step for change in artifact.changed] == [12], "those of later steps are not in it"
     assert before == sorted(begun.rglob("*"))
     with run_at(small_run.folder, "24") as folder:  # of a training that is finished
         assert_same(drawn(tmp_path / "model"), drawn(folder))
@@ -121,7 +134,9 @@ def test_what_a_training_was_not_made_from_is_refused(begun: Path, tmp_path: Pat
         pass
     shutil.rmtree(run / "stages/gpt/checkpoints")
     shutil.rmtree(run / "stages/face_gpt/checkpoints")
-    with pytest.raises(UserError, match="--at newest"), run_at(run, "newest"):
+    with run_at(run, "newest") as folder:
+        assert folder == run, "all that has begun is finished"
+    with pytest.raises(UserError, match="--at 7"), run_at(run, "7"):
         pass
 
 
@@ -160,13 +175,22 @@ def test_samples_of_dances(ude_run: Any, tmp_path: Path) -> None:
     assert out.name == "step=00000012" and list(out.glob("*.npz"))
 
 
+def test_trainings_that_motions_are_drawn_of() -> None:
+    """Of UDE the last one: `ude`, which generates, trains nothing."""
+    for name, wanted in (("humantomato-tiny", {"gpt", "face_gpt"}), ("ude-tiny", {"dmd"})):
+        recipe = load_recipe(name)
+        assert {one.name for one in recipe.stages if one.kind.trains and _draws(recipe, one)} == wanted
+
+
 def test_a_drawing_that_fails_is_one_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(telemetry, "_PROGRAM", "motionloom.no_such_module")
     console = Console(file=io.StringIO(), width=200)
-    for name in ("gpt", "tma"):
+    for name, draws in (("gpt", True), ("tma", False)):
         folder, kind = tmp_path / "stages" / name, stage_kind(name, "")
-        context = StageContext(name, "", kind.config(), folder, {}, 0, Hardware(), console, StageCache())
-        process = telemetry.SampleProcess(context, name, 2)
+        context = StageContext(
+            name, "", kind.config(), folder, {}, 0, Hardware(), console, StageCache(), draws=draws
+        )
+        process = telemetry.SampleProcess(context, 2)
         for step in range(1, 9):
             process.saved(step)
             if process._process is not None:
