@@ -29,6 +29,7 @@ from motionloom.pipeline.contract.stage import (
     StageCache,
     StageContext,
 )
+from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.runs.continuation import Started
 from motionloom.pipeline.runs.plan import terms_of
@@ -62,6 +63,8 @@ def run_at(run: P, at: str | None, what: str = GENERATOR) -> Iterator[P]:
         yield run
         return
     folder = Path(run)
+    if not folder.exists() and str(run) in shipped_models():
+        raise UserError(f"--at {at}: {run} comes with the package and is finished; leave --at out")
     require_run(folder)
     recipe, finished = load_recipe(folder / "recipe.yaml"), finished_stages(folder)
     chosen = _chosen(folder, recipe, finished, at, what)

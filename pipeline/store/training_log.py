@@ -28,7 +28,8 @@ def optional(what: str, console: Console) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}".partition("\n")[0].rstrip(": ")
+        cause = str(error) or error.__cause__ or error.__context__ or ""
+        reason = f"{type(error).__name__}: {cause}".partition("\n")[0].rstrip(": ")
         console.print(f"[yellow]    {escape(f'{what} is left out: {reason}')}[/]", soft_wrap=True)
 
 

@@ -116,8 +116,16 @@ class TrainedStageConfig(StageConfig):
 
     def doubts(self) -> list[str]:
         """Return a warning for each setting that probably does not do what is meant."""
-        found = optimizers_of(self)
-        return [f"{key}.{doubt}" for key, optim in found for doubt in optim.doubts(self.train.steps)]
+        found, steps, loss = optimizers_of(self), self.train.steps, getattr(self, "loss", None)
+        begins = {key: getattr(loss, key, 0) for key in ("align_from", "adversarial_start")}
+        return [
+            *(f"{key}.{doubt}" for key, optim in found for doubt in optim.doubts(steps)),
+            *(
+                f"loss.{key} {step:,} is no step of this training, which has {steps:,}: it never begins"
+                for key, step in begins.items()
+                if step >= steps
+            ),
+        ]
 
     def _require_shardable(self) -> None:
         if not self.shardable:

@@ -122,6 +122,14 @@ def test_what_will_hardly_do_what_is_meant_is_said(tmp_path: Path) -> None:
     recipe = load_recipe(path, sets)
     (doubt,) = doubts(recipe, run, recipe.stages)
     assert doubt.startswith("tokenizer: optim.warmup_steps 8 ") and " 7 steps" in doubt
+    for name, stage, key in (
+        ("humantomato-tiny", "gpt", "loss.align_from"),
+        ("ude-tiny", "utt", "loss.adversarial_start"),
+    ):
+        for step in (59, 60):
+            short = load_recipe(name, [f"{stage}.{key}={step}", f"{stage}.train.steps=60"])
+            found = [one for one in doubts(short, run, short.stages) if f"{stage}: {key} 60 " in one]
+            assert len(found) == step - 59
     run_recipe(path, run, select=Selection(until="data"), console=Console(quiet=True))
     clips = Data(run / "stages/data").clips("train")
     said = Console(record=True, width=300)

@@ -138,6 +138,8 @@ def test_what_a_training_was_not_made_from_is_refused(begun: Path, tmp_path: Pat
         assert folder == run, "all that has begun is finished"
     with pytest.raises(UserError, match="--at 7"), run_at(run, "7"):
         pass
+    with pytest.raises(UserError, match=r"synthetic .*leave --at out"), run_at("synthetic", "newest"):
+        pass
 
 
 def test_while_it_trains(small_run: Any, start: Callable[..., Any], tmp_path: Path, call: Any) -> None:
