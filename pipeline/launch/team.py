@@ -8,6 +8,7 @@ Lightning's launcher (which repeats the command) or from torchrun or SLURM.
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
@@ -31,6 +32,11 @@ _PATIENCE = timedelta(days=30)
 _COLLECTIVE = 1800
 """Seconds for which a process waits for the others, at least. A training that stalls ends itself earlier,
 after `hardware.stall_seconds` without a step; this ends what waits for a process that cannot do so."""
+
+
+_GRACE = 60
+"""Seconds between two looks of Lightning's observer, which kills the lead where another process has died. A
+lead that can end by itself finishes the checkpoint that it writes and says what happened before that."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,7 @@ class Team:
         )
         fabric.launch()
         started.extend(getattr(fabric.strategy.launcher, "procs", ()))
+        give_time()
         return Team(fabric.global_rank, fabric.world_size, _patient_group())
 
     @property
@@ -88,6 +95,13 @@ class Team:
         except RuntimeError:
             raise TeamError.lost() from None
         return values
+
+
+def give_time() -> None:
+    """Have Lightning's observer of other processes look every `_GRACE` seconds."""
+    for thread in threading.enumerate():
+        if thread.name == "child-process-observer":
+            thread._sleep_period = _GRACE  # type: ignore[attr-defined]
 
 
 def lead_finds(find: Callable[[], Found]) -> Found:

@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -20,13 +21,14 @@ import pytest
 import torch
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.fabric.plugins.environments.slurm import SLURMEnvironment
+from lightning.fabric.strategies.launchers import subprocess_script
 from rich.console import Console
 from watched_training import Jobs, end_of, is_gone, pid_of, until, wait_for_step
 
 from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import LOST, TeamError, process_rank, srun_tasks
-from motionloom.pipeline.launch.team import Team, environment
+from motionloom.pipeline.launch.team import Team, environment, give_time
 from motionloom.pipeline.runs.api import run_recipe
 
 RECIPE = """
@@ -82,6 +84,16 @@ def srun(monkeypatch: pytest.MonkeyPatch) -> Srun:
 
 def cpu(devices: int = 0, nodes: int = 1) -> Hardware:
     return Hardware(accelerator="cpu", devices=devices, nodes=nodes)
+
+
+def test_the_lead_has_time_to_finish_its_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lightning's observer kills it else within five seconds of another process's end."""
+    kept: list[Any] = []
+    monkeypatch.setattr(threading.Thread, "start", lambda self: kept.append(self))
+    subprocess_script._launch_process_observer([])
+    monkeypatch.setattr(threading, "enumerate", lambda: kept)
+    give_time()
+    assert [one._sleep_period for one in kept] == [60]
 
 
 @pytest.mark.parametrize("rank", [0, 1])
