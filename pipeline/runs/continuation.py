@@ -62,7 +62,7 @@ class Continuation:
     step: int
     """Step of its newest checkpoint."""
     differs: str
-    """What has changed, in words."""
+    """The changes, in words."""
     reason: str
     changed: tuple[Change, ...]
     knowingly: bool

@@ -147,11 +147,11 @@ def context_of(
         stage_cache=StageCache(recipe.hardware.device()) if stage_cache is None else stage_cache,
         rank=team.rank,
         world=team.world,
-        draws=_draws(recipe, stage),
+        draws=draws_motions(recipe, stage),
     )
 
 
-def _draws(recipe: Recipe, stage: Stage) -> bool:
+def draws_motions(recipe: Recipe, stage: Stage) -> bool:
     """Whether a stage generates, or is the last input of one that trains nothing and does (UDE's DMD)."""
     before = {one.name for one in recipe.stages[: recipe.stages.index(stage) + 1]} | recipe.outside.keys()
     for one in recipe.stages:

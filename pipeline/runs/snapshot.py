@@ -75,7 +75,10 @@ def run_at(run: P, at: str | None, what: str = GENERATOR) -> Iterator[P]:
         made = _write(Path(temporary), folder, recipe, finished, chosen)
         try:
             yield type(run)(made)
-        except UserError as error:  # who reads it finds the run, and no folder that is gone
+        except UserError as error:
+            if str(made) not in str(error):
+                raise
+            # Who reads it finds the run, and no folder that is gone.
             raise UserError(str(error).replace(str(made), str(folder))) from error
 
 

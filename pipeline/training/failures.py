@@ -31,7 +31,7 @@ from motionloom.pipeline.store.training_log import optional
 from motionloom.pipeline.training.telemetry import all_ranks
 
 
-class NotFiniteError(UserError):
+class NotFiniteError(JointError):
     """A loss or a gradient is not finite."""
 
 
@@ -91,7 +91,7 @@ class FailureGuard:
         self.name, self.module = name, module
 
     def check(self) -> None:
-        """Collective: raise `NotFiniteError` in the lead and `TeamError` elsewhere if any rank has failed."""
+        """Collective: raise `NotFiniteError` if any rank has failed."""
         # The rank that failed first is the cause: the others got its gradient.
         failure = first_failure(self.module)
         orders = all_ranks([math.inf if failure is None else failure.order], self.module.device)[
@@ -109,9 +109,7 @@ class FailureGuard:
             ]
         if world_size() > 1:
             dist.broadcast_object_list(text, src=first)
-        if rank() == 0:
-            raise NotFiniteError(text[0])
-        raise TeamError(text[0])
+        raise NotFiniteError(text[0])
 
     def due(self, step: int) -> bool:
         """Whether to check after a step: reading a figure waits for a GPU, and ranks for each other."""
@@ -144,8 +142,7 @@ class ShardWatch:
         """Return `error`, or the error of a changed shard where this process finds one that `error`, which
         not all processes have found together, may come from.
         """
-        joint = isinstance(error, (JointError, NotFiniteError, TeamError))
-        number = None if joint else self._changed(0, 1)
+        number = None if isinstance(error, (JointError, TeamError)) else self._changed(0, 1)
         return error if number is None else UserError(self._say(number))
 
     def _changed(self, first: int, every: int) -> int | None:

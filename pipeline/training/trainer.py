@@ -328,10 +328,11 @@ class Training:
                 f"({str(error).splitlines()[-1].strip()}); give the settings that it began with, or begin "
                 f"anew with --from {name}"
             ) from None
-        if self.config.ema:  # a training that goes on with an average begins it with its own weights
+        average = state["average"]
+        if self.config.ema and average is None:  # it begins now, with these weights
             self.average = AveragedWeights(module.net, self.config.ema)
-            if state["average"] is not None:
-                self.average.load_state_dict(state["average"])
+        elif self.average is not None and average is not None:
+            self.average.load_state_dict(average)
         self.log.load_state_dict(state["log"])
         load_row(module, state["row"])
         self.validation_is_due = state["validate"]

@@ -207,7 +207,7 @@ def test_what_cannot_go_on_says_why(overrides: list[str], go_on: str, says: str,
 
 
 def test_an_average_begins_or_ends_where_it_is_asked_for(tmp_path: Path) -> None:
-    """It begins with the weights that are there, which a validation before the next step already takes."""
+    """`--go-on` takes both; a checkpoint holds one where there is one."""
     dies(tmp_path, 8)
     go(tmp_path, "duel.train.ema=0.9", "duel.train.steps=7", go_on=["duel"])
     folder = tmp_path / "run/stages/duel/checkpoints"

@@ -23,7 +23,7 @@ from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import StageCache, StageContext, stage_kind
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.runs.execute import _draws
+from motionloom.pipeline.runs.execute import draws_motions
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.samples import draw_samples
 from motionloom.pipeline.runs.snapshot import run_at
@@ -178,10 +178,10 @@ def test_samples_of_dances(ude_run: Any, tmp_path: Path) -> None:
 
 
 def test_trainings_that_motions_are_drawn_of() -> None:
-    """Of UDE the last one: `ude`, which generates, trains nothing."""
+    """UDE's last one, since `ude`, which generates, trains nothing."""
     for name, wanted in (("humantomato-tiny", {"gpt", "face_gpt"}), ("ude-tiny", {"dmd"})):
         recipe = load_recipe(name)
-        assert {one.name for one in recipe.stages if one.kind.trains and _draws(recipe, one)} == wanted
+        assert {one.name for one in recipe.stages if one.kind.trains and draws_motions(recipe, one)} == wanted
 
 
 def test_a_drawing_that_fails_is_one_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
