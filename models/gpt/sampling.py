@@ -67,27 +67,24 @@ class Drawing:
 
     def __call__(self, logits: Tensor, uniform: Tensor) -> Tensor:
         """Tokens int64 [B] from logits [B, V] and uniform float64 [B]."""
-        best = logits.argmax(-1)
         if self.temperature == 0:
-            return best
-        scaled = filter_logits(logits.double() / self.temperature, top_k=self.top_k, top_p=self.top_p)
-        # In whole numbers, which a GPU adds up to the same sums every time.
-        mass = (scaled.softmax(-1) * 2**53).long().cumsum(-1)
-        at = torch.searchsorted(mass, (uniform[:, None] * mass[:, -1:]).long(), right=True)[:, 0]
-        # Rounding can push the last number onto the total; there is no token after it.
-        return torch.where(at < logits.shape[-1], at, best)
+            return logits.argmax(-1)
+        scaled = logits.double() if self.temperature == 1 else logits.double() / self.temperature
+        scaled = filter_logits(scaled, top_k=self.top_k, top_p=self.top_p)
+        # In whole numbers, which a GPU adds up to the same sums every time. Of 2^52, so that no uniform
+        # number, a multiple of 2^-53 below 1, is rounded up to the whole sum: no token begins there.
+        mass = (scaled.softmax(-1) * 2**52).long().cumsum(-1)
+        return torch.searchsorted(mass, (uniform[:, None] * mass[:, -1:]).long(), right=True)[:, 0]
 
 
-def guide(logits: Tensor, legal: Tensor, scale: Tensor) -> Tensor:
-    """Guided logits [B, V] of the conditional and the unconditional half [2B, V]; -inf where not `legal`
-    [B, V].
+def guide(logits: Tensor, scale: Tensor) -> Tensor:
+    """Guided logits [B, V] of the conditional and the unconditional half [2B, V].
 
     `scale` is each row's strength [B]; a row of 1 is as without guidance, to the bit.
     """
     on, off = logits.chunk(2)
     strength = scale.to(logits.dtype)[:, None]
-    mixed = torch.where(strength == 1, on, off + strength * (on - off))
-    return torch.where(legal, mixed, -torch.inf)
+    return torch.where(strength == 1, on, off + strength * (on - off))
 
 
 def filter_logits(logits: Tensor, *, top_k: int | None = None, top_p: float = 1.0) -> Tensor:
@@ -143,11 +140,13 @@ def requested_groups(
 
 
 class Rows:
-    """Rows of tokens that are being drawn. All that a step reads and writes stays in the same tensors.
+    """Rows of tokens that are being drawn. All that a step reads and writes stays in the same tensors; what
+    follows from a token's number is looked up, since a GPU takes as long for a number as for a thousand.
 
     Args:
         start: Tokens [B, M * P] of `before` [B] groups a row; the others are drawn.
         limit: New groups at which each row must stop, int64 [B].
+        first: Read before token 0 [B, 1, D], of guidance [2B, 1, D]; None where the caller embeds tokens.
         uniform: Draws float64 [B, most new tokens] in [0, 1).
         free: Whether rows may draw End before their limit.
         scale: Each row's guidance [B]; None without.
@@ -160,79 +159,87 @@ class Rows:
         before: Tensor,
         limit: Tensor,
         *,
+        first: Tensor | None = None,
         uniform: Tensor,
         free: bool,
         how: Drawing,
         scale: Tensor | None,
     ) -> None:
-        self.network, self.free, self.how = network, free, how
-        batch, size = len(limit), len(network.pattern)
+        self.how, self.size = how, len(network.pattern)
         self.first, self.last = 0, 0
-        if batch:
-            self.first, self.last = int(before.min()) * size, int((before + limit).max()) * size
+        if len(limit):
+            self.first, self.last = int(before.min()) * self.size, int((before + limit).max()) * self.size
         self.at = torch.full((1,), self.first, device=limit.device)
         """Number of the token to draw, int64 [1]."""
         self.tokens = functional.pad(start, (0, max(0, self.last - start.shape[1])))
-        self.before, self.limit, self.uniform, self.scale = before, limit, uniform, scale
-        self.counts, self.ended = torch.zeros_like(limit), torch.zeros_like(limit, dtype=torch.bool)
+        """int64 [B, N * P]; behind a row's End or limit they mean nothing."""
+        self.before, self.limit, self.scale = before, limit, scale
+        number = torch.arange(self.tokens.shape[1], device=limit.device)
+        group, slot = number // self.size, number % self.size
+        self.new = group >= before[:, None]
+        # Draws count from a row's first new token, whatever it starts from.
+        index = (number - before[:, None] * self.size).clamp(0, max(0, uniform.shape[1] - 1))
+        self.draws = uniform.gather(1, index)
+        self.kinds, self.end = network.slots[slot], network.ends[network.slots[0]]
+        # A motion is never empty, so its first group cannot be End.
+        may_end = (slot == 0) & (group > before[:, None]) & free
+        self.rules = self.kinds * 2 + may_end
+        """Row of `illegal` for each token, int64 [B, N * P]."""
+        self.illegal = network.illegal()
+        self.weight, self.bias = network.joint_heads()
+        self.x = self.embeddings = None
+        if first is not None:
+            self.embeddings = network.joint_embeddings()
+            self.x = first.to(self.embeddings.dtype, copy=True)
+            """What the network reads next, of `first`'s shape."""
 
     def draw(self, hidden: Tensor) -> None:
         """Draw token number `at` of each row by the network's output there [B, 1, D], of guidance [2B, 1, D].
 
         Nothing here waits for the device, and no shape depends on what lies there.
         """
-        network, scale, size = self.network, self.scale, len(self.network.pattern)
-        group, slot = self.at // size, self.at % size
-        opens, new = slot == 0, group >= self.before
-        # Rows that only read their start are not alive yet, and those behind their End not any more.
-        alive = new & (group < self.before + self.limit) & ~self.ended
-        no = torch.zeros_like(self.ended)
-        # A motion is never empty, so its first group cannot be End.
-        may_end = alive & (group > self.before) & opens if self.free else no
-        # Numbers count from a row's first new token, whatever it starts from.
-        index = (self.at - self.before * size).clamp(0, self.uniform.shape[1] - 1)
-        own = self.uniform.gather(1, index[:, None])[:, 0]
-        kind = network.slots[slot]
-        legal = network.legal_at(network.ends[kind].expand(len(no)), may_end, no)
-        rows = legal if scale is None else legal.repeat(2, 1)
-        logits = network.logits(hidden, kind.expand(len(rows), 1), rows[:, None])[:, 0]
-        token = self.how(logits if scale is None else guide(logits, legal, scale), own)
-        stops = alive & opens & (token == network.ends[network.slots[:1]])
-        self.ended |= stops
-        alive = alive & ~stops
-        self.counts += alive & opens
-        known = self.tokens.index_select(1, self.at)[:, 0]
-        drawn = torch.where(new, torch.where(alive, token, 0), known)
-        self.tokens.index_copy_(1, self.at, drawn[:, None])
-        self.at += 1
+        at, kind = self.at, self.kinds.index_select(0, self.at)
+        # One product for all streams' heads, of which one is taken.
+        heads = functional.linear(hidden[:, 0].to(self.weight.dtype), self.weight, self.bias)
+        logits = heads.view(len(heads), -1, self.illegal.shape[1]).index_select(1, kind)[:, 0].float()
+        logits = logits if self.scale is None else guide(logits, self.scale)
+        illegal = self.illegal[self.rules.index_select(1, at)[:, 0]]
+        own = self.draws.index_select(1, at)[:, 0]
+        drawn = self.how(logits.masked_fill(illegal, -torch.inf), own)[:, None]
+        token = torch.where(self.new.index_select(1, at), drawn, self.tokens.index_select(1, at))
+        self.tokens.index_copy_(1, at, token)
+        if self.x is not None and self.embeddings is not None:
+            # Both passes of guidance read the tokens that were drawn under guidance.
+            self.x.view(-1, *token.shape, self.x.shape[2]).copy_(self.embeddings[kind, token])
+        at += 1
+
+    def counts(self) -> Tensor:
+        """New groups of each row as far as they are drawn: up to its End, at most its limit; int64 [B]."""
+        heads = self.tokens[:, :: self.size]
+        new = self.new[:, :: self.size]
+        ended = (new & (heads == self.end)).cumsum(1) > 0
+        return torch.minimum((new & ~ended).sum(1), self.limit)
 
     def done(self) -> bool:
         """Whether no row draws or reads its start any more."""
-        group = self.at // len(self.network.pattern)
-        return bool(((group >= self.before) & (self.ended | (group >= self.before + self.limit))).all())
+        return bool((self.at // self.size >= self.before + self.counts()).all())
 
     def run(self, step: Callable[[int], None]) -> tuple[Tensor, Tensor]:
         """Take `step`, which calls `draw`, for each number in order; all tokens int64 [B, N * P], those of
         the start included, and the numbers of new groups int64 [B].
         """
-        every = _LOOK if self.at.is_cuda else len(self.network.pattern)
+        every = _LOOK if self.at.is_cuda else self.size
         for number in range(self.first, self.last):
             if (number - self.first) % every == 0 and self.done():
                 break
             step(number)
-        return self.tokens, self.counts
+        return self.tokens, self.counts()
 
 
-def advance(gpt: InterleavedGPT, rows: Rows, first: Tensor, cache: KVCache) -> None:
-    """Draw the next token of each row behind those that the cache holds; `first` [B, 1, D], of guidance
-    [2B, 1, D], is read before token 0.
-    """
-    before = (rows.at - 1).clamp(min=0)
-    kinds = gpt.slots[before % len(gpt.pattern)].expand(len(rows.tokens), 1)
-    x = gpt.embed(rows.tokens.index_select(1, before), kinds)
-    # Both passes of guidance read the tokens that were drawn under guidance.
-    x = x if rows.scale is None else torch.cat([x, x])
-    rows.draw(gpt.hidden(torch.where(rows.at == 0, first, x), cache))
+def advance(gpt: InterleavedGPT, rows: Rows, cache: KVCache) -> None:
+    """Draw the next token of each row behind those that the cache holds."""
+    assert rows.x is not None
+    rows.draw(gpt.hidden(rows.x, cache))
 
 
 class FixedSteps:
@@ -243,26 +250,25 @@ class FixedSteps:
     their products are computed, as autocast would cast them at each use.
     """
 
-    def __init__(self, shape: object, gpt: InterleavedGPT, rows: Rows, first: Tensor) -> None:
+    def __init__(self, shape: object, gpt: InterleavedGPT, rows: Rows) -> None:
         self.shape = shape
-        self.gpt, self.rows, self.first = copy.deepcopy((gpt, rows, first))
+        self.gpt, self.rows = copy.deepcopy((gpt, rows))
         for module in self.gpt.requires_grad_(False).modules():
             if isinstance(module, nn.Linear):
                 module.to(product_type(module.weight))
         self.cache = self.gpt.stack.cache(self.rows.tokens.shape[1], self.rows.at)
-        self.step = recorded(partial(advance, self.gpt, self.rows, self.first, self.cache), first.device)
+        self.step = recorded(partial(advance, self.gpt, self.rows, self.cache), rows.at.device)
 
-    def run(self, gpt: InterleavedGPT, rows: Rows, first: Tensor) -> tuple[Tensor, Tensor]:
+    def run(self, gpt: InterleavedGPT, rows: Rows) -> tuple[Tensor, Tensor]:
         """Draw rows of this shape; return as `Rows.run` does."""
         torch._foreach_copy_(list(self.gpt.parameters()), list(gpt.parameters()))
         for name, value in vars(rows).items():
             if isinstance(value, Tensor):
                 getattr(self.rows, name).copy_(value)
-        self.first.copy_(first)
         self.rows.first, self.rows.last = rows.first, rows.last
         self.cache.clear()
         tokens, counts = self.rows.run(lambda _: self.step())
-        return tokens.clone(), counts.clone()
+        return tokens.clone(), counts
 
 
 _KEPT: WeakKeyDictionary[InterleavedGPT, FixedSteps] = WeakKeyDictionary()
@@ -271,16 +277,17 @@ _KEPT: WeakKeyDictionary[InterleavedGPT, FixedSteps] = WeakKeyDictionary()
 
 @torch.inference_mode(False)  # what is kept is written again, which tensors of that mode do not bear outside
 @torch.no_grad()
-def run_fixed(gpt: InterleavedGPT, rows: Rows, first: Tensor) -> tuple[Tensor, Tensor]:
+def run_fixed(gpt: InterleavedGPT, rows: Rows) -> tuple[Tensor, Tensor]:
     """Draw rows by steps of fixed shapes; return as `Rows.run` does."""
-    types = first.dtype, gpt.positions.dtype, product_type(gpt.positions)
-    shape = first.shape, rows.tokens.shape, rows.scale is None, rows.free, rows.how, first.device, types
+    assert rows.x is not None
+    types = rows.x.dtype, gpt.positions.dtype, product_type(gpt.positions)
+    shape = rows.x.shape, rows.tokens.shape, rows.scale is None, rows.how, rows.x.device, types
     # Taken out meanwhile: another thread with the same network makes its own.
     steps = _KEPT.pop(gpt, None)
     if steps is None or steps.shape != shape:
         steps = None  # so that its memory is free for the next
-        steps = FixedSteps(shape, gpt, rows, first)
-    made = steps.run(gpt, rows, first)
+        steps = FixedSteps(shape, gpt, rows)
+    made = steps.run(gpt, rows)
     _KEPT[gpt] = steps
     return made
 
@@ -321,15 +328,17 @@ def generate(
     uniform = uniform_numbers(seeds_of(seed, batch, "texts"), room, device)
     scale = torch.full((batch,), cfg_scale, device=device) if cfg_scale != 1 else None
     start, before = torch.zeros(batch, room, dtype=torch.int64, device=device), torch.zeros_like(limit)
-    rows = Rows(gpt, start, before, limit, uniform=uniform, free=groups is None, how=how, scale=scale)
     with evaluating(gpt):
         first = gpt.embed_text(text)
         if scale is not None:
             nothing = torch.ones(batch, dtype=torch.bool, device=device)
             first = torch.cat([first, gpt.embed_text(text, nothing)])
+        rows = Rows(
+            gpt, start, before, limit, first=first, uniform=uniform, free=groups is None, how=how, scale=scale
+        )
         if fixed:
-            tokens, counts = run_fixed(gpt, rows, first)
+            tokens, counts = run_fixed(gpt, rows)
         else:
             cache = gpt.stack.cache(max(1, room))
-            tokens, counts = rows.run(lambda _: advance(gpt, rows, first, cache))
+            tokens, counts = rows.run(lambda _: advance(gpt, rows, cache))
     return as_codes(tokens[:, : most * size].reshape(batch, most, size), gpt.pattern, counts)

@@ -22,7 +22,7 @@ Legend: B batch, G groups, P slots of a group, L tokens, D width, V largest voca
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -195,6 +195,36 @@ class TokenNetwork(nn.Module):
         """Fresh weights for embeddings and heads."""
         for layer in (*self.embeddings, *self.heads):
             nn.init.normal_(layer.weight, std=0.02)
+
+    def joint_embeddings(self) -> Tensor:
+        """The embeddings of all streams [S, V, D], V rounded up to a multiple of 8."""
+        return self._joint(table.weight for table in self.embeddings)
+
+    def joint_heads(self) -> tuple[Tensor, Tensor]:
+        """Weights [S * V, D] and biases [S * V] of all heads, V as above, in the type of their products; a
+        bias of -inf where a stream has no token.
+        """
+        weight = self._joint(head.weight for head in self.heads).flatten(0, 1)
+        bias = self._joint((head.bias for head in self.heads), -torch.inf).flatten()
+        return weight.to(product_type(weight)), bias.to(product_type(weight))
+
+    def _joint(self, tables: Iterable[Tensor | nn.Module], value: float = 0.0) -> Tensor:
+        """Tables [K + 1, ...] of the streams as one [S, V, ...], filled up with `value`."""
+        filled = []
+        for table in tables:
+            assert isinstance(table, Tensor)
+            # Even rows, which kernels for half precision need.
+            more = -(-self.vocabulary // 8) * 8 - len(table)
+            filled.append(functional.pad(table, (0, 0) * (table.dim() - 1) + (0, more), value=value))
+        return torch.stack(filled)
+
+    def illegal(self) -> Tensor:
+        """Bool [2 * S, V], V as above: what cannot be drawn before End of a stream's token; row 2 s where it
+        cannot be End, row 2 s + 1 where it can.
+        """
+        may_end = torch.arange(2 * len(self.ends), device=self.ends.device) % 2 == 1
+        legal = self.legal_at(self.ends.repeat_interleave(2), may_end, torch.zeros_like(may_end))
+        return ~functional.pad(legal, (0, -self.vocabulary % 8))
 
     def embed(self, tokens: Tensor, kinds: Tensor) -> Tensor:
         """Token embeddings [B, L, D]; each stream looks up its own table, padding reads as any code."""

@@ -14,6 +14,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from motionloom.models.layers.linear import product_type
+
 HIDDEN = -(2.0**15)
 """Product with a hidden key: exact in float16 and bfloat16, and nothing beside others behind the softmax."""
 
@@ -58,6 +60,17 @@ def unmasked_attention(
     return out[..., :width]
 
 
+def added_mask(mask: Tensor, x: Tensor) -> Tensor:
+    """A mask of visible positions, bool [B, S] or [B, L, S], as attention adds it to the products of heads,
+    in the type in which they are computed on x.
+    """
+    mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
+    kind, size = product_type(x), mask.shape[-1]
+    # Kernels of GPUs read rows that begin at multiples of 8, and copy others in every layer.
+    hidden = F.pad(~mask, (0, -size % 8), value=True)
+    return torch.zeros(hidden.shape, dtype=kind, device=x.device).masked_fill_(hidden, -torch.inf)[..., :size]
+
+
 class LayerCache:
     """Keys and values [2, B, H, size, D/H] of the positions one layer has seen, made at the first append.
 
@@ -97,6 +110,7 @@ class KVCache:
     def __init__(self, layers: int, size: int, at: Tensor | None = None) -> None:
         self.size, self.at = size, at
         self.layers = [LayerCache(size, at) for _ in range(layers)]
+        self._masks: Tensor | None = None
 
     @property
     def length(self) -> int:
@@ -106,9 +120,14 @@ class KVCache:
         """Return the indices of the next `count` positions; 1 with `at`."""
         return slice(self.length, self.length + count) if self.at is None else self.at
 
-    def visible(self) -> Tensor | None:
-        """Return the places that hold positions up to `at`, bool [1, size]; None where all that come do."""
-        return None if self.at is None else torch.arange(self.size, device=self.at.device)[None] <= self.at
+    def mask(self, x: Tensor) -> Tensor | None:
+        """What attention adds at position `at`, [1, 1, 1, size]; None where all that is stored is seen."""
+        if self.at is None:
+            return None
+        if self._masks is None:
+            seen = torch.ones(self.size, self.size, dtype=torch.bool, device=x.device).tril()
+            self._masks = added_mask(seen, x)
+        return self._masks.index_select(0, self.at)
 
     def clear(self) -> None:
         """Forget what is stored at the places of `at`."""

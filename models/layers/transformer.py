@@ -26,8 +26,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from motionloom.datasets.schema import Config
-from motionloom.models.layers.attention import CrossAttention, KVCache, LayerCache, SelfAttention
-from motionloom.models.layers.linear import product_type
+from motionloom.models.layers.attention import CrossAttention, KVCache, LayerCache, SelfAttention, added_mask
 
 Norm = Literal["pre", "post"]
 """Position of LayerNorm: before attention and feed-forward, or after their sums."""
@@ -196,8 +195,10 @@ class Transformer(nn.Module):
         """x [B, L, D]; mask bool [B, L] of visible positions or [B, L, S], or `causal`; cache to decode;
         memory [B, M, D] and its mask [B, M] or [B, L, M].
         """
-        mask = cache.visible() if mask is None and cache is not None else mask
-        given, seen = (_added(mask, x), causal), (memory, _added(memory_mask, x))
+        added, beside = (None if one is None else added_mask(one, x) for one in (mask, memory_mask))
+        if mask is None and cache is not None:
+            added = cache.mask(x)
+        given, seen = (added, causal), (memory, beside)
 
         def step(index: int, x: Tensor) -> Tensor:
             if cache is None:
@@ -255,14 +256,3 @@ class SkipTransformer(Transformer):
             if index < half:
                 kept.append(x)
         return x
-
-
-def _added(mask: Tensor | None, x: Tensor) -> Tensor | None:
-    """A mask [B, S] or [B, L, S] as attention adds it, in the type in which it computes on x."""
-    if mask is None:
-        return None
-    mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
-    kind, size = product_type(x), mask.shape[-1]
-    # Kernels of GPUs read rows that begin at multiples of 8, and copy others in every layer.
-    hidden = F.pad(~mask, (0, -size % 8), value=True)
-    return torch.zeros(hidden.shape, dtype=kind, device=x.device).masked_fill_(hidden, -torch.inf)[..., :size]

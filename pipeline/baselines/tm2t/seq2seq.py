@@ -58,10 +58,19 @@ class _Tied(nn.Module):
         super().__init__()
         self._table = [table]  # in a list, so that it is no child of this module too
 
-    def forward(self, x: Tensor) -> Tensor:
+    @property
+    def weight(self) -> Tensor:
         weight = self._table[0].weight
         assert isinstance(weight, Tensor)
-        return functional.linear(x, weight)
+        return weight
+
+    @property
+    def bias(self) -> Tensor:
+        """What other outputs have, for `TokenNetwork.joint_heads`."""
+        return self.weight.new_zeros(len(self.weight))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return functional.linear(x, self.weight)
 
 
 class Seq2Seq(TokenNetwork):
@@ -149,16 +158,17 @@ def draw_tokens(
     most = int(limit.max()) if batch else 0
     uniform = uniform_numbers(seeds, most * size, device)
     start, before = torch.zeros(batch, 0, dtype=torch.int64, device=device), torch.zeros_like(limit)
-    rows = Rows(net, start, before, limit, uniform=uniform, free=groups is None, how=how, scale=None)
+    first = net.start.expand(batch, 1, -1)
+    rows = Rows(
+        net, start, before, limit, first=first, uniform=uniform, free=groups is None, how=how, scale=None
+    )
     with evaluating(net):
         read, state = net.read(text, mask)
 
-        def draw(at: int) -> None:
+        def draw(_: int) -> None:
             nonlocal state
-            x = net.start.expand(batch, -1)
-            if at:
-                x = net.embed_at(rows.tokens[:, at - 1], net.slots[(at - 1) % size].expand(batch))
-            state = net.step(x, state, read)
+            assert rows.x is not None
+            state = net.step(rows.x[:, 0], state, read)
             rows.draw(state[:, None])
 
         tokens, counts = rows.run(draw)

@@ -13,14 +13,31 @@ from toy_gpt import row_of, toy_gpt
 from motionloom.models.gpt import sampling
 from motionloom.models.gpt.sampling import Drawing, generate
 
+VIEWS = {
+    "alias",
+    "chunk",
+    "detach",
+    "expand",
+    "permute",
+    "select",
+    "slice",
+    "split",
+    "t",
+    "transpose",
+    "view",
+}
+VIEWS |= {"unsqueeze", "_unsafe_view"}
+"""What launches no kernel."""
+
 
 def test_drawn_as_with_a_growing_cache_and_never_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     """Calls of two networks in turn, whose weights move; on a device that is waited for."""
-    inside, made = [False], []
+    inside, made, launched, steps = [False], [], list[str](), [0]
 
     def recorded(step: Callable[[], None], device: torch.device) -> Callable[[], None]:
         def again() -> None:
             inside[0] = True
+            steps[0] += 1
             step()
             inside[0] = False
 
@@ -32,6 +49,7 @@ def test_drawn_as_with_a_growing_cache_and_never_waiting(monkeypatch: pytest.Mon
         short = name.removeprefix("aten::")
         copied = "copy" in short and not all(isinstance(one, Far) for one in (args[0], out))
         assert not inside[0] or not (short in WAITS or copied), name
+        launched.extend([short] if inside[0] and short not in VIEWS else [])
 
     monkeypatch.setattr(sampling, "recorded", recorded)
     monkeypatch.setattr(sampling, "_FIXED", {SECOND.type})
@@ -53,3 +71,5 @@ def test_drawn_as_with_a_growing_cache_and_never_waiting(monkeypatch: pytest.Mon
             for index in range(2 - half):
                 assert row_of(found, index) == row_of(want, index), seed
     assert made == [SECOND] * 4 and all(far in sampling._KEPT for _, far in nets)
+    # Launches are what a token of one motion takes a GPU: 11 of a layer, and what is drawn by.
+    assert len(launched) <= steps[0] * (11 * 2 + 45), {name: launched.count(name) for name in set(launched)}
