@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.loading.crops import Crops
-from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.plan import ALONE, BatchPlan, Share
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
@@ -52,9 +52,7 @@ class WindowBatches(Dataset[MotionBatch]):
         window: int,
         batch_size: int,
         seed: int = 0,
-        rank: int = 0,
-        world: int = 1,
-        parts: int = 1,
+        share: Share = ALONE,
         columns: NDArray[np.int64] | None = None,
     ) -> None:
         if window < 1:
@@ -62,7 +60,7 @@ class WindowBatches(Dataset[MotionBatch]):
         self.crops = Crops(dataset, stats, columns)
         self.dataset = dataset
         self.window = window
-        self.seed, self.share = seed, (rank, world, parts)
+        self.seed, self.share = seed, share
         self.clips = self.crops.clips
         if len(self.clips) == 0 or not self.crops.present[np.unique(dataset.present)].any(axis=0).all():
             raise UserError(
@@ -73,11 +71,11 @@ class WindowBatches(Dataset[MotionBatch]):
         self.full = bool(whole and (dataset.frames[self.clips] >= window).all())
         sources = dataset.sources(self.clips)
         self.plan = BatchPlan(len(self.clips), batch_size, seed, sources=sources)
-        self.plan.local(0, *self.share)  # an indivisible batch is refused now, not in a loader worker
+        self.plan.local(0, self.share)  # an indivisible batch is refused now, not in a loader worker
 
     def _windows(self, k: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Clips, first frames and lengths of batch `k`, each [n]."""
-        turns, items = self.plan.local(k, *self.share)
+        turns, items = self.plan.local(k, self.share)
         clips = self.clips[items]
         frames = self.dataset.frames[clips]
         draws = uniform(self.seed, _WINDOW, turns, clips, 0)

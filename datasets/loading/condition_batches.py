@@ -23,6 +23,7 @@ from motionloom.datasets.conditions import Condition
 from motionloom.datasets.loading.batches import MotionBatch
 from motionloom.datasets.loading.crops import CaptionSpan, Crops, caption_spans
 from motionloom.datasets.loading.kinds import KindPlan, drop_some
+from motionloom.datasets.loading.plan import ALONE, Share
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import Rows
 from motionloom.datasets.modalities.table import MODALITIES, modality
@@ -185,24 +186,22 @@ class ConditionBatches(Dataset[ConditionBatch]):
         drop: Mapping[str, float] | None = None,
         homogeneous: bool = False,
         seed: int = 0,
-        rank: int = 0,
-        world: int = 1,
-        parts: int = 1,
+        share: Share = ALONE,
         columns: NDArray[np.int64] | None = None,
     ) -> None:
         self.source = ConditionedClips(
             dataset, stats, readers, max_frames=max_frames, min_frames=min_frames, columns=columns,
             captioned=captioned,
         )  # fmt: skip
-        self.seed, self.share = seed, (rank, world, parts)
+        self.seed, self.share = seed, share
         self.drop = drop or {}
         clips = self.source.clips
         present, names = self.source.present[clips], self.source.names
         self.plan = KindPlan(dataset, clips, present, names, batch_size, seed, balance, homogeneous)
-        self.plan.local(0, *self.share)  # an indivisible batch is refused now, not in a loader worker
+        self.plan.local(0, self.share)  # an indivisible batch is refused now, not in a loader worker
 
     def __getitem__(self, k: int) -> ConditionBatch:
-        turns, clips = self.plan.local(k, *self.share)
+        turns, clips = self.plan.local(k, self.share)
         source = self.source
         # Each purpose draws by a counter of its own, so that a change of one leaves the others as they were.
         draws = uniform(self.seed, _DROP, turns, clips)

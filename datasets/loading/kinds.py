@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from motionloom.datasets.loading.order import shares
-from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.plan import BatchPlan, Share
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, Source
@@ -167,20 +167,18 @@ class KindPlan:
                     ]
             self._whole = BatchPlan(len(self.clips), batch_size, seed, sources=sources)
 
-    def local(
-        self, n: int, rank: int, world: int, parts: int = 1
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """(turns, clips), [batch_size / world / parts]: the rank's rows, as `BatchPlan.local`."""
+    def local(self, n: int, share: Share) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(turns, clips), [batch_size / world / parts]: the share's rows, as `BatchPlan.local`."""
         if self._whole is not None:
-            turns, items = self._whole.local(n, rank, world, parts)
+            turns, items = self._whole.local(n, share)
             return turns, self.clips[items]
         # Which kind batch k is of is a function of its place in the epoch alone, the same for every rank.
-        k, part = divmod(n, parts)
+        k, part = divmod(n, share.parts)
         epoch, position = divmod(k, self._epoch)
         place = np.concatenate([(np.arange(share) + 0.5) / share for share in self._shares])
         which = np.repeat(np.arange(len(self._shares)), self._shares)[np.argsort(place, kind="stable")]
         kind = int(which[position])
         own, plan = self._own[kind]
         number = epoch * self._shares[kind] + int((which[:position] == kind).sum())
-        turns, items = plan.local(number * parts + part, rank, world, parts)
+        turns, items = plan.local(number * share.parts + part, share)
         return turns, own[items]

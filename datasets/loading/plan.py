@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,20 @@ from motionloom.datasets.shards.clips import Source
 
 POOL = 8
 """Batches sorted by length together. More of them mean less padding, fewer mix lengths better."""
+
+
+class Share(NamedTuple):
+    """What one process reads of a step's batch: its rows of each part."""
+
+    rank: int = 0
+    world: int = 1
+    """Processes."""
+    parts: int = 1
+    """Parts that a step's batch is cut into; each is divided over the processes and read by itself."""
+
+
+ALONE = Share()
+"""All of it: of one process, in one part."""
 
 
 class BatchPlan:
@@ -84,14 +98,13 @@ class BatchPlan:
         part = slice(position * self.batch_items, (position + 1) * self.batch_items)
         return turns[part], order[part]
 
-    def local(
-        self, n: int, rank: int, world: int, parts: int = 1
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """(turns, items), [batch_items / world / parts]: the rank's share of part `n % parts` of global batch
+    def local(self, n: int, share: Share) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """(turns, items), [batch_items / world / parts]: the share of part `n % parts` of global batch
         `n // parts`.
 
         Shares are contiguous: rows gathered in the order of parts, then ranks, stand as in the whole batch.
         """
+        rank, world, parts = share
         if self.batch_items % (world * parts):
             cut = f" in {parts} parts" * (parts > 1)
             raise UserError(
@@ -99,9 +112,9 @@ class BatchPlan:
                 f"make the batch size a multiple of {world * parts}"
             )
         turns, items = self.batch(n // parts)
-        share = self.batch_items // (world * parts)
-        first = (n % parts * world + rank) * share
-        return turns[first : first + share], items[first : first + share]
+        size = self.batch_items // (world * parts)
+        first = (n % parts * world + rank) * size
+        return turns[first : first + size], items[first : first + size]
 
     def _epoch(self, epoch: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         if len(self.sources) == 1:

@@ -19,6 +19,8 @@ from collections import OrderedDict
 from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
+from typing import ClassVar
+from weakref import ReferenceType, ref
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +52,8 @@ _MOTION = MEMBERS.index("motion.npy")
 _SHARD_NAME = re.compile(r"[A-Za-z0-9_-]+-(?:train|val|test)-(\d{6,})\.tar")
 
 OPEN_SHARDS = 256
-"""Shards mapped at a time in one process; the least recently used is unmapped."""
+"""Shards mapped at a time in one process, of all data sets; the least recently used is unmapped. Each takes a
+file descriptor, of which a process has 1,024 as a rule."""
 
 
 def load_manifest(root: Path) -> Manifest:
@@ -88,8 +91,12 @@ def manifest_layout(manifest: Manifest) -> MotionLayout:
 class MappedShards:
     """Files of this machine, memory-mapped: the page cache is the only cache and all processes share it."""
 
+    _recent: ClassVar[OrderedDict[tuple[ReferenceType[MappedShards], int], None]] = OrderedDict()
+    """Data set and number of each shard that is mapped, in the order of their use."""
+
     def __init__(self, store: Store, shards: list[ShardInfo], index: SplitIndex, room: int = 0) -> None:
         self.maps: OrderedDict[int, mmap.mmap] = OrderedDict()
+        self._self = ref(self)
         self._store, self._shards, self._offsets = store, shards, index.offsets
         self._most = OPEN_SHARDS
         if room:  # a deleted file takes disk space while it is mapped: at most an eighth of the cache may
@@ -97,11 +104,16 @@ class MappedShards:
 
     def member(self, shard: int, clip: int, column: int) -> tuple[mmap.mmap, int]:
         """Return (buffer, offset of the member in it). Views keep an unmapped shard alive."""
-        mapped = self.maps.get(shard)
-        if mapped is None:
-            mapped = self._map(shard)
-        else:
-            self.maps.move_to_end(shard)
+        mapped = self.maps.pop(shard, None) or self._map(shard)
+        self._recent.pop((self._self, shard), None)
+        # Back as the one used last.
+        self.maps[shard], self._recent[self._self, shard] = mapped, None
+        while len(self.maps) > self._most:
+            self.maps.popitem(last=False)
+        while len(self._recent) > OPEN_SHARDS:
+            (other, number), _ = self._recent.popitem(last=False)
+            if (owner := other()) is not None:
+                owner.maps.pop(number, None)
         return mapped, int(self._offsets[clip, column])
 
     def _map(self, shard: int) -> mmap.mmap:
@@ -116,9 +128,6 @@ class MappedShards:
             raise UserError(
                 f"{where}: {len(mapped)} bytes, the manifest says {info.bytes}: truncated while in use"
             )
-        self.maps[shard] = mapped
-        while len(self.maps) > self._most:
-            self.maps.popitem(last=False)
         return mapped
 
 

@@ -27,7 +27,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
-from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.plan import ALONE, BatchPlan, Share
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, Source
@@ -165,9 +165,7 @@ class TokenBatches(Dataset[dict[str, Any]]):
     max_groups: int
     batch_size: int
     seed: int
-    rank: int = 0
-    world: int = 1
-    parts: int = 1
+    share: Share = ALONE
     training: bool = True
     sources: tuple[Source, ...] = ()
     """Data sets and their weights, when several are mixed."""
@@ -197,7 +195,7 @@ class TokenBatches(Dataset[dict[str, Any]]):
 
     def __getitem__(self, k: int) -> dict[str, Any]:
         if self.training:
-            turns, items = self._plan.local(k, self.rank, self.world, self.parts)
+            turns, items = self._plan.local(k, self.share)
         else:
             items = np.arange(k * self.batch_size, min((k + 1) * self.batch_size, len(self.captions)))
             turns = np.zeros(len(items), dtype=np.int64)

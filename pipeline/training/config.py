@@ -11,15 +11,16 @@ from typing import Any, ClassVar, Literal, Protocol
 
 from pydantic import BaseModel, Field
 
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Numbered
 from motionloom.datasets.schema import Config, UserError
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import RUNTIME, StageConfig
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers
 
-BatchSource = Callable[[int, int, int, int], Numbered[Any]]
-"""(items of a step on all processes, rank, world, parts of a step) -> batches; item n is this rank's share of
-part `n % parts` of step `n // parts`."""
+BatchSource = Callable[[int, Share], Numbered[Any]]
+"""(items of a step on all processes, share of this one) -> batches; item n is its rows of part `n % parts` of
+step `n // parts`."""
 
 
 class SizedBatches(Numbered[Any], Sized, Protocol):

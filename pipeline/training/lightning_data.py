@@ -9,6 +9,7 @@ from typing import Any
 import lightning as L
 from torch.utils.data import DataLoader
 
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Numbered, Steps
 from motionloom.models.training.stage_module import Batch, StageModule
 from motionloom.pipeline.contract.stage import CompletedStage, Inputs, StageCache
@@ -47,7 +48,7 @@ class StageData(L.LightningDataModule):
         size, batches = self.config.batch_size, self.batches.train
 
         def make(rank: int, world: int) -> Numbered[Batch]:
-            return batches(size, rank, world, parts)
+            return batches(size, Share(rank, world, parts))
 
         return loader(Steps(make, steps * parts, done * parts), self.hardware)
 

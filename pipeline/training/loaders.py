@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.data import DataLoader, IterableDataset
 
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Steps
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Batch
@@ -41,7 +42,7 @@ class TrainingData:
         self, train: BatchSource, validation: EvalSource | None, config: TrainConfig, hardware: Hardware
     ) -> None:
         self.config, self.hardware = config, hardware
-        self.train = train(config.batch_size, rank(), world_size(), config.accumulate)
+        self.train = train(config.batch_size, Share(rank(), world_size(), config.accumulate))
         self.validation = validation
         self._training: _Loader | None = None
         self._held_out: _Loader | None = None

@@ -8,16 +8,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from motionloom.datasets.loading.plan import ALONE, Share
+
 
 def require_shares(
-    build: Callable[[int, int, int], Any], batches: Iterable[int] = (0, 4, 9), worlds: Iterable[int] = (2, 3)
+    build: Callable[[Share], Any], batches: Iterable[int] = (0, 4, 9), worlds: Iterable[int] = (2, 3)
 ) -> None:
-    """`build(rank, world, parts)` gives the batches by number."""
+    """`build` gives the batches by number."""
     for k in batches:
-        whole = build(0, 1, 1)[k]
+        whole = build(ALONE)[k]
         for world, parts in [(1, 2), *((world, 1) for world in worlds), (2, 2)]:
             shares = [
-                build(rank, world, parts)[k * parts + part] for part in range(parts) for rank in range(world)
+                build(Share(rank, world, parts))[k * parts + part]
+                for part in range(parts)
+                for rank in range(world)
             ]
             require_rows(whole, shares)
 

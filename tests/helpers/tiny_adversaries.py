@@ -14,6 +14,7 @@ from rich.console import Console
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from motionloom.datasets.loading.plan import ALONE, Share
 from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import StageCache, StageContext
@@ -36,9 +37,7 @@ class Steps(Dataset[dict[str, Any]]):
     def __init__(
         self,
         batch: int,
-        rank: int = 0,
-        world: int = 1,
-        parts: int = 1,
+        share: Share = ALONE,
         *,
         size: int = 10**6,
         dtype: Any = torch.float32,
@@ -46,6 +45,7 @@ class Steps(Dataset[dict[str, Any]]):
         signalled: dict[int, signal.Signals] | None = None,
         hangs_at: int | None = None,
     ) -> None:
+        rank, world, parts = share
         batch //= parts
         self.batch, self.parts, self.size, self.dtype = batch, parts, size, dtype
         self.dies_at, self.hangs_at, self.signalled = dies_at, hangs_at, signalled or {}

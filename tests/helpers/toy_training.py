@@ -10,6 +10,7 @@ from tiny_adversaries import DIM, Steps
 from torch import Tensor, nn
 from toy_stages import register_toys
 
+from motionloom.datasets.loading.plan import Share
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.stage import Inputs
 from motionloom.pipeline.store.weights import LayoutFacts, ModelFacts
@@ -59,9 +60,9 @@ class ToyModule(StageModule):
 class ToyBatches(Steps):
     """Item k is this rank's rows of batch k."""
 
-    def __init__(self, config: ToyConfig, seed: int, *place: int) -> None:
-        super().__init__(*place)
-        self.config, self.seed, self.rank = config, seed, place[1]
+    def __init__(self, config: ToyConfig, seed: int, batch: int, share: Share) -> None:
+        super().__init__(batch, share)
+        self.config, self.seed, self.rank = config, seed, share.rank
 
     def made(self, step: int, part: int) -> dict[str, Tensor]:
         generator = torch.Generator().manual_seed(self.seed * 10**6 + step)

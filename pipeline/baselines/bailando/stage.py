@@ -12,6 +12,7 @@ from pydantic import Field
 from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.dances import BeatBatches, JointCrops, danced_joints
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
@@ -262,8 +263,8 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
             clips=window_of(net.gpt, inputs.dance_vq, config.reward.contexts), dataset=songs, balance=MUSIC,
         )  # fmt: skip
 
-        def train(*share: int) -> Dataset[object]:
-            return BeatBatches(found.train(*share), audio, fps)  # type: ignore[arg-type, return-value]
+        def train(batch: int, share: Share) -> Dataset[object]:
+            return BeatBatches(found.train(batch, share), audio, fps)  # type: ignore[arg-type, return-value]
 
         assert found.validation is not None
         check = found.validation

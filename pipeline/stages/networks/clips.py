@@ -11,6 +11,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import Crops
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
@@ -51,9 +52,10 @@ def clip_batches(
     def of(some: ClipDataset) -> FeatureStats | Crops:
         return read(some) if callable(read) else read
 
-    def train(batch: int, rank: int, world: int, parts: int) -> Dataset[object]:
-        at: dict[str, Any] = {"batch_size": batch, "rank": rank, "world": world, "parts": parts}
-        return ConditionBatches(dataset, of(dataset), readers, seed=seed, **at, **clips, **draws)
+    def train(batch: int, share: Share) -> Dataset[object]:
+        return ConditionBatches(
+            dataset, of(dataset), readers, seed=seed, batch_size=batch, share=share, **clips, **draws
+        )
 
     def validation() -> SizedBatches:
         held_out = data.held_out()

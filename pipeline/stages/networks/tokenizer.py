@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.schema import UserError
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer, TokenizerConfig
@@ -146,9 +147,10 @@ def window_batches(
     data, stats = inputs.data, inputs.stats
     dataset, window = data.split("train"), config.window
 
-    def train(batch: int, rank: int, world: int, parts: int) -> Dataset[object]:
-        at = {"batch_size": batch, "rank": rank, "world": world, "parts": parts}
-        return WindowBatches(dataset, stats, window=window, seed=seed, columns=columns, **at)
+    def train(batch: int, share: Share) -> Dataset[object]:
+        return WindowBatches(
+            dataset, stats, window=window, seed=seed, columns=columns, batch_size=batch, share=share
+        )
 
     return Batches(train, lambda: EvalBatches(data.held_out(), stats, columns=columns, **validation))
 

@@ -15,6 +15,7 @@ from pydantic import Field
 from torch import Tensor
 
 from motionloom.datasets.base.progress import Meter
+from motionloom.datasets.loading.plan import ALONE, Share
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import Stream, Tokenizer
@@ -182,13 +183,11 @@ def token_batches(
         wrap: Makes other batches of these.
     """
 
-    def batches(
-        split: str, training: bool, batch: int, rank: int = 0, world: int = 1, parts: int = 1
-    ) -> SizedBatches:
+    def batches(split: str, training: bool, batch: int, share: Share = ALONE) -> SizedBatches:
         clips = clips_of(split)
         found = TokenBatches(
             clips.store, clips.captions, pattern=net.pattern, ends=net.num_codes, max_groups=net.max_groups,
-            batch_size=batch, seed=seed, rank=rank, world=world, parts=parts, training=training,
+            batch_size=batch, seed=seed, share=share, training=training,
             sources=clips.sources, present=clips.present, **tables(clips),
         )  # fmt: skip
         return wrap(clips, found)

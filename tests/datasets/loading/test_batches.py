@@ -17,6 +17,7 @@ from torch.utils.data import DataLoader
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import frame_span
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.loading.steps import Steps
 from motionloom.datasets.motion.layout import MotionLayout
@@ -92,10 +93,9 @@ def test_windows_are_normalised_to_the_byte(
 def test_any_number_of_ranks_sees_the_same_global_batch(
     train: ShardDataset, stats: FeatureStats, text: TextCache, world: int
 ) -> None:
-    def captions(*share: int) -> ConditionBatches:
-        place = dict(zip(("rank", "world", "parts"), share, strict=True))
+    def captions(share: Share) -> ConditionBatches:
         return caption_batches(
-            train, stats, text, batch_size=12, max_frames=40, min_frames=8, seed=1, **place
+            train, stats, text, batch_size=12, max_frames=40, min_frames=8, seed=1, share=share
         )
 
     require_shares(captions, worlds=[world])
@@ -238,7 +238,7 @@ def test_caption_stretches_in_frames() -> None:
 
 def test_mistakes_are_named(train: ShardDataset, stats: FeatureStats, text: TextCache) -> None:
     with pytest.raises(UserError, match="3 ranks"):
-        WindowBatches(train, stats, window=16, batch_size=8, world=3)
+        WindowBatches(train, stats, window=16, batch_size=8, share=Share(0, 3))
     with pytest.raises(UserError, match="lower min_frames"):
         caption_batches(train, stats, text, batch_size=8, max_frames=2000, min_frames=1000)
     with pytest.raises(UserError, match="need 1 <= min_frames"):

@@ -15,6 +15,7 @@ from text_samples import WordLengths
 from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches
 from motionloom.datasets.loading.kinds import Balance, Drop, all_kinds, key_of
 from motionloom.datasets.loading.mix import MixedDataset
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats, compute, frame_statistics
 from motionloom.datasets.modalities.audio import RECORD as AUDIO
 from motionloom.datasets.modalities.modality import FrameStats
@@ -181,9 +182,9 @@ def test_batches_of_one_kind(data: ShardDataset, stats: FeatureStats, readers: d
 def test_any_number_of_ranks_sees_the_same_rows(
     data: ShardDataset, stats: FeatureStats, readers: dict[str, object], homogeneous: bool
 ) -> None:
-    def build(rank: int, world: int, parts: int) -> ConditionBatches:
+    def build(share: Share) -> ConditionBatches:
         return ConditionBatches(
-            data, stats, readers, batch_size=12, max_frames=20, seed=4, rank=rank, world=world, parts=parts,
+            data, stats, readers, batch_size=12, max_frames=20, seed=4, share=share,
             balance={"text": 1, "audio": 1, "text+audio": 1, "none": 1}, drop={"text": 0.4, "audio": 0.4},
             homogeneous=homogeneous,
         )  # fmt: skip
@@ -245,7 +246,7 @@ def test_mistakes_are_named(
     with pytest.raises(UserError, match=r"balance.audio"):
         ConditionBatches(words, stats, readers, batch_size=4, max_frames=16, balance={"audio": 1})
     with pytest.raises(UserError, match="3 ranks"):
-        ConditionBatches(data, stats, readers, batch_size=4, max_frames=16, world=3)
+        ConditionBatches(data, stats, readers, batch_size=4, max_frames=16, share=Share(0, 3))
     for wrong in (
         {"balance": {}},
         {"balance": {"text": 0}},

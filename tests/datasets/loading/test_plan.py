@@ -23,7 +23,7 @@ from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
 from motionloom.datasets.loading.mix import MixedDataset
 from motionloom.datasets.loading.order import shares
-from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.plan import BatchPlan, Share
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
@@ -77,7 +77,7 @@ def test_uniform_is_uniform_and_depends_on_every_counter() -> None:
 
 def test_mistakes_in_a_plan_are_named() -> None:
     with pytest.raises(UserError, match="5 ranks"):
-        BatchPlan(100, 12, 0).local(0, 0, 5)
+        BatchPlan(100, 12, 0).local(0, Share(0, 5))
     with pytest.raises(UserError, match="empty"):
         BatchPlan(0, 4, 0)
     with pytest.raises(UserError, match="not 0"):
@@ -158,12 +158,12 @@ def test_ranks_share_every_global_batch_out_alike(order: str) -> None:
             turns, items = plan.batch(k)
             seen.append(items)
             for world in WORLDS if k % 37 == 0 else (64,):
-                parts = [plan.local(k, rank, world) for rank in range(world)]
+                parts = [plan.local(k, Share(rank, world)) for rank in range(world)]
                 assert {len(part) for _, part in parts} == {BATCH // world}
                 assert np.array_equal(np.concatenate([part for _, part in parts]), items)
                 assert np.array_equal(np.concatenate([turn for turn, _ in parts]), turns)
             # A step in parts reads the same clips: else another `accumulate` would go on elsewhere.
-            cut = [plan.local(2 * k + part, rank, 2, 2) for part in range(2) for rank in range(2)]
+            cut = [plan.local(2 * k + part, Share(rank, 2, 2)) for part in range(2) for rank in range(2)]
             assert np.array_equal(np.concatenate([part for _, part in cut]), items)
         drawn = np.concatenate(seen)
         assert len(drawn) == plan.num_items // BATCH * BATCH
@@ -181,8 +181,8 @@ def test_a_million_samples_fit_into_little_memory() -> None:
     tracemalloc.start()
     try:
         plan = BatchPlan(len(shards), 1024, seed=0, lengths=lengths, sources=sources)
-        plan.local(0, 63, 64)
-        plan.local(plan.batches_per_epoch, 0, 64)
+        plan.local(0, Share(63, 64))
+        plan.local(plan.batches_per_epoch, Share(0, 64))
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -258,9 +258,8 @@ def test_batches_are_the_same_for_any_number_of_ranks(order: str, roots: tuple[P
     data = mixed(roots, order=order, shards_per_group=2)
     stats = compute(data)
 
-    def windows(*share: int) -> WindowBatches:
-        place = dict(zip(("rank", "world", "parts"), share, strict=True))
-        return WindowBatches(data, stats, window=16, batch_size=24, seed=1, **place)
+    def windows(share: Share) -> WindowBatches:
+        return WindowBatches(data, stats, window=16, batch_size=24, seed=1, share=share)
 
     require_shares(windows)
     evaluated = EvalBatches(data, stats, batch_size=16, max_frames=40)

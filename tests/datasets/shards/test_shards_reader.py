@@ -50,10 +50,10 @@ def test_every_member_comes_back(made: ModuleType, root: Path) -> None:
 def test_few_shards_stay_open_and_views_survive(
     made: ModuleType, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "OPEN_SHARDS", 2)
-    dataset = ShardDataset.open(root, "train")
-    views = [dataset.motion(i) for i in range(36)]
-    assert len(dataset._access.maps) == 2
+    monkeypatch.setattr(reader, "OPEN_SHARDS", 3)
+    dataset, other = (ShardDataset.open(root, "train") for _ in range(2))
+    views = [some.motion(i) for i in range(36) for some in (dataset, other)][::2]
+    assert len(dataset._access.maps) + len(other._access.maps) == 3, "a process has so many descriptors"
     for i, view in enumerate(views):
         np.testing.assert_array_equal(view, made.clip_motion(int(dataset.ids[i].rpartition("-")[2])))
 

@@ -12,6 +12,7 @@ import pytest
 import torch
 from rank_shares import require_rows
 
+from motionloom.datasets.loading.plan import ALONE
 from motionloom.datasets.schema import UserError
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.training.stage_module import StageModule
@@ -50,7 +51,7 @@ def test_a_trainer_makes_the_weights_of_the_run(stage: str, request: Any, tmp_pa
     for name, value in module.state_dict().items():
         assert torch.equal(value, wanted["state_dict"][name]), name
     trainer.save_checkpoint(tmp_path / "trainer.ckpt")
-    batches = data.batches.train(8, 0, 1, 1)
+    batches = data.batches.train(8, ALONE)
     batch = batches[0]
     require_rows(batch, [pickle.loads(pickle.dumps(batches))[0]])  # a loader's worker gets a copy
     losses = []

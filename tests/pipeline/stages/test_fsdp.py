@@ -46,7 +46,7 @@ CLIP = 0.5  # below the norms met here
 class Tokens(Steps):
     """Random token sequences of a network."""
 
-    def __init__(self, net: InterleavedGPT, *place: int, **options: Any) -> None:
+    def __init__(self, net: InterleavedGPT, *place: Any, **options: Any) -> None:
         super().__init__(*place, **options)
         self.net = net
 
@@ -83,7 +83,7 @@ def train(folder: Path, **settings: Any) -> None:
         module,
         TrainConfig.model_validate(given),
         lambda *place: Tokens(net, *place),
-        lambda: Tokens(net, 4, 0, 1, size=2),
+        lambda: Tokens(net, 4, size=2),
     )
     assert module.net is net
     if torch.distributed.get_rank() == 0:

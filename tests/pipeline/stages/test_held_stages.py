@@ -16,6 +16,7 @@ import torch.multiprocessing as mp
 from shard_samples import write_made
 from toy_gpt import encode_split
 
+from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout, Part
 from motionloom.datasets.schema import FACE, HANDS, Caption, Split, UserError
@@ -300,7 +301,7 @@ def codes_of(store: TokenStore, clip: int) -> dict[str, torch.Tensor]:
 def sequence_by_sequence(batches: TokenBatches, k: int) -> dict[str, torch.Tensor]:
     """The slow obvious way: one row after the other, token by token, padded to the longest."""
     captions, pattern, names = batches.captions, batches.pattern, stream_names(batches.pattern)
-    turns, items = batches._plan.local(k, batches.rank, batches.world)
+    turns, items = batches._plan.local(k, batches.share)
     rows, texts = [], []
     for turn, item in zip(turns.tolist(), items.tolist(), strict=True):
         rng = np.random.default_rng([batches.seed, turn, item])
@@ -335,7 +336,7 @@ def test_batches_hold_what_one_sequence_after_the_other_gives(
     texts = [[WALKS, SITS, ALL], [SITS], [WALKS, BLINK], [ALL, WALKS], [WALKS]]
     clips, _, net = clips_of(dataset_of(tmp_path, Convert(texts)), config=config)
     for rank in range(2):
-        batches = replace(batches_of(clips, net, most=most), rank=rank, world=2, seed=most**30)
+        batches = replace(batches_of(clips, net, most=most), share=Share(rank, 2), seed=most**30)
         for k in range(6):
             wanted, batch = sequence_by_sequence(batches, k), batches[k]
             assert batch.keys() == wanted.keys()
