@@ -43,7 +43,8 @@ class AudioModality(FrameModality):
         from motionloom.datasets.audio.features import BEAT
 
         if features.shape[1] == self.width:
-            return [float(frame / fps) for frame in np.flatnonzero(features[:, BEAT])]
+            # 0 or 1, to rounding where they were normalised in between.
+            return [float(frame / fps) for frame in np.flatnonzero(features[:, BEAT] > 0.5)]
         from motionloom.datasets.audio.rhythm_features import beats_of_rows
 
         return [float(beat) for beat in beats_of_rows(features, fps)]

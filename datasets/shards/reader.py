@@ -109,12 +109,17 @@ class MappedShards:
         # Back as the one used last.
         self.maps[shard], self._recent[self._self, shard] = mapped, None
         while len(self.maps) > self._most:
-            self.maps.popitem(last=False)
+            self._recent.pop((self._self, self.maps.popitem(last=False)[0]), None)
         while len(self._recent) > OPEN_SHARDS:
             (other, number), _ = self._recent.popitem(last=False)
             if (owner := other()) is not None:
                 owner.maps.pop(number, None)
         return mapped, int(self._offsets[clip, column])
+
+    def clear(self) -> None:
+        """Unmap all."""
+        while self.maps:
+            self._recent.pop((self._self, self.maps.popitem()[0]), None)
 
     def _map(self, shard: int) -> mmap.mmap:
         info = self._shards[shard]
@@ -247,7 +252,7 @@ class ShardDataset:
 
     def unmap(self) -> None:
         """Unmap the shards, to free memory after all clips were read once."""
-        self._access.maps.clear()
+        self._access.clear()
 
     def _captions(self, i: int, member: str) -> list[Caption]:
         raw = self._member(i, member)

@@ -46,7 +46,8 @@ def predicted(tokens: Tensor, logits: Tensor, known: Tensor | None = None) -> Te
     """Bool [B, L]: real tokens the grammar does not already decide (padding and the Ends after the first are
     out), and of those the `known` [B, L] ones (None = all): not the codes of a part that the clip lacks.
     """
-    free = (tokens != PAD) & (torch.isfinite(logits).sum(-1) > 1)
+    # NaN counts, so that a lost network has no loss of 0.
+    free = (tokens != PAD) & ((logits != -torch.inf).sum(-1) > 1)
     return free if known is None else free & known
 
 
@@ -103,12 +104,18 @@ def soft_codes(
     for name in gpt.names:
         here = steps[:, :, _slots(gpt.pattern, name), : gpt.num_codes[name]]
         here = torch.where(valid, here, 0.0).flatten(1, 2)
-        if sample:
-            out[name] = F.gumbel_softmax(here, tau=temperature)
-        else:
-            soft = (here / temperature).softmax(-1)
-            out[name] = F.one_hot(here.argmax(-1), here.shape[-1]).to(soft) + soft - soft.detach()
+        out[name] = straight_through(here, temperature, sample=sample)
     return out
+
+
+def straight_through(logits: Tensor, temperature: float, *, sample: bool) -> Tensor:
+    """One-hot weights [..., V] of logits: a draw by Gumbel noise, or the likeliest. Their gradient is that of
+    the softmax by `temperature`.
+    """
+    if sample:
+        return F.gumbel_softmax(logits, tau=temperature, hard=True)
+    soft = (logits / temperature).softmax(-1)
+    return F.one_hot(logits.argmax(-1), logits.shape[-1]).to(soft) + soft - soft.detach()
 
 
 def _slots(pattern: Sequence[str], name: str) -> slice | list[int]:

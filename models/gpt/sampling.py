@@ -74,7 +74,8 @@ class Drawing:
         # In whole numbers, which a GPU adds up to the same sums every time. Of 2^52, so that no uniform
         # number, a multiple of 2^-53 below 1, is rounded up to the whole sum: no token begins there.
         mass = (scaled.softmax(-1) * 2**52).long().cumsum(-1)
-        return torch.searchsorted(mass, (uniform[:, None] * mass[:, -1:]).long(), right=True)[:, 0]
+        at = torch.searchsorted(mass, (uniform[:, None] * mass[:, -1:]).long(), right=True)[:, 0]
+        return at.clamp(max=logits.shape[-1] - 1)  # of NaN all are passed; on a GPU no index may lie outside
 
 
 def guide(logits: Tensor, scale: Tensor) -> Tensor:
@@ -112,7 +113,7 @@ def seeds_of(seed: int | Sequence[int], count: int, what: str) -> list[int]:
 def uniform_numbers(seeds: Sequence[int], count: int, device: torch.device) -> Tensor:
     """float64 [B, count] in [0, 1), each row by its own seed."""
     if not seeds:
-        return torch.zeros(0, 0)
+        return torch.zeros(0, count, dtype=torch.float64, device=device)
     rows = [np.random.Generator(np.random.Philox(key=seed)).random(count) for seed in seeds]
     return torch.from_numpy(np.stack(rows)).to(device)
 

@@ -135,6 +135,11 @@ def _numbers(values: Sequence[int], device: torch.device) -> Tensor:
     return torch.stack([torch.full((), value, device=device) for value in values])
 
 
+def known_tokens(recorded: Tensor, batch: TokenSequence, ends: Tensor) -> Tensor:
+    """Bool [B, L]: false at codes of streams that a clip lacks. recorded bool [B, K], ends int64 [K]."""
+    return recorded.gather(1, batch.kinds) | (batch.tokens == ends[batch.kinds])
+
+
 def as_codes(tokens: Tensor, pattern: Sequence[str], groups: Tensor) -> Codes:
     """Tokens int64 [B, N, P] of `groups` [B] groups a row as streams; 0 after a shorter row."""
     longest = int(groups.max()) if len(groups) else 0

@@ -27,6 +27,7 @@ def ranks(distance: Tensor, positive: Tensor | None = None) -> Tensor:
 
     `positive` bool [N, N] marks the columns that count as true; the diagonal always does.
     """
+    distance = distance.where(~distance.isnan(), torch.inf)  # what is no number is near to nothing
     true = distance.diagonal()
     if positive is not None:
         true = torch.minimum(true, distance.masked_fill(~positive, torch.inf).amin(1))
@@ -150,7 +151,7 @@ def accuracy_among(
     draws = torch.rand(count, count, generator=generator, dtype=torch.float64).masked_fill(~allowed, -1.0)
     others = draws.topk(candidates - 1, dim=1).indices.to(motion.device)
     motion, text = F.normalize(motion.double(), dim=-1), F.normalize(text.double(), dim=-1)
-    near = motion @ text.T
+    near = (motion @ text.T).nan_to_num(nan=-1.0)
     own, rest = near.diagonal()[:, None], near.gather(1, others)
     rank = (rest > own).sum(1) + 0.5 * (rest == own).sum(1)
     return {f"top-{k}": float((rank < k).double().mean()) for k in tops}

@@ -198,6 +198,16 @@ class Tokenizer(nn.Module, ABC):
         """Bool [B] for each optional stream: True where `present` [B, dim] (None: all) lacks its part."""
         return {}
 
+    def recorded(self, present: Tensor) -> Tensor:
+        """bool [B, K]: streams, in the order of the pattern, that say what was recorded of clips which hold
+        the columns `present` [B, dim].
+        """
+        missing = self.missing(present)
+        # A tokenizer that gives a part a stream of its own keeps that part out of the other streams.
+        others = torch.ones_like(present[:, 0]) if missing else present.all(1)
+        names = dict.fromkeys(self.pattern)
+        return torch.stack([~missing[name] if name in missing else others for name in names], dim=1)
+
     def forward(
         self, x: Tensor, length: Tensor | None = None, present: Tensor | None = None
     ) -> TokenizerOutput:

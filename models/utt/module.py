@@ -24,7 +24,7 @@ from motionloom.models.discriminator.patch import (
     generator_loss,
 )
 from motionloom.models.gpt.losses import accuracy, corrupt, cross_entropy, soft_motion
-from motionloom.models.gpt.tokens import TokenSequence, interleave
+from motionloom.models.gpt.tokens import TokenSequence, interleave, known_tokens
 from motionloom.models.layers.frozen import Frozen
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
 from motionloom.models.training.alternating import AlternatingModule, OptimizerGroup
@@ -113,7 +113,12 @@ class UttModule(AlternatingModule):
 
     def _tokens(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         net, config = self.net.utt, self.net.utt.config
-        tokens, kinds, _ = self.sequences(batch)
+        sequence = self.sequences(batch)
+        tokens, kinds, known = sequence.tokens, sequence.kinds, None
+        if "present" in batch:
+            recorded = self.tokenizer.module.recorded(batch["present"])
+            # A clip of which no stream says what was recorded teaches nothing, not even where it ends.
+            known = known_tokens(recorded, sequence, net.ends) & recorded.any(1, keepdim=True)
         conditions, inputs, z = batch["conditions"], None, None
         size, device = len(tokens), tokens.device
         # Validation drops no conditions and corrupts no tokens, so its cross-entropy compares.
@@ -125,11 +130,11 @@ class UttModule(AlternatingModule):
         encoded: Encoded = self.net.mate(conditions, size)
         if config.z_dim:
             z = torch.randn(size, config.z_dim, device=device)
-        logits = net(tokens, kinds, encoded, z, inputs=inputs)
-        ce = cross_entropy(logits, tokens)
+        logits = net(tokens, kinds, encoded, z, inputs=inputs, known=known)
+        ce = cross_entropy(logits, tokens, known)
         values = {"loss": ce, "ce": ce}
         for kind, name in enumerate(net.names):
-            values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind)
+            values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)
         if self.discriminator is None or (self.training and not self.judged):
             return values
         # The critic judges motion decoded by the frozen tokenizer, so that gradients reach the logits.

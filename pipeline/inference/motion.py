@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.render.sound import Segment
@@ -42,6 +43,14 @@ class GeneratedMotion:
     """The figure whose joints these are, which is shown as it is; None: one is fitted to them."""
     bvh: OwnBvh | None = None
     """The user's own file with what was made in it, which is what is saved as BVH."""
+
+    def __post_init__(self) -> None:
+        made = (self.features, self.joints, self.face)
+        if not all(values is None or np.isfinite(values).all() for values in made):
+            raise UserError(
+                f"the motion for '{self.prompt.text}' holds numbers that are not finite: so do the model's "
+                f"weights, or a network overflows in half precision; take an earlier checkpoint (--at)"
+            )
 
     @property
     def caption(self) -> str:

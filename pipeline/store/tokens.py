@@ -31,7 +31,7 @@ from motionloom.datasets.loading.plan import ALONE, BatchPlan, Share
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, Source
-from motionloom.models.gpt.tokens import TokenSequence, interleave, stream_names
+from motionloom.models.gpt.tokens import TokenSequence, interleave, known_tokens, stream_names
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.pipeline.store.data import captions_of
 
@@ -140,8 +140,7 @@ class PresentTokens:
 
     def known(self, items: Sequence[int] | NDArray[np.int64], batch: TokenSequence, ends: Tensor) -> Tensor:
         """Bool [B, L]: false at codes of streams that the clips `items` [B] lack; `ends` int64 [K]."""
-        recorded = self.streams[self.bits[items]].gather(1, batch.kinds)
-        return recorded | (batch.tokens == ends[batch.kinds])
+        return known_tokens(self.streams[self.bits[items]], batch, ends)
 
 
 @dataclass(frozen=True)
@@ -333,10 +332,5 @@ class PresentTable:
 def present_table(tokenizer: Tokenizer, layout: MotionLayout) -> PresentTable:
     """The table of a tokenizer and the layout of the full frames."""
     columns = torch.from_numpy(layout.present_columns[:, tokenizer.columns.cpu().numpy()])
-    missing_masks = tokenizer.missing(columns.to(tokenizer.columns.device))
-    missing = {name: value.cpu() for name, value in missing_masks.items()}
-    # A tokenizer that gives a part a stream of its own keeps that part out of the other streams.
-    others = torch.ones(len(columns), dtype=torch.bool) if missing else columns.all(1)
-    recorded = [~missing[name] if name in missing else others for name in stream_names(tokenizer.pattern)]
-    streams = torch.stack(recorded, dim=1)
+    streams = tokenizer.recorded(columns.to(tokenizer.columns.device)).cpu()
     return PresentTable(columns, streams, streams.any(1).numpy())

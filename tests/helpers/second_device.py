@@ -15,7 +15,6 @@ from typing import Any
 import torch
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map
 
 
 class _Backend(backend_registration._DummyBackendModule):
@@ -80,7 +79,8 @@ class _Second(TorchDispatchMode):
 
 
 def _run(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
-    values = tree_flatten((args, kwargs))[0]
+    values: list[Any] = []
+    _each(values.append, (args, kwargs))
     far = any(isinstance(value, Far) for value in values)
     copies = func._schema.name in _COPIES
     if func._schema.name in _INDEXED:
@@ -92,14 +92,23 @@ def _run(func: Any, args: Sequence[Any], kwargs: dict[str, Any]) -> Any:
         far = device.type == SECOND.type
     if copies:  # else the copy could be the tensor itself
         args = [args[0].clone(), *args[1:]] if func._schema.name != "aten::copy_" else args
-    near_args, near_kwargs = tree_map(_near, (tuple(args), kwargs))
+    near_args, near_kwargs = _each(_near, (tuple(args), kwargs))
     out = _ELSEWHERE.get(func._schema.name, func)(*near_args, **near_kwargs)
     if func._schema.is_mutable:  # in place
         if func._schema.name == "aten::transpose_":  # as a GRU does
             with torch._C._DisableTorchDispatch():
                 func(*args, **kwargs)
         return args[0] if func._schema.returns else None
-    return tree_map(lambda value: Far(value) if far and isinstance(value, torch.Tensor) else value, out)
+    return _each(lambda value: Far(value) if isinstance(value, torch.Tensor) else value, out) if far else out
+
+
+def _each(change: Callable[[Any], Any], value: Any) -> Any:
+    """The same lists, tuples and dicts of changed values; torch's own way takes several times as long."""
+    if isinstance(value, (list, tuple)):
+        return type(value)([_each(change, one) for one in value])
+    if isinstance(value, dict):
+        return {name: _each(change, one) for name, one in value.items()}
+    return change(value)
 
 
 def _near(value: Any) -> Any:

@@ -24,7 +24,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.models.gpt.losses import accuracy, cross_entropy, group_counts, predicted, token_errors
+from motionloom.models.gpt.losses import (
+    accuracy,
+    cross_entropy,
+    group_counts,
+    predicted,
+    straight_through,
+    token_errors,
+)
 from motionloom.models.layers.frozen import Frozen
 from motionloom.models.layers.strided import SLOPE
 from motionloom.models.layers.transformer import length_mask
@@ -77,7 +84,7 @@ class CaptionerModule(StageModule):
         right = (logits.argmax(-1) == words).float()
         ce = masked_mean(each, counted)
         return {
-            "loss": summed_or_mean(each, counted, summed=self.loss_config.summed),
+            "loss": summed_or_mean(each, counted, self, summed=self.loss_config.summed),
             "ce": ce,
             "accuracy": masked_mean(right, counted),
         }
@@ -127,12 +134,12 @@ class Seq2SeqModule(StageModule):
         each = token_errors(logits, tokens)
         counted = predicted(tokens, logits, known)
         # The release sums errors; the mean is logged either way, so that runs compare.
-        values = {"loss": summed_or_mean(each, counted, summed=self.loss_config.summed), "ce": ce}
+        values = {"loss": summed_or_mean(each, counted, self, summed=self.loss_config.summed), "ce": ce}
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)
         if self.captioner is not None:
             errors, said = self._inverse(batch, self.captioner.module), batch["said"]
-            inverse = summed_or_mean(errors, said != PAD, summed=self.loss_config.summed)
+            inverse = summed_or_mean(errors, said != PAD, self, summed=self.loss_config.summed)
             values["inverse"] = inverse
             values["loss"] = values["loss"] + self.loss_config.inverse_weight * inverse
         return values
@@ -164,9 +171,7 @@ class Seq2SeqModule(StageModule):
 
     def _weights(self, logits: Tensor) -> Tensor:
         """One-hot weights [B, V], differentiable straight through: drawn, or the likeliest in validation."""
-        if self.training:
-            return functional.gumbel_softmax(logits, tau=self.loss_config.gumbel_temperature, hard=True)
-        return functional.one_hot(logits.argmax(-1), logits.shape[-1]).to(logits)
+        return straight_through(logits, self.loss_config.gumbel_temperature, sample=self.training)
 
 
 def _soft(net: Seq2Seq | Captioner, weights: Tensor, kinds: Tensor) -> Tensor:
@@ -192,13 +197,14 @@ class RankNorm(nn.Module):
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("var", torch.ones(channels))
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor, there: Tensor) -> Tensor:
+        """The same of x; padding, where `there` [B, 1, T] is 0, counts for nothing."""
         x = x.to(torch.promote_types(x.dtype, torch.float32))
         mean, var = self.mean.to(x), self.var.to(x)
         if self.training:
-            count = sum_over_ranks(x.new_tensor(x.shape[0] * x.shape[2]))
-            mean = sum_over_ranks_with_grad(x.sum((0, 2))) / count
-            var = sum_over_ranks_with_grad((x - mean[:, None]).square().sum((0, 2))) / count
+            count = sum_over_ranks(there.sum().to(x))
+            mean = sum_over_ranks_with_grad((x * there).sum((0, 2))) / count
+            var = sum_over_ranks_with_grad(((x - mean[:, None]).square() * there).sum((0, 2))) / count
             with torch.no_grad():
                 self.mean.lerp_(mean.to(self.mean), self.momentum)
                 self.var.lerp_((var * count / (count - 1)).to(self.var), self.momentum)
@@ -207,7 +213,9 @@ class RankNorm(nn.Module):
 
 
 class Critic(nn.Module):
-    """Scores [B, T / 4] of motion [B, T, D], T a multiple of 4; higher is more real."""
+    """Scores [B, T / 4] of motion [B, T, D], T a multiple of 4, zero after `length` [B], and which of them
+    are of frames, bool [B, T / 4]; higher is more real.
+    """
 
     def __init__(self, motion_dim: int, width: int) -> None:
         super().__init__()
@@ -216,12 +224,13 @@ class Critic(nn.Module):
         self.norms = nn.ModuleList(map(RankNorm, widths[1:]))
         self.out = nn.Conv1d(width // 2, 1, 3, padding=1)
 
-    def forward(self, motion: Tensor) -> Tensor:
-        x = motion.transpose(1, 2)
+    def forward(self, motion: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
+        x, there = motion.transpose(1, 2), length_mask(length, motion.shape[1])[:, None]
         for down, norm in zip(self.down, self.norms, strict=True):
-            x = functional.leaky_relu(norm(down(x)), SLOPE)
-        scores: Tensor = self.out(x)[:, 0]
-        return scores
+            there = there[..., ::2]
+            # Behind a clip there are zeros again, as behind one that fills its window.
+            x = functional.leaky_relu(norm(down(x), there), SLOPE) * there
+        return self.out(x)[:, 0], there[:, 0]
 
 
 class AdversarialTokenizerModule(AlternatingModule):
@@ -253,10 +262,12 @@ class AdversarialTokenizerModule(AlternatingModule):
     def losses_of(self, group: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """A group's loss of one batch, as `TokenizerModule` takes it."""
         if group == "critic":
-            real, made = self.critic(shared["motion"]), self.critic(shared["made"])
-            terms = {"real": functional.relu(1 - real).mean(), "made": functional.relu(1 + made).mean()}
-            accuracy = ((real > 0).float().mean() + (made < 0).float().mean()) / 2
-            return {"loss": (terms["real"] + terms["made"]) / 2, **terms, "accuracy": accuracy}
+            (real, there), (made, _) = (self.critic(shared[k], batch["length"]) for k in ("motion", "made"))
+            terms = {"real": functional.relu(1 - real), "made": functional.relu(1 + made)}
+            values = {name: masked_mean(each, there) for name, each in terms.items()}
+            right = (real > 0).float() + (made < 0).float()
+            values["accuracy"] = masked_mean(right / 2, there)
+            return {"loss": (values["real"] + values["made"]) / 2, **values}
         values, out = tokenizer_losses(self.net, batch)
         there = length_mask(batch["length"], out.input.shape[1])[..., None]
         if "present" in batch:
@@ -264,6 +275,6 @@ class AdversarialTokenizerModule(AlternatingModule):
         shared |= {"motion": out.input * there, "made": out.reconstruction * there}
         if self.training and not self.judged:
             return values
-        values["adversarial"] = -self.critic(shared["made"]).mean()
+        values["adversarial"] = -masked_mean(*self.critic(shared["made"], batch["length"]))
         values["loss"] = values["loss"] + self.critic_config.weight * values["adversarial"]
         return values

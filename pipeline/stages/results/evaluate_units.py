@@ -223,11 +223,13 @@ class EvaluationUnits(Evaluation):
         moves = all_features((m.joints for m in motions), fps)
         out |= {MOVEMENT + kind: rows for kind, rows in moves.items()}
         for role, judge in self.performed_by.items():
-            if judge.of_faces:
-                made = [m.face for t, m in zip(truths, motions, strict=True) if t.face is not None]
-            else:
-                made = [m.features for m in motions]
-            shown = [x for x in made if x is not None]
-            if shown:
-                out[LATENT[role]] = embed_motions(judge.motions, shown).numpy()
+            faces, pairs = judge.of_faces, zip(truths, motions, strict=True)
+            shown = [
+                (t, m.face if faces else m.features) for t, m in pairs if t.face is not None or not faces
+            ]
+            made = [x for _, x in shown if x is not None]
+            if made:
+                # By what the clip holds, as the recording is judged: else hands would tell the two apart.
+                held = [t.present for t, x in shown if x is not None]
+                out[LATENT[role]] = embed_motions(judge.motions, made, held).numpy()
         return out

@@ -25,6 +25,8 @@ from motionloom.datasets.audio.beat_net import (
     read_beat_net,
 )
 from motionloom.datasets.audio.features import (
+    BEAT,
+    DIM,
     AudioSettings,
     audio_features,
     beats,
@@ -34,6 +36,7 @@ from motionloom.datasets.audio.features import (
     settings_at,
 )
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.recording import render_song
 from motionloom.datasets.synth.music.song import Song
@@ -77,6 +80,17 @@ def song(seconds: float, rate: int, seed: int, bpm: float = 110.0) -> NDArray[np
 def golden(shared: Path) -> dict[str, NDArray]:
     with np.load(shared / "golden" / "t5_audio_A.npz", allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays}
+
+
+def test_beats_are_those_of_the_music_after_normalising_and_back() -> None:
+    draws, truth = np.random.default_rng(0), np.arange(0, 240, 31)
+    for _ in range(200):
+        rows = draws.normal(size=(240, DIM)).astype(np.float32)
+        rows[:, BEAT] = 0
+        rows[truth, BEAT] = 1
+        mean, std = (draws.uniform(0.01, 1, DIM).astype(np.float32) for _ in range(2))
+        back = (rows - mean) / std * std + mean
+        assert np.allclose(MODALITIES["audio"].ticks(None, back, 20.0), truth / 20)
 
 
 def test_438_columns_equal_the_golden_ones(golden: dict[str, NDArray]) -> None:

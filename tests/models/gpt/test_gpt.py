@@ -8,7 +8,7 @@ from torch import Tensor
 from toy_gpt import PATTERN, STREAMS, TINY, aligned_gpt, sequences, toy_gpt
 
 from motionloom.datasets.schema import UserError
-from motionloom.models.gpt.losses import corrupt, soft_codes
+from motionloom.models.gpt.losses import corrupt, cross_entropy, soft_codes, straight_through
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import PAD
@@ -106,6 +106,25 @@ def test_alignment_reaches_every_code_head_from_its_step_on() -> None:
         assert gradient[:-1].abs().max() > 0
         assert gradient[-1].abs().max() == 0  # End is no part of the decoded motion
     assert module.net.text_in.weight.grad.abs().max() > 0
+
+
+@pytest.mark.parametrize("sample", [False, True])
+def test_weights_are_one_code_with_the_gradient_of_the_softmax(sample: bool) -> None:
+    """However flat the distribution is; draws follow it."""
+    logits = torch.linspace(-1, 1, 5).expand(20_000, 5).requires_grad_()
+    torch.manual_seed(0)
+    weights = straight_through(logits, 0.7, sample=sample)
+    torch.testing.assert_close(weights.sort().values, torch.eye(5)[4].expand(20_000, 5))
+    share = weights.mean(0) if sample else torch.tensor([0.0, 0, 0, 0, 1])
+    torch.testing.assert_close(share, logits[0].softmax(-1) if sample else share, rtol=0, atol=0.02)
+    (slope,) = torch.autograd.grad(weights[:, 2].sum(), logits)
+    assert slope.sum(-1).abs().max() < 1e-6 and (slope[:, 2] > 0).all()
+
+
+def test_a_lost_network_has_no_loss_of_zero() -> None:
+    tokens = torch.tensor([[1, 2, -1]])
+    logits = torch.full((1, 3, 4), torch.nan)
+    assert cross_entropy(logits, tokens).isnan()
 
 
 def test_alignment_on_known_logits_decodes_the_codes() -> None:

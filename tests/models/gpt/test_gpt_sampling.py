@@ -97,6 +97,13 @@ def test_draws_follow_the_distribution() -> None:
     assert Drawing()(torch.tensor([[-torch.inf, 1.0, 1.0, -torch.inf]] * 2), ends).tolist() == [1, 2]
 
 
+def test_of_a_lost_network_a_code_is_drawn_and_of_no_text_none(gpt: InterleavedGPT) -> None:
+    """An index outside of a table ends a GPU's context."""
+    uniform = torch.tensor([0.0, 0.9], dtype=torch.float64)
+    assert (Drawing()(torch.full((2, 5), torch.nan), uniform) < 5).all()
+    assert len(generate(gpt, torch.randn(0, 6), seed=[]).groups) == 0
+
+
 def test_top_k_and_top_p() -> None:
     logits = torch.tensor([[0.4, 0.1, 0.3, 0.2]]).log()
 

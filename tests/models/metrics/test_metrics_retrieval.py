@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from motionloom.models.metrics.distributions import diversity, fid, frechet_distance, multimodality
-from motionloom.models.metrics.retrieval import matching_score, r_precision, ranks, recall
+from motionloom.models.metrics.retrieval import accuracy_among, matching_score, r_precision, ranks, recall
 
 
 def close(value: torch.Tensor, expected: torch.Tensor) -> None:
@@ -32,6 +32,15 @@ def test_r_precision_and_matching_equal_public_ones(golden: dict[str, torch.Tens
             matching_score(unit["text"], unit[name], batch=batch),
             golden[f"opentma_{tag}_Matching_score_B{batch}"],
         )
+
+
+def test_what_is_no_number_is_found_last() -> None:
+    text = torch.eye(8)
+    lost = torch.where(torch.arange(8)[:, None] < 4, torch.nan, text)
+    for pair in ((text, lost), (lost, text)):
+        assert r_precision(*pair, batch=8).tolist() == [0.5, 0.5, 0.5]
+    assert recall(text, torch.full_like(text, torch.nan))["t2m/R@1"] == 0
+    assert accuracy_among(lost, text, candidates=4)["top-1"] <= 0.5
 
 
 @pytest.mark.parametrize("threshold", [None, 0.9])

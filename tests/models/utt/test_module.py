@@ -102,6 +102,20 @@ def grads(module: nn.Module) -> dict[str, float]:
     }
 
 
+def test_codes_of_hands_that_a_clip_lacks_teach_nothing() -> None:
+    module = toy_module("h2vq")
+    batch = toy_batch(module)
+    batch["present"][:, module.tokenizer.module.hand_columns] = False
+    module.losses_of("tokens", batch, {})["ce"].backward()
+    body, hand = (head.weight.grad.abs().max() for head in module.net.utt.heads)
+    assert hand == 0 < body
+    # Where one stream says all, such a clip says nothing.
+    module = toy_module("mq")
+    batch = toy_batch(module)
+    batch["present"][:, -1] = False
+    assert module.losses_of("tokens", batch, {})["ce"] == 0
+
+
 @pytest.mark.parametrize("kind", ["mq", "h2vq"])
 def test_the_generators_loss_moves_mate_and_utt_and_not_the_critic(kind: str) -> None:
     module = toy_module(kind, loss={"adversarial": {"weight": 0.5, "sample": False}})

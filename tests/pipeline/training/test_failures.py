@@ -224,7 +224,7 @@ def on_second(*_: object) -> Fabric:
 
 
 def few_steps(recipe: str) -> list[str]:
-    """Two steps of every training, on few clips; nothing waits for its first step."""
+    """Two steps of every training, on few clips, judged once; nothing waits for its first step."""
     sets = ["data.clips=40", "hardware.accelerator=cpu", "hardware.threads=1", "hardware.convert_workers=1"]
     sets.append("hardware.loggers=[]")
     for stage in load_recipe(recipe).stages:
@@ -232,6 +232,8 @@ def few_steps(recipe: str) -> list[str]:
             one = f"{stage.name}.train"
             sets += [f"{one}.{key}=2" for key in ("steps", "checkpoint_every", "validate_every")]
             sets += [f"{one}.batch_size=8", *STARTS.get(stage.name, ())]
+        if "repeats" in type(stage.config).model_fields:
+            sets.append(f"{stage.name}.repeats=1")
     return sets
 
 

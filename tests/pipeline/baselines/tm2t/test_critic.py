@@ -54,10 +54,23 @@ def test_losses_equal_those_of_plain_layers() -> None:
 def test_normalisation_is_torchs_with_its_running_statistics() -> None:
     torch.manual_seed(3)
     own, second = RankNorm(5), nn.BatchNorm1d(5)
+    there = torch.ones(4, 1, 6, dtype=torch.bool)
     for _ in range(3):
         x = 2 * torch.randn(4, 5, 6) + 1
-        torch.testing.assert_close(own(x), second(x))
+        torch.testing.assert_close(own(x, there), second(x))
     assert second.running_mean is not None and second.running_var is not None
     torch.testing.assert_close(own.mean, second.running_mean)
     torch.testing.assert_close(own.var, second.running_var)
-    torch.testing.assert_close(own.eval()(x), second.eval()(x))
+    torch.testing.assert_close(own.eval()(x, there), second.eval()(x))
+
+
+def test_padding_of_a_window_plays_no_part() -> None:
+    """Clips of 12 frames give in windows of 16 what they give alone."""
+    alone, padded = (module(start=0) for _ in range(2))
+    padded.load_state_dict(alone.state_dict())
+    short = {"motion": BATCH["motion"][:, :12], "length": torch.full((4,), 12)}
+    shown = {"motion": functional.pad(short["motion"], (0, 0, 0, 4)), "length": short["length"]}
+    shared: tuple[dict[str, torch.Tensor], ...] = ({}, {})
+    for group in ("tokenizer", "critic"):
+        one = alone.losses_of(group, short, shared[0])
+        torch.testing.assert_close(padded.losses_of(group, shown, shared[1]), one)

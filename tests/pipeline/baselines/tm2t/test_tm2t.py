@@ -26,6 +26,7 @@ from motionloom.pipeline.baselines.tm2t.network import (
     Seq2SeqLossConfig,
     Vocabulary,
     hidden_ends,
+    summed_or_mean,
 )
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig, draw_tokens
 
@@ -108,6 +109,14 @@ def test_the_loss_is_that_of_the_words_one_by_one(summed: bool) -> None:
     got = module.losses({"tokens": tokens, "kinds": kinds, "text": words})
     assert float(got["loss"]) == pytest.approx(total if summed else total / 6, rel=1e-5)
     assert float(got["ce"]) == pytest.approx(total / 6, rel=1e-5)
+    # A sum is the step's whole batch's, as the mean of its parts.
+    module.train().accumulate = 2
+    each, counted = torch.rand(4, 3), torch.rand(4, 3) < 0.7
+    parts = [
+        summed_or_mean(e, c, module, summed=True)
+        for e, c in zip(each.split(2), counted.split(2), strict=True)
+    ]
+    torch.testing.assert_close(sum(parts) / 2, each[counted].sum())
 
 
 GRU = Seq2SeqConfig(reader=6, dim=8, max_tokens=16)
