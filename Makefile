@@ -28,7 +28,9 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "motionloom needs Python 3.11 or newer; name one: make PYTHON=python3.12 demo"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip -c constraints.txt
-	$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[band,glb,remote,tensorboard]'
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt --group dev -e '.[band,glb,remote,tensorboard]'
+	@# pip compiles on one core what it installs. Templates among the packages are no Python.
+	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib >/dev/null || true
 	@touch $(STAMP)
 
 # On a CPU, two processes of one thread train these small networks faster than one of two threads, and do not slow
@@ -39,8 +41,10 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/python -P -m pytest -n auto --maxprocesses 4 --dist loadfile -m "$(FAST)" $(PYTEST_ARGS)
 
+# One process more than cores: a slow test waits for processes that it has started.
 test-all: $(STAMP)
-	$(BIN)/python -P -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
+	@cores=$$(getconf _NPROCESSORS_ONLN); set -x; $(BIN)/python -P -m pytest \
+	  -n $$((cores < 4 ? cores + 1 : 4)) --dist loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 # The tests as a processor with AVX2 and without AVX-512 computes: sums are taken in another order there, so a bound or a
 # digest that only one kind of processor keeps fails here.

@@ -136,16 +136,19 @@ class KindPlan:
         self.clips = clips if balance is None else np.concatenate([groups[kind] for kind in used])
         self._whole: BatchPlan | None = None
         self._own: list[tuple[NDArray[np.int64], BatchPlan]] = []
-        self._turns: list[Source] = []
         # Batches of one kind: each kind has a plan of its own, and the kinds take turns by their weights.
         if homogeneous:
+            turns = []
             for kind in used:
                 own = groups[kind]
                 plan = BatchPlan(len(own), batch_size, seed, sources=dataset.sources(own))
                 self._own.append((own, plan))
-                self._turns.append(Source(0, len(own), weights[kind], name=f"balance.{kind}"))
-            self._epoch = max(1, len(self.clips) // batch_size)
-            self._shares = shares(self._turns, self._epoch)
+                turns.append(Source(0, len(own), weights[kind], name=f"balance.{kind}"))
+            counts = shares(turns, max(1, len(self.clips) // batch_size))
+            place = np.concatenate([(np.arange(count) + 0.5) / count for count in counts])
+            order = np.argsort(place, kind="stable")
+            self._kinds = np.repeat(np.arange(len(counts)), counts)[order]
+            """Number of the kind of each batch of an epoch, the same for every rank."""
         else:
             sources: list[Source] = []
             if balance is None:
@@ -172,13 +175,10 @@ class KindPlan:
         if self._whole is not None:
             turns, items = self._whole.local(n, share)
             return turns, self.clips[items]
-        # Which kind batch k is of is a function of its place in the epoch alone, the same for every rank.
         k, part = divmod(n, share.parts)
-        epoch, position = divmod(k, self._epoch)
-        place = np.concatenate([(np.arange(share) + 0.5) / share for share in self._shares])
-        which = np.repeat(np.arange(len(self._shares)), self._shares)[np.argsort(place, kind="stable")]
-        kind = int(which[position])
-        own, plan = self._own[kind]
-        number = epoch * self._shares[kind] + int((which[:position] == kind).sum())
+        epoch, position = divmod(k, len(self._kinds))
+        of_kind = self._kinds == self._kinds[position]
+        own, plan = self._own[self._kinds[position]]
+        number = int(epoch * of_kind.sum() + of_kind[:position].sum())
         turns, items = plan.local(number * share.parts + part, share)
         return turns, own[items]

@@ -48,10 +48,19 @@ from motionloom.pipeline.baselines.tm2t.network import (
     CriticConfig,
     Seq2SeqLossConfig,
     hidden_ends,
-    summed_or_mean,
     word_errors,
 )
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq
+
+
+def summed_or_mean(each: Tensor, counted: Tensor, module: StageModule, *, summed: bool) -> Tensor:
+    """Errors `each` where `counted`, over the batches of all ranks: their mean, or the sum over the step's
+    whole batch, as the mean of the parts that `module` reads it in.
+    """
+    mean = masked_mean(each, counted)
+    if not summed:
+        return mean
+    return mean * sum_over_ranks(counted.sum().float()) * (module.accumulate if module.training else 1)
 
 
 class CaptionerModule(StageModule):

@@ -29,8 +29,6 @@ from motionloom.models.gpt.tokens import TokenNetwork
 from motionloom.models.layers.transformer import LayerNorm, StackConfig, sinusoid
 from motionloom.models.metrics.captions import words_of
 from motionloom.models.tokenizer.base import Stream
-from motionloom.models.training.distributed import masked_mean, sum_over_ranks
-from motionloom.models.training.stage_module import StageModule
 
 PAD, START, END, UNKNOWN = range(4)
 FIRST = 4
@@ -310,16 +308,6 @@ class Seq2SeqLossConfig(Config):
     gumbel_temperature: float = Field(default=1.0, gt=0)
     summed: bool = False
     """Add errors of a batch up, as TM2T does."""
-
-
-def summed_or_mean(each: Tensor, counted: Tensor, module: StageModule, *, summed: bool) -> Tensor:
-    """Errors `each` where `counted`, over the batches of all ranks: their mean, or the sum over the step's
-    whole batch, as the mean of the parts that `module` reads it in.
-    """
-    mean = masked_mean(each, counted)
-    if not summed:
-        return mean
-    return mean * sum_over_ranks(counted.sum().float()) * (module.accumulate if module.training else 1)
 
 
 def word_errors(logits: Tensor, words: Tensor) -> Tensor:

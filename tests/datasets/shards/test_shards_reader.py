@@ -54,6 +54,8 @@ def test_few_shards_stay_open_and_views_survive(
     dataset, other = (ShardDataset.open(root, "train") for _ in range(2))
     views = [some.motion(i) for i in range(36) for some in (dataset, other)][::2]
     assert len(dataset._access.maps) + len(other._access.maps) == 3, "a process has so many descriptors"
+    dataset.unmap()
+    assert len([other.motion(i) for i in range(36)]) == 36 and len(other._access.maps) == 3
     for i, view in enumerate(views):
         np.testing.assert_array_equal(view, made.clip_motion(int(dataset.ids[i].rpartition("-")[2])))
 

@@ -13,7 +13,7 @@ from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.gpt.tokens import interleave
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.baselines.tm2t.generator import likeliest
-from motionloom.pipeline.baselines.tm2t.module import CaptionerModule, Seq2SeqModule
+from motionloom.pipeline.baselines.tm2t.module import CaptionerModule, Seq2SeqModule, summed_or_mean
 from motionloom.pipeline.baselines.tm2t.network import (
     END,
     FIRST,
@@ -26,7 +26,6 @@ from motionloom.pipeline.baselines.tm2t.network import (
     Seq2SeqLossConfig,
     Vocabulary,
     hidden_ends,
-    summed_or_mean,
 )
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig, draw_tokens
 
