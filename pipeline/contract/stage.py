@@ -149,6 +149,10 @@ class StageCache:
         return stage.kind.captioner(stage, self.given(stage.inputs), self.device)
 
 
+def _nothing() -> None:
+    pass
+
+
 @dataclass(frozen=True)
 class StageContext:
     """The arguments of a stage's `run`. `inputs` maps each role to a finished stage."""
@@ -173,6 +177,8 @@ class StageContext:
     missing, and times may be shown. Within a run equal stages give equal outputs."""
     draws: bool = False
     """Whether motions can be drawn while it trains."""
+    begun: Callable[[], None] = _nothing
+    """Called by a training once its checkpoint has been loaded: until then the folder says what it said."""
 
     @property
     def units(self) -> Units:

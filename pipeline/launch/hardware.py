@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from typing import Annotated, Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.launch.process import local_rank
@@ -60,6 +60,11 @@ class Hardware(Config):
     been compared in this run as they are now, all each time a stage starts, or none."""
     loggers: tuple[LoggerName, ...] = ("csv",)
     """Where the figures of trainings go, besides `metrics.jsonl`; all but csv are extras of these names."""
+
+    @field_validator("loggers", mode="before")
+    @classmethod
+    def _one(cls, value: object) -> object:
+        return (value,) if isinstance(value, str) else value
 
     def resolved_accelerator(self) -> Literal["cpu", "gpu"]:
         if self.accelerator == "auto":

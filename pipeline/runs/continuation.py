@@ -85,30 +85,33 @@ def continuation(
     if wanted is None or old is None or step is None:
         return "there is no checkpoint to go on from"
     config: TrainedStageConfig = stage.config
-    keys = sorted(
-        key for key in old.config.keys() | wanted.config if old.config.get(key) != wanted.config.get(key)
-    )
+    # A change that no checkpoint has been trained with yet is replaced by the next, or taken back.
+    noted = [change for change in before.changed if change.step < step]
+    untried = (change for change in reversed(before.changed) if change.step >= step)
+    trained = old.config | {change.key: change.old for change in untried}
+    keys = sorted(key for key in trained.keys() | wanted.config if trained.get(key) != wanted.config.get(key))
     # Keys that say what a step computes, and nothing about the network.
     free = ("loss.", "train.", *(f"{key}." for key, _ in optimizers_of(config)))
-    changes = [f"{key} {_say(old.config, key)} -> {_say(wanted.config, key)}" for key in keys]
+    changes = [f"{key} {_say(trained, key)} -> {_say(wanted.config, key)}" for key in keys]
     fixed = [change for key, change in zip(keys, changes, strict=True) if not key.startswith(free)]
     if fixed or old.others != wanted.others:
         what = ", ".join(fixed) or "its inputs, its seed or the version of its kind"
         return f"what it is made of has changed ({what}); only {', '.join(f'{part}*' for part in free)} may"
-    if step >= config.train.steps:
+    # What was to be trained further, and was not, is finished where it was.
+    if step > config.train.steps or (step == config.train.steps and set(keys) - {_STEPS}):
         return f"step {step} is its last; raise {stage.name}.{_STEPS}"
-    differs, schedule = ", ".join(changes), config.schedule_of_length()
+    differs, schedule = ", ".join(changes) or "as it was trained", config.schedule_of_length()
     reason = f"{differs}: goes on from step {step}"
     if _STEPS in keys and schedule is not None:
         reason += f"; {schedule} now ends with step {config.train.steps}, which is not the same as at once"
-    # A change that no checkpoint has been trained with yet is replaced by the next, or taken back.
-    noted = [change for change in before.changed if change.step < step]
-    begun = {change.key: change.old for change in reversed(before.changed) if change.step >= step}
-    for key in sorted({*keys, *begun} - ({_STEPS} if schedule is None else set())):
-        first, now = begun.get(key, old.config.get(key)), wanted.config.get(key)
-        if first != now:
-            noted.append(Change(step=step, key=key, old=first, new=now))
-    return Continuation(step, differs, reason, tuple(noted), bool(set(keys) - HOW - {_STEPS}))
+    noted += [
+        Change(step=step, key=key, old=trained.get(key), new=wanted.config.get(key))
+        for key in keys
+        if key != _STEPS or schedule is not None
+    ]
+    # What was asked for once, and has not been trained with yet, is not asked for again.
+    asked = {key for key in keys if old.config.get(key) != wanted.config.get(key)}
+    return Continuation(step, differs, reason, tuple(noted), bool(asked - HOW - {_STEPS}))
 
 
 def newest_step(folder: Path) -> int | None:

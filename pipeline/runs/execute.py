@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -70,7 +72,10 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                     if doubt not in said:  # of data that this run has made
                         say(console, f"    {doubt}", "yellow")
                 _prepare(folder, row)
-            perform(stage.kind, context_of(recipe, run, stage, folder, console, team), team, run)
+            context = context_of(recipe, run, stage, folder, console, team)
+            if leads:
+                context = replace(context, begun=partial(_note, folder, row))
+            perform(stage.kind, context, team, run)
             if leads:
                 seconds = time.perf_counter() - begin
                 took = {"seconds": round(seconds, 2), "hardware": recipe.hardware.describe()}
@@ -181,8 +186,14 @@ def _prepare(folder: Path, row: PlannedStage) -> None:
     if row.action == "run":
         remove_tree(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    # A training that cannot load its checkpoint with other settings stays what it was.
+    if row.action == "run" or not row.stage.kind.trains:
+        _note(folder, row)
+
+
+def _note(folder: Path, row: PlannedStage) -> None:
+    """Note what is being made in a folder; a training that goes on is not finished any more."""
     write_json(folder / "started.json", row.started.dump())
-    # A training that goes on is not finished any more.
     (folder / "artifact.json").unlink(missing_ok=True)
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.dances import dance_to, dances_for
 from motionloom.pipeline.evaluation.estimate import row_estimates
@@ -52,6 +53,8 @@ def draw_samples(run: Path, stage: str) -> Path:
             real = [Performance(one.joints, one.joints, fps, one.face, one.truth) for one in truths]
         else:
             metrics, dances = metrics_of("dances"), dances_for(bundle, clips, _COUNT, seconds=_DANCE_SECONDS)
+            if not dances:
+                raise UserError(f"{data.folder}: no clip of the validation split has music to dance to")
             made = dance_to(bundle, dances)
             real = [
                 Performance(one.joints, one.joints, fps, truth=one.truth, beats=one.beats) for one in dances

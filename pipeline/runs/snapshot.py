@@ -8,7 +8,7 @@ the run are inputs from outside. So every command takes it as any other run, als
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -72,7 +72,7 @@ def run_at(run: P, at: str | None, what: str = GENERATOR) -> Iterator[P]:
         yield run  # all trainings that have begun are finished
         return
     with TemporaryDirectory(prefix="motionloom-") as temporary:
-        made = _write(Path(temporary), folder, recipe, finished, chosen)
+        made = _write(Path(temporary), folder, recipe, finished, chosen, exact=not at.endswith(NEWEST))
         try:
             yield type(run)(made)
         except UserError as error:
@@ -117,9 +117,17 @@ def _gives(stage: Stage, *what: str) -> bool:
 
 
 def _write(
-    place: Path, run: Path, recipe: Recipe, finished: Mapping[str, CompletedStage], chosen: Mapping[str, int]
+    place: Path,
+    run: Path,
+    recipe: Recipe,
+    finished: Mapping[str, CompletedStage],
+    chosen: Mapping[str, int],
+    *,
+    exact: bool,
 ) -> Path:
-    """Write the run folder into `place`, and say how far each training is; returns it."""
+    """Write the run folder into `place`, and say how far each training is; returns it. `exact`: the first was
+    asked for by its step.
+    """
     first, aside = next(iter(chosen)), make_console(aside=True)
     label = f"{first}-{chosen[first]}"
     folder = place / f"{run.resolve().name}-{label}"
@@ -130,7 +138,8 @@ def _write(
         lacking = stage.inputs.keys() - given.keys()
         if stage.name in chosen:
             try:
-                own.append(_take(stage.name, chosen[stage.name], run, folder, outside, aside))
+                content = _read(run, stage.name, chosen[stage.name], aside, exact and stage.name == first)
+                own.append(_take(stage.name, *content, folder, outside, aside))
             except UserError as error:
                 if stage.name == first:
                     raise
@@ -141,14 +150,16 @@ def _write(
             names[stage.name] = str(finished[stage.name].folder.resolve())
             outside[names[stage.name]] = finished[stage.name]
         elif not stage.kind.trains and _remains(stage, given, lacking):
-            # The first generator is the default: one of a checkpoint comes before finished ones.
-            given = dict(sorted(given.items(), key=lambda item: item[1] in outside))
             own.append(replace(stage, inputs=given))
             names[stage.name] = stage.name
         elif not stage.kind.trains and _gives(stage, GENERATOR, CAPTIONER):
             needed = ", ".join(sorted(stage.inputs[role] for role in lacking))
             say(aside, f"without {stage.name}: there is no checkpoint yet of {needed}", "yellow")
+        elif stage.name in finished and _gives(stage, GENERATOR, CAPTIONER):
+            changed = ", ".join(one.name for one in recipe.above(stage) if one.name in chosen)
+            say(aside, f"without {stage.name}, which was trained with the finished {changed}", "yellow")
     name = f"{recipe.name}-{label}"
+    own = _asked_first(own, first)
     new = replace(recipe, name=name, stages=tuple(own), outside=outside)
     write_text(folder / "recipe.yaml", new.to_yaml(folder))
     for stage in own:
@@ -163,6 +174,32 @@ def _write(
     return folder
 
 
+def _asked_first(stages: Sequence[Stage], first: str) -> list[Stage]:
+    """Stages, each behind its inputs, and as early as can be the generators that `first` is part of: the
+    first generator is the default, of a run as of a stage that reads every one.
+    """
+    named, ordered = {stage.name: stage for stage in stages}, dict[str, Stage]()
+
+    def above(stage: Stage) -> list[Stage]:
+        return [named[name] for name in stage.inputs.values() if name in named]
+
+    def asked(stage: Stage) -> bool:
+        return stage.name == first or any(map(asked, above(stage)))
+
+    def add(stage: Stage) -> None:
+        for one in above(stage):
+            add(one)
+        ordered.setdefault(stage.name, stage)
+
+    for stage in sorted(stages, key=lambda one: not (_gives(one, GENERATOR, CAPTIONER) and asked(one))):
+        add(stage)
+    places = [*ordered, *(name for stage in stages for name in stage.inputs.values() if name not in named)]
+    return [
+        replace(stage, inputs=dict(sorted(stage.inputs.items(), key=lambda item: places.index(item[1]))))
+        for stage in ordered.values()
+    ]
+
+
 def _remains(stage: Stage, given: Iterable[str], lacking: Set[str]) -> bool:
     """Whether a stage that trains nothing is of use: a generator with all inputs, or one that reads any."""
     if _gives(stage, GENERATOR, CAPTIONER):
@@ -175,15 +212,19 @@ def _remains(stage: Stage, given: Iterable[str], lacking: Set[str]) -> bool:
 
 
 def _take(
-    name: str, step: int, run: Path, folder: Path, outside: dict[str, CompletedStage], aside: Console
+    name: str,
+    path: Path,
+    content: Checkpoint,
+    folder: Path,
+    outside: dict[str, CompletedStage],
+    aside: Console,
 ) -> Stage:
     """Write a training's checkpoint as a finished stage of the run `folder`; returns its stage there."""
     from motionloom.models.training.averaging import AveragedWeights
     from motionloom.pipeline.training.trained_stage import describe
 
-    source, home = stage_folder(run, name), stage_folder(folder, name)
-    path, content = _read(source / "checkpoints", step)
-    hyper = content["hyper_parameters"]
+    source, home = path.parents[1], stage_folder(folder, name)
+    hyper, run = content["hyper_parameters"], path.parents[3]
     for role, place in hyper["inputs"].items():
         if identity_of((source / place).resolve()) != hyper["identities"][role]:
             raise UserError(
@@ -214,19 +255,25 @@ def _take(
     return stage
 
 
-def _read(folder: Path, step: int) -> tuple[Path, Checkpoint]:
-    """A checkpoint and its content; a newer one, where the training deletes it meanwhile."""
+def _read(run: Path, name: str, step: int, aside: Console, exact: bool) -> tuple[Path, Checkpoint]:
+    """A training's checkpoint and its content: a newer one where the training deletes it meanwhile, the one
+    before where it is damaged and not `exact`ly this step was asked for.
+    """
     from motionloom.pipeline.training.checkpointing import DamagedError, name_of, read_checkpoint, step_of
 
+    folder = stage_folder(run, name) / "checkpoints"
     while True:
         path = folder / name_of(step)
         try:
             return path, read_checkpoint(path)
         except DamagedError as error:
-            newest = max((step_of(file) or 0 for file in folder.glob("*.ckpt")), default=0)
-            if path.is_file() or newest <= step:
+            there = [step_of(file) or 0 for file in folder.glob("*.ckpt")]
+            other = [one for one in there if (one < step and not exact if path.is_file() else one > step)]
+            if not other:
                 raise UserError(f"{path}: {error}; take another one by --at") from None
-            step = newest
+            if path.is_file():
+                say(aside, f"{path}: {error}; the one before is used", "yellow")
+            step = max(other)
 
 
 def _finish(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sized
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Protocol
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, field_validator
 
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Numbered
@@ -74,6 +74,11 @@ class TrainConfig(Config):
     figures of them, drawn on the CPU by a process beside the training; 0 turns them off."""
     validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
     """Steps between validations, rounded up to checkpoints; 0 turns them off."""
+
+    @field_validator("ema")
+    @classmethod
+    def _off(cls, value: float | None) -> float | None:
+        return value or None  # one way to say it, so that the other is no change
 
     def seed_of(self, recipe: int) -> int:
         """Return the seed of the training in a recipe of seed `recipe`."""

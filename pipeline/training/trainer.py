@@ -82,6 +82,11 @@ def fit(
     except RuntimeError as error:
         if isinstance(error, dist.DistBackendError) or "by peer" in str(error) or "imed out" in str(error):
             raise TeamError.lost(training.log.folder) from None
+        if "DataLoader worker" in str(error) and "killed" in str(error):
+            raise UserError(
+                f"stage {context.name}: a loader worker was killed, as systems do that are short of memory; "
+                f"lower hardware.workers and run the same command, which goes on from the last checkpoint"
+            ) from error
         if "does not have a deterministic implementation" in str(error):
             what = str(error).partition(",")[0]
             raise UserError(f"stage {context.name}: {what}; set hardware.deterministic: false") from error
@@ -129,6 +134,7 @@ class Training:
         # Loaded before telemetry and writer begin: both go on from the module's step.
         if resume is not None:
             self._load(read_checkpoint(resume))
+        context.begun()
         self.writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)
         sample_every = -(-config.sample_every // self.every) * self.every
         self.samples = SampleProcess(context, sample_every)
@@ -325,8 +331,8 @@ class Training:
         except (RuntimeError, ValueError) as error:  # torch names every tensor that does not fit
             raise UserError(
                 f"{self.folder / name_of(module.step)}: holds another network than {name} has now "
-                f"({str(error).splitlines()[-1].strip()}); give the settings that it began with, or begin "
-                f"anew with --from {name}"
+                f"({str(error).splitlines()[-1].strip()[:200]}); give the settings that it began with, or "
+                f"begin anew with --from {name}"
             ) from None
         average = state["average"]
         if self.config.ema and average is None:  # it begins now, with these weights

@@ -218,6 +218,39 @@ def test_an_average_begins_or_ends_where_it_is_asked_for(tmp_path: Path) -> None
     assert (7, "train.ema", 0.9, None) in changes(tmp_path)
 
 
+def test_what_cannot_be_loaded_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a finished training nor one that is not."""
+    for ends in (True, False):
+        folder = tmp_path / str(ends)
+        go(folder) if ends else dies(folder, 8)
+        stage = folder / "run/stages/duel"
+        before = {path: path.read_bytes() for path in stage.rglob("*") if path.is_file()}
+        with monkeypatch.context() as patch, pytest.raises(UserError, match="another network than duel"):
+            patch.setattr(tiny_adversaries, "DIM", 5)
+            go(folder, LONG, "duel.optim.lr=0.02", go_on=["duel"])
+        assert {path: path.read_bytes() for path in before} == before
+        assert go(folder)[0] == ("skip" if ends else "resume") and changes(folder) == []
+
+
+@pytest.mark.parametrize("more", [(), ("duel.optim.schedule=cosine",)])
+def test_what_was_to_be_trained_further_by_mistake_is_finished_again(
+    tmp_path: Path, more: tuple[str, ...]
+) -> None:
+    go(tmp_path, *more)
+    before = outcome(tmp_path)
+    dies(tmp_path, 12, LONG, *more)
+    assert Artifact.find(tmp_path / "run/stages/duel") is None
+    assert go(tmp_path, *more)[0] == "resume" and outcome(tmp_path) == before
+    # So is a rate that nothing was trained with.
+    dies(tmp_path, 12, LONG, *more, "duel.optim.lr=0.5", go_on=["duel"])
+    assert go(tmp_path, *more)[0] == "resume" and outcome(tmp_path) == before
+
+
+def test_two_ways_to_turn_an_average_off_are_one(tmp_path: Path) -> None:
+    go(tmp_path)
+    assert go(tmp_path, "duel.train.ema=0")[0] == "skip"
+
+
 def test_another_network_in_the_checkpoint_is_named(tmp_path: Path) -> None:
     dies(tmp_path, 8)
     path = tmp_path / "run/stages/duel/checkpoints" / name_of(6)

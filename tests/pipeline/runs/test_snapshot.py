@@ -26,7 +26,7 @@ from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.execute import draws_motions
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.samples import draw_samples
-from motionloom.pipeline.runs.snapshot import run_at
+from motionloom.pipeline.runs.snapshot import _asked_first, run_at
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.training import telemetry
 from motionloom.pipeline.training.checkpointing import readable
@@ -175,6 +175,38 @@ def test_samples_of_dances(ude_run: Any, tmp_path: Path) -> None:
     shutil.copytree(ude_run.folder, run)
     out = draw_samples(run, "utt")
     assert out.name == "step=00000012" and list(out.glob("*.npz"))
+
+
+def test_what_is_asked_for_is_the_first_generator() -> None:
+    """Of a run of many, also where others are not finished either."""
+    recipe = load_recipe("baselines-tiny-ude")
+    makers = {one.name for one in recipe.stages if "generator" in one.kind.gives(one.config)}
+    for asked in sorted({"utt", "dmd"} | makers - {"ude"}):
+        # What it was trained with is finished, and comes from outside.
+        above = {one.name for one in recipe.above(recipe.stage(asked))}
+        stages = [one for one in recipe.stages if one.name not in above]
+        ordered = _asked_first(stages, asked)
+        names = [one.name for one in ordered]
+        assert sorted(names) == sorted(one.name for one in stages)
+        for place, one in enumerate(ordered):
+            assert not set(names[place:]) & set(one.inputs.values())
+        first = next(one for one in ordered if one.name in makers)
+        assert asked == first.name or asked in first.inputs.values()
+        every = recipe.stage("generate").inputs.values(), ordered[names.index("generate")].inputs.values()
+        assert sorted(every[0]) == sorted(every[1])
+        assert next(name for name in every[1] if name in makers - above) == first.name
+
+
+def test_the_one_before_a_damaged_checkpoint(begun: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
+    run = shutil.copytree(begun, tmp_path / "run")
+    last, before = sorted((run / "stages/gpt/checkpoints").glob("*.ckpt"), reverse=True)[:2]
+    last.write_bytes(last.read_bytes()[:-50])
+    step = int(before.stem.partition("=")[2])
+    with run_at(run, "newest") as folder:
+        artifact = Artifact.find(folder / "stages/gpt")
+    assert artifact is not None and artifact.step == step
+    with pytest.raises(UserError, match=r"damaged; take another one"), run_at(run, "gpt:30"):
+        pass
 
 
 def test_trainings_that_motions_are_drawn_of() -> None:

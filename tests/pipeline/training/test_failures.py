@@ -93,6 +93,15 @@ def test_a_shard_that_changes_ends_the_training_before_its_next_checkpoint(
     assert watch.explain(found) is found and isinstance(watch.explain(OSError()), UserError)
 
 
+def test_a_worker_that_the_system_kills_is_called_that(recipe: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def killed(*_: object) -> None:
+        raise RuntimeError("DataLoader worker (pid 25032) is killed by signal: Killed. ")
+
+    monkeypatch.setattr(ToyBatches, "__getitem__", killed)
+    with pytest.raises(UserError, match=r"toy: a loader worker was killed.*hardware\.workers"):
+        run_recipe(recipe, recipe.parent / "killed", console=Console(quiet=True))
+
+
 def test_a_log_folder_that_turns_read_only_ends_no_training(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
