@@ -97,10 +97,11 @@ def test_frames_follow_the_sound_after_seek_pause_and_at_half_speed(
     assert page.evaluate("[__viewer.sound, __viewer.audio.paused]") == [False, True]  # silent at first
     turn_on(page, until)
     assert_in_step(moments(page))
-    page.evaluate("__viewer.setFrame(100)")
-    until(page, "!__viewer.audio.seeking && __viewer.audio.currentTime > 5.05")
+    # Far from the end, where a slow machine would hear the beginning again.
+    page.evaluate("__viewer.setFrame(60)")
+    until(page, "!__viewer.audio.seeking && __viewer.audio.currentTime > 3.05")
     seen = moments(page)
-    assert seen[0]["heard"] > 5.0
+    assert seen[0]["heard"] > 3.0
     assert_in_step(seen)
 
     page.locator("canvas").first.focus()
