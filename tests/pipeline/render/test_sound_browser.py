@@ -56,14 +56,14 @@ def turn_on(page: Any, until: Make) -> None:
 
 
 def moments(page: Any, count: int = 20, gap: int = 3) -> list[dict[str, float]]:
-    """What is drawn and what is heard, `count` times, right after the page has drawn.
+    """What is drawn and what is heard, `count` times or for 1.5 s, right after the page has drawn.
 
     `frame` is the number written on the figure; `late` the seconds since the browser began this drawing:
     the sound has gone on for that long, at most, since the page looked at its clock.
     """
     return page.evaluate(
         """([count, gap]) => new Promise((done) => {
-            const out = []; let k = 0;
+            const out = [], end = performance.now() + 1500, more = requestAnimationFrame; let k = 0;
             const look = (start) => {
                 const frame = parseInt(document.querySelector(".mlv-count").textContent) - 1;
                 const audio = __viewer.audio;
@@ -71,7 +71,7 @@ def moments(page: Any, count: int = 20, gap: int = 3) -> list[dict[str, float]]:
                     frame, time: __viewer.time, heard: audio.currentTime, rate: audio.playbackRate,
                     late: (performance.now() - start) / 1000, paused: audio.paused,
                 });
-                if (out.length < count) requestAnimationFrame(look); else done(out);
+                if (out.length < count && performance.now() < end) more(look); else done(out);
             };
             requestAnimationFrame(look);
         })""",
