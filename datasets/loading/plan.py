@@ -24,7 +24,7 @@ POOL = 8
 
 
 class Share(NamedTuple):
-    """What one process reads of a step's batch: its rows of each part."""
+    """The rows of a step's batch that one process reads, some of each part."""
 
     rank: int = 0
     world: int = 1

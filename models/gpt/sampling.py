@@ -192,7 +192,7 @@ class Rows:
         if first is not None:
             self.embeddings = network.joint_embeddings()
             self.x = first.to(self.embeddings.dtype, copy=True)
-            """What the network reads next, of `first`'s shape."""
+            """Input of the next step, of `first`'s shape."""
 
     def draw(self, hidden: Tensor) -> None:
         """Draw token number `at` of each row by the network's output there [B, 1, D], of guidance [2B, 1, D].
@@ -212,7 +212,7 @@ class Rows:
         if self.x is not None and self.embeddings is not None:
             # Both passes of guidance read the tokens that were drawn under guidance.
             self.x.view(-1, *token.shape, self.x.shape[2]).copy_(self.embeddings[kind, token])
-        at += 1
+        self.at += 1
 
     def counts(self) -> Tensor:
         """New groups of each row as far as they are drawn: up to its End, at most its limit; int64 [B]."""

@@ -121,7 +121,7 @@ class KVCache:
         return slice(self.length, self.length + count) if self.at is None else self.at
 
     def mask(self, x: Tensor) -> Tensor | None:
-        """What attention adds at position `at`, [1, 1, 1, size]; None where all that is stored is seen."""
+        """Return the mask that is added at position `at`, [1, 1, 1, size]; None where all stored is seen."""
         if self.at is None:
             return None
         if self._masks is None:

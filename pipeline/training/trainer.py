@@ -82,7 +82,7 @@ def fit(
     except RuntimeError as error:
         if isinstance(error, dist.DistBackendError) or "by peer" in str(error) or "imed out" in str(error):
             raise TeamError.lost(training.log.folder) from None
-        if "DataLoader worker" in str(error) and "killed" in str(error):
+        if "killed by signal: Killed" in str(error):
             raise UserError(
                 f"stage {context.name}: a loader worker was killed, as systems do that are short of memory; "
                 f"lower hardware.workers and run the same command, which goes on from the last checkpoint"

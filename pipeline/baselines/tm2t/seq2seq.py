@@ -66,7 +66,7 @@ class _Tied(nn.Module):
 
     @property
     def bias(self) -> Tensor:
-        """What other outputs have, for `TokenNetwork.joint_heads`."""
+        """Zeros, as `TokenNetwork.joint_heads` asks for a bias."""
         return self.weight.new_zeros(len(self.weight))
 
     def forward(self, x: Tensor) -> Tensor:

@@ -27,7 +27,7 @@ VIEWS = {
     "view",
 }
 VIEWS |= {"unsqueeze", "_unsafe_view"}
-"""What launches no kernel."""
+"""Operations that launch no kernel."""
 
 
 def test_drawn_as_with_a_growing_cache_and_never_waiting(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -56,7 +56,7 @@ def turn_on(page: Any, until: Make) -> None:
 
 
 def moments(page: Any, count: int = 20, gap: int = 3) -> list[dict[str, float]]:
-    """What is drawn and what is heard, `count` times or for 1.5 s, right after the page has drawn.
+    """Return what is drawn and heard, `count` times or for 1.5 s, right after the page has drawn.
 
     `frame` is the number written on the figure; `late` the seconds since the browser began this drawing:
     the sound has gone on for that long, at most, since the page looked at its clock.
