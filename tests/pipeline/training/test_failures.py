@@ -169,6 +169,9 @@ ANY_ORDER = {
 """Operations that `torch.use_deterministic_algorithms` refuses on a GPU or turns into slow ones; sums of
 gradients that a gather or an index gives (scatter_add, index_put) it sorts."""
 
+FEW = {"repeats": 1, "shuffles": 1, "count": 1, "dances": 1, "clips": 4}
+"""Of what is drawn and judged: every operation takes as long as a hundred do without the second device."""
+
 MAY_WAIT = {"ActorCriticModule"}
 """Its rewards are beats of dances, which numpy finds."""
 
@@ -235,14 +238,16 @@ def on_second(*_: object) -> Fabric:
 def few_steps(recipe: str) -> list[str]:
     """Two steps of every training, on few clips, judged once; nothing waits for its first step."""
     sets = ["data.clips=40", "hardware.accelerator=cpu", "hardware.threads=1", "hardware.convert_workers=1"]
-    sets.append("hardware.loggers=[]")
+    sets += ["hardware.loggers=[]", *(["data.dances.songs=4"] if "ude" in recipe else [])]
     for stage in load_recipe(recipe).stages:
         if isinstance(stage.config, TrainedStageConfig):
             one = f"{stage.name}.train"
             sets += [f"{one}.{key}=2" for key in ("steps", "checkpoint_every", "validate_every")]
             sets += [f"{one}.batch_size=8", *STARTS.get(stage.name, ())]
-        if "repeats" in type(stage.config).model_fields:
-            sets.append(f"{stage.name}.repeats=1")
+        if stage.name != "data":
+            fields = type(stage.config).model_fields
+            sets += [f"{stage.name}.{key}={value}" for key, value in FEW.items() if key in fields]
+            sets += [f"{stage.name}.sampling.denoising_steps=3"] if "sampling" in fields else []
     return sets
 
 
