@@ -170,9 +170,12 @@ FrameRate = Annotated[float, Field(ge=0.1, le=1000)]
 
 
 class Config(BaseModel):
-    """Base of every config class and record: unknown keys and wrong types are refused, values are frozen."""
+    """Base of every config class and record: unknown keys, wrong types and numbers that are not finite are
+    refused, values are frozen."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, defer_build=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, validate_default=True, defer_build=True, allow_inf_nan=False
+    )
 
     @classmethod
     def parse(cls, data: Any, where: str) -> Self:

@@ -12,6 +12,7 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -122,6 +123,17 @@ def sha256_of(path: Path) -> str:
     """sha256 of a file's content, hex."""
     with path.open("rb") as file:
         return hashlib.file_digest(cast(Any, file), "sha256").hexdigest()
+
+
+def content_of(path: Path) -> str:
+    """The same of a source file; it is read again only where its size or its time has changed."""
+    about = path.stat()
+    return _content_of(path, about.st_size, about.st_mtime_ns)
+
+
+@lru_cache(maxsize=2**20)
+def _content_of(path: Path, size: int, changed: int) -> str:
+    return sha256_of(path)
 
 
 def sha256_of_json(value: object) -> str:

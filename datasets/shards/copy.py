@@ -6,9 +6,7 @@ compared there. The manifest goes last, and an older one is deleted first: no re
 
 from __future__ import annotations
 
-import hashlib
 import tempfile
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,22 +64,22 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
 
 def _remove_older(there: Store, manifest: Manifest, digest: str) -> None:
     """Delete an older manifest at the target, after the files that it alone names."""
-    if _digest(there, MANIFEST_FILE) in (None, digest):
+    if there.digest(MANIFEST_FILE) in (None, digest):
         return
     old, _ = read_manifest(there)
     if old.name != manifest.name:
         raise UserError(f"{there.place}: holds data set '{old.name}', not '{manifest.name}'; name another")
     gone = sorted({shard.name for shard in old.shards} - {shard.name for shard in manifest.shards})
     for name in (*map(_index_name, gone), *gone, *_BESIDE, MANIFEST_FILE):
-        if _digest(there, name) is not None:
-            persist(there.where(name), partial(there.system().rm_file, there.where(name)))
+        if there.digest(name) is not None:
+            there.remove(name)
 
 
 def _send_file(here: Store, there: Store, name: str, wanted: str | None, folder: Path) -> bool:
     """Send a file unless the target has it, compare it there, and return whether it was sent."""
-    if wanted is not None and _digest(there, name) == wanted:
+    if wanted is not None and there.digest(name) == wanted:
         return False
-    source, target, path = here.where(name), there.where(name), folder / name
+    source, path = here.where(name), folder / name
     if isinstance(here, LocalStore):
         path = here.root / name
         if not path.is_file():
@@ -91,35 +89,16 @@ def _send_file(here: Store, there: Store, name: str, wanted: str | None, folder:
     found = sha256_of(path)
     if wanted not in (None, found):
         raise UserError(f"{source}: the sha256 is not the manifest's: damaged; nothing of it is copied")
-    if wanted is None and _digest(there, name) == found:
+    if wanted is None and there.digest(name) == found:
         return False
     try:
-        persist(target, lambda: there.system().put_file(str(path), target))
-    except MissingFileError:
-        raise UserError(f"{there.place}: no such bucket or repository; make it first") from None
+        there.put(path, name)
     finally:
         if path.parent == folder:
             path.unlink()
-    if _digest(there, name) != found:
-        raise UserError(f"{target}: is not what was sent, by its sha256; give the command again")
+    if there.digest(name) != found:
+        raise UserError(f"{there.where(name)}: is not what was sent, by its sha256; give the command again")
     return True
-
-
-def _digest(store: Store, name: str) -> str | None:
-    """Return the sha256 of a stored file, from its bytes or the hub's record; None if it is missing."""
-    where = store.where(name)
-
-    def digest() -> str:
-        system = store.system()
-        if large := system.info(where).get("lfs"):
-            return str(large["sha256"])
-        with system.open(where, "rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-
-    try:
-        return persist(where, digest, first=True)
-    except MissingFileError:
-        return None
 
 
 def _index_name(shard: str) -> str:

@@ -192,8 +192,10 @@ def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:
     try:
         with open_plain(path) as file:
             return read_index(file, str(path), split, shards)
-    except OSError:
+    except FileNotFoundError:
         raise UserError(f"{path}: no such file; convert the dataset again") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 def read_index(file: BinaryIO, where: str, split: Split, shards: list[ShardInfo]) -> SplitIndex:

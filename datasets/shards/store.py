@@ -12,6 +12,7 @@ import hashlib
 import os
 import random
 import re
+import shutil
 import time
 from collections.abc import Callable
 from functools import lru_cache
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
+from motionloom.datasets.base.files import atomic_file, sha256_of
 from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError, open_plain, read_plain
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 from motionloom.datasets.shards.checksums import LocalShard, fault_of
@@ -91,11 +93,21 @@ class LocalStore:
         """A whole shard, buffered, from its beginning."""
         return self._open(shard.name)
 
-    def system(self) -> Any:
-        """The fsspec file system that `where` names files of."""
-        import fsspec
+    def digest(self, name: str) -> str | None:
+        """sha256 of a stored file; None if it is missing."""
+        try:
+            return sha256_of(self.root / name)
+        except FileNotFoundError:
+            return None
 
-        return fsspec.filesystem("file", auto_mkdir=True)
+    def put(self, path: Path, name: str) -> None:
+        """Store a file of this machine under a name."""
+        with path.open("rb") as file, atomic_file(self.root / name) as into:
+            shutil.copyfileobj(file, into)
+
+    def remove(self, name: str) -> None:
+        """Delete a stored file."""
+        (self.root / name).unlink()
 
     def _open(self, name: str) -> BinaryIO:
         try:
@@ -141,6 +153,32 @@ class RemoteStore:
         """Open a shard in the cache, where it was compared with the manifest's sha256 when it arrived."""
         return self.cache.get(f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path))
 
+    def digest(self, name: str) -> str | None:
+        """The same, from the file's bytes or the hub's record."""
+        where = self.where(name)
+
+        def found() -> str:
+            if large := self.system().info(where).get("lfs"):
+                return str(large["sha256"])
+            with self.system().open(where, "rb") as file:
+                return hashlib.file_digest(file, "sha256").hexdigest()
+
+        try:
+            return persist(where, found, first=True)
+        except MissingFileError:
+            return None
+
+    def put(self, path: Path, name: str) -> None:
+        where = self.where(name)
+        try:
+            persist(where, lambda: self.system().put_file(str(path), where))
+        except MissingFileError:
+            raise UserError(f"{self.place}: no such bucket or repository; make it first") from None
+
+    def remove(self, name: str) -> None:
+        where = self.where(name)
+        persist(where, lambda: self.system().rm_file(where))
+
     def _fetch(self, shard: ShardInfo, path: Path) -> None:
         url = self.where(shard.name)
 
@@ -152,6 +190,7 @@ class RemoteStore:
         persist(url, fetch)
 
     def system(self) -> Any:
+        """The fsspec file system that `where` names files of."""
         settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith(("AWS_", "HF_"))))
         return _connect(cast(str, _scheme(self.place)), os.getpid(), settings)
 

@@ -6,6 +6,7 @@ on its neighbours. `synthesize` writes them through the shard writer like any ot
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,7 +33,16 @@ from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.actions import arms, floor, legs, locomotion
 from motionloom.datasets.synth.actions.maths import Array, ease
 from motionloom.datasets.synth.actions.pose import OVERLAP, Track, joined
-from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, SEATED, Span, Truth, draw, require_known
+from motionloom.datasets.synth.actions.truth import (
+    ACTIONS,
+    BASIC,
+    SEATED,
+    Span,
+    Truth,
+    draw,
+    require_known,
+    values_of,
+)
 from motionloom.datasets.synth.captions import Wordings, body_captions, face_captions
 from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
 from motionloom.datasets.synth.dances import Dance, DanceConfig, DanceTruth, dance, plan_dance
@@ -114,6 +124,11 @@ class SynthConfig(Config):
     def _attributes(cls, combinations: list[Record]) -> list[Record]:
         for combination in combinations:
             require_known(list(combination), tuple(DanceTruth.__dataclass_fields__), "truth attribute")
+            for key, value in combination.items():
+                known = values_of(key, combination.get("action"))
+                if known is not None and value not in known:
+                    names = ", ".join(sorted(map(str, known - {None}))) or "none"
+                    raise ValueError(f"no clip of {combination} is made: {key} is one of {names}")
         return combinations
 
     @model_validator(mode="after")
@@ -287,19 +302,24 @@ def _action_of(index: int, config: SynthConfig) -> tuple[str, int]:
 def split_of(index: int, config: SynthConfig) -> Split:
     """Split of a clip: held-out combinations test or validate, dances to songs by their song, the others by a
     low-discrepancy sequence."""
+    return _split(index, config)[0]
+
+
+def _split(index: int, config: SynthConfig) -> tuple[Split, Record | None]:
+    """Split of a clip, and the held-out combination that it is of."""
     planned = dance_of(index, config)
     truth = planned.truth if planned else truth_of(index, config)
     kept: tuple[tuple[Split, list[Record]], ...] = (("test", config.hold_out), ("val", config.hold_out_val))
     for split, combinations in kept:
         for combination in combinations:
             if all(getattr(truth, key, None) == value for key, value in combination.items()):
-                return split
+                return split, combination
     if planned and config.dances:
-        return config.dances.split(planned.song, config.test_fraction, config.val_fraction)
+        return config.dances.split(planned.song, config.test_fraction, config.val_fraction), None
     share = (index * _GOLDEN + 0.5 + config.seed * 0.7548776662466927) % 1.0
     if share < config.test_fraction:
-        return "test"
-    return "val" if share < config.test_fraction + config.val_fraction else "train"
+        return "test", None
+    return "val" if share < config.test_fraction + config.val_fraction else "train", None
 
 
 def make_sample(index: int, config: SynthConfig) -> Sample:
@@ -337,9 +357,13 @@ def synthesize(config: SynthConfig, out: Path, workers: int = 1, progress: bool 
     if config.dances is not None:
         options["audio_version"] = AUDIO_VERSION
         audio = settings_at(config.motion_layout.fps).dump()
+    splits = [_split(index, config) for index in range(config.clips)]
+    for combination in (*config.hold_out, *config.hold_out_val):
+        if all(of is not combination for _, of in splits):
+            warnings.warn(f"hold_out: none of {config.clips} clips is of {combination}", stacklevel=2)
     return write_dataset(
         out,
-        [(split_of(index, config), index) for index in range(config.clips)],
+        [(split, index) for index, (split, _) in enumerate(splits)],
         partial(make_sample, config=config),
         DatasetFacts(
             name="synth",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import Field
@@ -13,6 +13,9 @@ from torch.optim import Optimizer
 
 from motionloom.datasets.schema import Config
 
+Beta = Annotated[float, Field(ge=0, lt=1)]
+"""Share of a moving average that each step keeps."""
+
 
 class OptimConfig(Config):
     """Adam or AdamW and its learning-rate schedule."""
@@ -20,7 +23,7 @@ class OptimConfig(Config):
     optimizer: Literal["adamw", "adam"] = "adamw"
     """`adam` adds the weight decay to the gradient (L2), `adamw` takes it from the weights."""
     lr: float = Field(1e-4, gt=0)
-    betas: tuple[float, float] = (0.9, 0.99)
+    betas: tuple[Beta, Beta] = (0.9, 0.99)
     weight_decay: float = Field(0.0, ge=0)
     warmup_steps: int = Field(0, ge=0)
     schedule: Literal["constant", "cosine"] = "constant"

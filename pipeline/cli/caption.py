@@ -23,7 +23,9 @@ def caption(
     run_folder: ModelFolder,
     clips: Annotated[
         list[Path] | None,
-        typer.Argument(help="Files (.npz of generate, .bvh, .amc, .glb), archives or folders."),
+        typer.Argument(
+            help="Files (.npz of generate, .bvh, .amc, .glb), or folders of them; unpack archives first."
+        ),
     ] = None,
     count: Annotated[int, typer.Option("--k", min=1, help="Sentences for each clip, likeliest first.")] = 3,
     out: Annotated[
@@ -49,7 +51,7 @@ def caption(
     if not files or Path(run_folder).suffix.lower() in _FILES:
         run_folder, files = _OURS, [Path(run_folder), *files]
     if out is not None:
-        require_file_place(out)
+        require_file_place(out, ".jsonl")
     found, left_out = [], []
     with run_at(run_folder, at, CAPTIONER) as folder:
         for one in captions(MotionModel(folder, device), files, count):

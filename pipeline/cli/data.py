@@ -168,7 +168,7 @@ def report(
     from motionloom.pipeline.results.data_page import write_data_report
 
     console, path = make_console(), out or root / "report.html"
-    require_file_place(path)
+    require_file_place(path, ".html")
     write_data_report(root, path, progress=console.is_terminal)
     console.print(str(path), markup=False, soft_wrap=True)
 
@@ -215,7 +215,7 @@ def clean(
         return
     from motionloom.pipeline.results.clean_page import kinds_of, suspects_of, write_clean_page
 
-    require_file_place(page)
+    require_file_place(page, ".html")
     found = suspects_of(root, model, progress=console.is_terminal)
     for suspect in list(found.values())[:_SUSPECTS]:
         say(console, f"{suspect.id}: {'; '.join(fault.text for fault in suspect.faults)}")

@@ -81,4 +81,5 @@ def edit(
         names=[clip.stem, *[f"{clip.stem} edited" for _ in motions]],
         labels=["the clip", *["edited" for _ in motions]],
         figure=posing,
+        made_from=clip,
     )

@@ -136,6 +136,7 @@ def generate(
                 notes=[notes([motion]) for motion in motions],
                 names=None if texts else each([Excerpt.named(path).path.stem for path in songs]),
                 figure=posing,
+                made_from=None if seed_motion is None else Path(str(seed_motion)),
                 say=partial(say, aside),
             )
 

@@ -21,13 +21,15 @@ from motionloom.datasets.schema import Config
 MAX_SPEED = 12.0
 """Metres a second of a root; the fastest sprint that was measured (Bolt, Berlin 2009) reached 12.4."""
 Seconds = Annotated[float, Field(ge=-3600, le=3600)]
-Metres = Annotated[float, Field(allow_inf_nan=False, ge=-1000, le=1000)]
+Length = Annotated[float, Field(ge=0, le=3600)]
+"""Of two lower bounds on one number only the last counts, so none can be put on `Seconds`."""
+Metres = Annotated[float, Field(ge=-1000, le=1000)]
 
 
 class Kept(Config):
     """The parts that stay as they are in the clip, from `start` up to `end`."""
 
-    start: Seconds = Field(0.0, ge=0)
+    start: Length = 0.0
     end: Seconds | None = None
     """None: to the clip's end."""
     parts: tuple[FigurePart, ...] = ("all",)
@@ -65,13 +67,13 @@ class EditTask(Config):
 
     caption: str = ""
     """Describes the new motion; empty: any that fits."""
-    lead: Seconds = Field(0.0, ge=0)
+    lead: Length = 0.0
     """Seconds to make before the clip."""
-    seconds: Seconds | None = Field(None, gt=0)
+    seconds: Length | None = Field(None, gt=0)
     """Length of the result from the clip's first frame on; None: the clip's. Longer: made after its end."""
     mirror: bool = False
     """Swap left and right of the clip."""
-    speed: float = Field(1.0, ge=0.1, le=10, allow_inf_nan=False)
+    speed: float = Field(1.0, ge=0.1, le=10)
     """Factor of the clip's speed."""
     repeat: int = Field(1, ge=1, le=20)
     """Number of times that the clip is played, each time from where it ended."""

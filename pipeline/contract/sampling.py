@@ -11,13 +11,13 @@ from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.schedule import Sampler
 
-Guidance = Annotated[float, Field(ge=1)]
+Guidance = Annotated[float, Field(ge=1, le=100)]
 
 
 class SamplingConfig(Config):
     """Settings of drawing tokens, latents and noise; unset fields are as the model recommends."""
 
-    temperature: float = Field(1.0, ge=0)
+    temperature: float = Field(1.0, ge=0, le=10)
     """Below 1 safer, above 1 more varied; 0 is greedy: the likeliest token, a latent's mean."""
     top_k: int = Field(0, ge=0)
     """Draw from the k likeliest tokens; 0 keeps every token."""
@@ -26,12 +26,12 @@ class SamplingConfig(Config):
     candidates: int = Field(1, ge=1, le=64)
     """Motions drawn for each text, of which the one that TMA finds nearest to it is kept; 1 takes the first.
     Needs a GPT whose prior is TMA's."""
-    cfg_scale: float = Field(1.0, ge=1)
+    cfg_scale: Guidance = 1.0
     """Classifier-free guidance; 1 is off. Needs a model trained with `condition_dropout` > 0."""
     guidance: dict[str, Guidance] = Field(default_factory=dict)
     """Guidance in place of `cfg_scale` where a motion is conditioned on a modality, by the modality's name:
     `{audio: 1.0}`. Of several the first that is present counts."""
-    face_cfg_scale: float | None = Field(None, ge=1)
+    face_cfg_scale: Guidance | None = None
     """Guidance of the face's GPT or diffusion model; None takes `cfg_scale`."""
     face_model: str | None = None
     """The face generator, by its method (gpt, vae, diffusion) or its stage; by default the first."""

@@ -16,7 +16,7 @@ from motionloom.pipeline.inference.writers import WRITERS, OutputClip, Outputs, 
 from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.render.viewer import viewer_page
 from motionloom.pipeline.store.artifact import Terms
-from motionloom.pipeline.store.files import require_folder
+from motionloom.pipeline.store.files import new_files, require_folder
 
 WRITTEN = ".motionloom"
 """Names of the files that are beside it; the next motions take their place."""
@@ -43,11 +43,13 @@ def write_motions(
     labels: Sequence[str] | None = None,
     notes: Sequence[Sequence[object]] | None = None,
     figure: FigureOptions | None = None,
+    made_from: Path | None = None,
     say: Callable[[str], None] | None = None,
 ) -> list[Path]:
     """Write every motion in every format; the page holds all of them. Returns the paths.
 
-    What was written there before is removed. `title` and `note` are the page's. `scores`, one for each
+    What was written there before is removed once all of it lies there, but for the file that the motions are
+    `made_from`. `title` and `note` are the page's. `scores`, one for each
     motion, are sound, beats and segments for the page; without them each motion comes with what drove it.
     `names` are what files are called after, instead of the captions; `labels` are what the page says above
     each, `notes` the lines below. `figure` says how the shown figure follows the generated joints, and `say`
@@ -60,40 +62,40 @@ def write_motions(
     for name, writer in writers:
         if writer.needs_face and any(motion.face is None for motion in motions):
             raise UserError(f"this model makes no face: leave the format {name} out")
-    folder.mkdir(parents=True, exist_ok=True)
-    _remove_written(folder)
+    names = [motion.caption for motion in motions] if names is None else names
     out: list[Path] = []
     clips: list[OutputClip] = []
-    names = [motion.caption for motion in motions] if names is None else names
-    for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
-        name = file_stem(number, names[number])
-        label = "generated" if labels is None else labels[number]
-        lines = () if notes is None else notes[number]
-        clips.append(OutputClip(shown(motion, options), score, options, label, "arkit" in formats, lines))
-        if say is not None and (remark := clips[-1].shown.remark):
-            say(f"{name}: {remark}")
+    with new_files(folder) as new:
+        for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
+            name = file_stem(number, names[number])
+            label = "generated" if labels is None else labels[number]
+            lines = () if notes is None else notes[number]
+            clips.append(OutputClip(shown(motion, options), score, options, label, "arkit" in formats, lines))
+            if say is not None and (remark := clips[-1].shown.remark):
+                say(f"{name}: {remark}")
+            for _, writer in writers:
+                if writer.alone:
+                    out.append(new / f"{name}{writer.suffix}")
+                    writer.write(out[-1], Outputs(clips[-1:], title, note))
         for _, writer in writers:
-            if writer.alone:
-                out.append(folder / f"{name}{writer.suffix}")
-                writer.write(out[-1], Outputs(clips[-1:], title, note))
-    for _, writer in writers:
-        if writer.together and (len(clips) > 1 or not writer.alone):
-            out.append(folder / writer.together)
-            writer.write(out[-1], Outputs(clips, title, note))
-    write_text(folder / WRITTEN, "".join(f"{path.name}\n" for path in out))
-    return out
+            if writer.together and (len(clips) > 1 or not writer.alone):
+                out.append(new / writer.together)
+                writer.write(out[-1], Outputs(clips, title, note))
+    paths = [folder / path.name for path in out]
+    for path in set(_written(folder)) - set(paths):
+        if made_from is None or not path.samefile(made_from):
+            path.unlink()
+    write_text(folder / WRITTEN, "".join(f"{path.name}\n" for path in paths))
+    return paths
 
 
-def _remove_written(folder: Path) -> None:
-    """Take away the files that motions before left here, and no other ones."""
+def _written(folder: Path) -> list[Path]:
+    """The files that motions before left here, and no other ones."""
     written = folder / WRITTEN
     known = {name for writer in WRITERS.values() for name in (writer.suffix, writer.together) if name}
-    if not written.is_file():
-        return
-    for name in written.read_text(encoding="utf-8").splitlines():
-        path = folder / name
-        if path.name == name and name.endswith(tuple(known)) and path.is_file():
-            path.unlink()
+    names = written.read_text(encoding="utf-8").splitlines() if written.is_file() else []
+    paths = [folder / name for name in names if Path(name).name == name and name.endswith(tuple(known))]
+    return [path for path in paths if path.is_file()]
 
 
 def save(path: Path, motion: GeneratedMotion, note: str = "") -> None:

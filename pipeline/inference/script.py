@@ -35,7 +35,7 @@ class ScriptSegment(Config):
     """Describes the face; empty takes `text`."""
     music: str | None = None
     """A sound file, seen from the script's folder, or a part of one: `song.ogg@0:30-0:42`."""
-    seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
+    seconds: float | None = Field(None, gt=0, le=3600)
     """Length of a segment of text alone."""
 
     @model_validator(mode="after")

@@ -16,7 +16,11 @@ from motionloom.pipeline.launch.process import process_rank
 
 
 class SafeConsole(Console):
-    """Writes out characters of strangers' text (captions, names) that a terminal or a log would obey."""
+    """Writes out characters of strangers' text (captions, names) that a terminal or a log would obey, and
+    makes no emoji of their colons."""
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(**{"emoji": False, **how})
 
     def render_str(self, text: str, **how: Any) -> Text:  # type: ignore[override]
         return super().render_str("\n".join(map(printable, text.split("\n"))), **how)

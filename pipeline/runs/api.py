@@ -224,7 +224,7 @@ def report_run(
     """
     console = console or make_console()
     if out is not None:
-        require_file_place(out)
+        require_file_place(out, ".html")
     with run_at(folder, at) as run:
         state, made = run_state(run), _beside(folder, run) / "report"
         page = _stages_again(run, "page", made, console, {}, device, state=state) / "report.html"

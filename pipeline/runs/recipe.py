@@ -148,7 +148,7 @@ def _parse(entries: Mapping[str, dict[str, Any]], where: str) -> list[tuple[Stag
         fields = dict(entry)
         kind_name = fields.pop("kind", None)
         renamed = fields.pop("inputs", None) or {}
-        if kind_name not in kinds:
+        if not isinstance(kind_name, str) or kind_name not in kinds:
             hint = nearest(str(kind_name), list(kinds))
             raise UserError(
                 f"{where}: stages.{name}.kind = '{kind_name}' is no stage kind{hint}; a kind of your own "

@@ -97,8 +97,8 @@ class MotionRequest(Config):
     seconds: float | None = Field(None, gt=0, le=3600)
     """Length; without it the model decides, or the sound, or it is four seconds."""
     seed: int = Field(0, ge=0, lt=2**63)
-    cfg_scale: float = Field(1.0, ge=1, le=20, allow_inf_nan=False)
-    temperature: float = Field(1.0, ge=0, le=10, allow_inf_nan=False)
+    cfg_scale: float = Field(1.0, ge=1, le=20)
+    temperature: float = Field(1.0, ge=0, le=10)
     top_p: float = Field(0.95, gt=0, le=1)
     format: Annotated[str, AfterValidator(known_answer)] = "joints"
     """Numbers (`joints`), the viewer's data (`viewer`), or a file of a format of `WRITERS`."""

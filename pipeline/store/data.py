@@ -49,7 +49,7 @@ class MixedStage(Config):
     """Its name, which is its folder beside that of the mix."""
     folder: str | None = None
     """Folder of a stage outside the run, seen from that of the mix."""
-    weight: float = Field(gt=0, allow_inf_nan=False)
+    weight: float = Field(gt=0)
 
 
 class Mix(Config):

@@ -24,10 +24,13 @@ def require_folder(folder: Path) -> None:
         raise UserError(f"{existing}: is a file, and a folder is needed here; choose another name")
 
 
-def require_file_place(path: Path) -> None:
-    """Refuse an output file that is a folder, or is below a file; creates nothing."""
+def require_file_place(path: Path, ending: str) -> None:
+    """Refuse an output file that is a folder or below a file, or whose name ends in another way, as that of a
+    shard or a recording does, which it would take the place of; creates nothing."""
     if path.is_dir():
-        raise UserError(f"{path}: is a folder; name a file, like {path / 'NAME'}")
+        raise UserError(f"{path}: is a folder; name a file, like {path / f'NAME{ending}'}")
+    if path.suffix.lower() != ending:
+        raise UserError(f"{path}: name a file that ends in {ending}, as what is written does")
     require_folder(path.parent)
 
 
@@ -71,17 +74,36 @@ def remove_tree(folder: Path) -> None:
 def new_folder(folder: Path) -> Iterator[Path]:
     """A folder to fill; it becomes `folder`, which is absent or empty before, when the block ends whole."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f".{folder.name}.{secrets.token_hex(8)}.tmp")
+    with _aside(folder, folder.parent) as temporary:
+        yield temporary
+        temporary.rename(folder)
+
+
+@contextmanager
+def new_files(folder: Path) -> Iterator[Path]:
+    """A folder to fill; its files go into `folder`, which may hold others, when the block ends whole."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with _aside(folder, folder) as temporary:
+        yield temporary
+        for path in sorted(temporary.iterdir()):
+            path.replace(folder / path.name)
+
+
+@contextmanager
+def _aside(folder: Path, place: Path) -> Iterator[Path]:
+    """A temporary folder in `place`; errors about what is in it name `folder`."""
+    temporary = place / f".{folder.name}.{secrets.token_hex(8)}.tmp"
     try:
         temporary.mkdir()
         yield temporary
-        temporary.rename(folder)
     except OSError as error:
         for side in ("filename", "filename2"):
             name = getattr(error, side)
             if name is not None and str(name).startswith(str(temporary)):
                 setattr(error, side, str(name).replace(str(temporary), str(folder), 1))
         raise
+    except UserError as error:
+        raise UserError(str(error).replace(str(temporary), str(folder))) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

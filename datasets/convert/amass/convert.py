@@ -154,10 +154,10 @@ class Amass(Release[AmassConfig]):
         return listed
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
-        header = self.headers[label] = read_motion_header(path, label)
-        if not (fps := self.config.source_fps or header.fps):
+        header = self.headers[label] = read_motion_header(path, label, self.config.source_fps)
+        if not header.fps:
             raise UserError("no mocap_framerate and no mocap_frame_rate in it; set source_fps")
-        return header.frames, fps
+        return header.frames, header.fps
 
     def fitted(self, entry: Entry, frames: int, fps: float, draft: ConversionPlan[ReleaseClip]) -> Entry:
         header, parts = self.headers[entry.file], PurePosixPath(entry.file).parts

@@ -49,8 +49,11 @@ class MotionHeader:
     """Whether there are finger rotations."""
 
 
-def read_motion_header(path: Path, label: str) -> MotionHeader:
-    """Length, frame rate and model of a clip without reading its motion; `UserError` when it is not one."""
+def read_motion_header(path: Path, label: str, fps: float | None = None) -> MotionHeader:
+    """Length, frame rate and model of a clip without reading its motion; `UserError` when it is not one.
+
+    With `fps` it does not matter what the file states.
+    """
     with NpzFile(path, label) as file:
         if "poses" in file.names:
             frames, width = _matrix(file, "poses", None)
@@ -74,7 +77,7 @@ def read_motion_header(path: Path, label: str) -> MotionHeader:
             raise UserError(f"{label}: no frames")
         if "betas" in file.names and len(file.header("betas").shape) not in (1, 2):
             raise UserError(f"{label}: betas is {list(file.header('betas').shape)}, not one shape [B]")
-        return MotionHeader(frames, _rate(file), kind, _gender(file), hands)
+        return MotionHeader(frames, fps or _rate(file), kind, _gender(file), hands)
 
 
 def read_motion(
@@ -130,14 +133,21 @@ def _same(label: str, name: str, found: int, frames: int) -> None:
 
 
 def _rate(file: NpzFile) -> float | None:
+    found: dict[str, float] = {}
     for name in _RATES:
         if name in file.names:
             value = file.numbers(name, limit=4096)
             fps = float(value.reshape(-1)[0]) if value.size == 1 else float("nan")
             if not 0 < fps <= 10_000:
-                raise UserError(f"{file.label}: {name} is {value.tolist()}, not a number of frames a second")
-            return fps
-    return None
+                raise UserError(
+                    f"{file.label}: {name} is {value.tolist()}, not a number of frames a second; state it: "
+                    f"--set source_fps=120"
+                )
+            found[name] = fps
+    if len(set(found.values())) > 1:
+        stated = " and ".join(f"{name} {fps:g}" for name, fps in found.items())
+        raise UserError(f"{file.label}: {stated} differ; state the frame rate: --set source_fps=120")
+    return next(iter(found.values()), None)
 
 
 def _gender(file: NpzFile) -> str:

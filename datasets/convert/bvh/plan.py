@@ -33,6 +33,7 @@ from motionloom.datasets.convert.common.facts import Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.tables import captions_within
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -339,7 +340,7 @@ def _decide(config: BvhConfig, folder: Path, found: list[FoundFile], stated: str
             or listing.problem(clip.path)
             or config.length_problem(frames / fps)
         )
-        texts = listing.texts_of(clip.path)
+        texts = captions_within(listing.texts_of(clip.path), frames / fps, clip_id, draft.notes)
         split, about = listing.split_of(clip.path), config.about(clip.path)
         planned = BvhClip(folder, clip, clip_id, split, texts, frames, fps, about, config.licence)
         keep = config.uncaptioned == "keep"

@@ -16,7 +16,8 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.convert.common.config import END_TOLERANCE, ConvertConfig
+from motionloom.datasets.base.files import content_of
+from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.features import features_of, frames_after
@@ -29,6 +30,7 @@ from motionloom.datasets.convert.common.splits import (
     read_split_files,
     split_files,
 )
+from motionloom.datasets.convert.common.tables import captions_within
 from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 
@@ -86,8 +88,8 @@ class ReleaseClip:
     last: int
     fps: float
     licence: str
-    size: int
-    """Bytes of the motion file."""
+    content: str
+    """sha256 of the motion file."""
 
     @property
     def id(self) -> str:
@@ -234,37 +236,29 @@ class Release(Converter[Cfg, ReleaseClip]):
         """The last frame before the sound ends, and why the clip is left out if it ends too early."""
         return last, ""
 
-    def _scan(self, file: str) -> tuple[int, float, int] | Exception | None:
-        """Frames, rate and bytes of a motion file; None when it is not there, an error when it is damaged."""
+    def _scan(self, file: str) -> tuple[int, float, str] | Exception | None:
+        """Frames, rate and sha256 of a motion file; None when it is absent, an error when it is damaged."""
         try:
             path = self.path_of(file)
             if not path.is_file():
                 return None
-            return (*self.length(path, file), path.stat().st_size)
+            return (*self.length(path, file), content_of(path))
         except Exception as error:  # whatever a bad file or name makes of the libraries below
             return error
 
     def _clip(
-        self, entry: Entry, state: tuple[int, float, int], draft: ConversionPlan[ReleaseClip]
+        self, entry: Entry, state: tuple[int, float, str], draft: ConversionPlan[ReleaseClip]
     ) -> tuple[ReleaseClip, str]:
         """The clip of an entry whose file is there, and why it is left out."""
-        config, (frames, fps, size) = self.config, state
+        config, (frames, fps, content) = self.config, state
         entry = self.fitted(entry, frames, fps, draft)
         last, mute = self.cut_to_sound(entry, min(frames if entry.last is None else entry.last, frames), fps)
         seconds = max(last - entry.first, 0) / fps
-        texts = []
-        # Which frames a caption beyond the clip describes is unknown; a little beyond is rounding.
-        for text in entry.texts:
-            if text.start < seconds and (text.end is None or text.end <= seconds + END_TOLERANCE):
-                end = None if text.end is None else min(text.end, seconds)
-                texts.append(text.model_copy(update={"end": end}))
-            else:
-                draft.notes.append(f"{entry.id}: a caption at {text.start:g} s is beyond its {seconds:.1f} s")
-        entry = replace(entry, texts=tuple(texts))
+        entry = replace(entry, texts=captions_within(entry.texts, seconds, entry.id, draft.notes))
         listed = self.listed if self.listed is not None else {entry.id: entry.split}
         split = listed.get(entry.id) or entry.split or hash_split(entry.group or entry.id)
         licence = config.licence or entry.licence or self.terms
-        clip = ReleaseClip(entry, split, min(entry.first, last), last, fps, licence, size)
+        clip = ReleaseClip(entry, split, min(entry.first, last), last, fps, licence, content)
         reason = (
             mute or ("" if entry.id in listed else "in no split file") or config.length_problem(clip.seconds)
         )
@@ -273,7 +267,7 @@ class Release(Converter[Cfg, ReleaseClip]):
     def depends_on(self, clip: ReleaseClip) -> list[object]:
         entry = clip.entry
         texts = [caption.dump() for caption in entry.texts]
-        return [clip.id, entry.file, clip.size, clip.first, clip.last, texts, clip.licence]
+        return [clip.id, entry.file, clip.content, clip.first, clip.last, texts, clip.licence]
 
     def licence(self, plan: ConversionPlan[ReleaseClip]) -> str:
         alone = next(iter(plan.licences), self.terms) if len(plan.licences) <= 1 else self.terms

@@ -6,6 +6,7 @@ import csv
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.schema import Caption, UserError, parse_json
 from motionloom.datasets.text.clean import clean_caption
@@ -36,7 +37,10 @@ def require_record(value: object, place: str) -> dict[str, object]:
 def read_csv(path: Path, columns: Iterable[str]) -> list[tuple[str, dict[str, str]]]:
     """(place, row) of a table with a header; `UserError` names a missing column or a row that is cut."""
     lines = read_text_file(path, path.name).split("\n")
-    header = [name.strip() for name in next(csv.reader(lines[:1]), [])]
+    try:
+        header = [name.strip() for name in next(csv.reader(lines[:1]), [])]
+    except csv.Error as error:
+        raise UserError(f"{path.name}:1: {error}") from None
     missing = [name for name in columns if name not in header]
     if missing:
         raise UserError(
@@ -82,6 +86,21 @@ def table_rows(
             yield place, UserError(problem)
             continue
         yield place, dict(zip(header, row, strict=True))
+
+
+def captions_within(
+    texts: Iterable[Caption], seconds: float, clip: str, notes: list[str]
+) -> tuple[Caption, ...]:
+    """The captions of a clip of that length, ending with it; those of other times are left out and noted."""
+    kept = []
+    # Which frames a caption beyond the clip describes is unknown; a little beyond is rounding.
+    for text in texts:
+        if text.start < seconds and (text.end is None or text.end <= seconds + END_TOLERANCE):
+            end = None if text.end is None else min(text.end, seconds)
+            kept.append(text.model_copy(update={"end": end}))
+        else:
+            notes.append(f"{clip}: a caption at {text.start:g} s is beyond its {seconds:.1f} s")
+    return tuple(kept)
 
 
 def captions_of(words: object, source: str, start: float = 0.0, end: float | None = None) -> list[Caption]:

@@ -24,6 +24,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.files import content_of
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import features_of, require_human
@@ -202,9 +203,9 @@ class MotionX(Release[MotionXConfig]):
     def depends_on(self, clip: ReleaseClip) -> list[object]:
         entry = _with_face(clip)
         files = [entry.file, *([entry.face] if entry.face else [])]
-        sizes = [self.path_of(file).stat().st_size for file in files]
+        contents = [content_of(self.path_of(file)) for file in files]
         texts = [caption.dump() for caption in (*entry.texts, *entry.face_texts)]
-        return [clip.id, files, sizes, clip.licence, texts]
+        return [clip.id, files, contents, clip.licence, texts]
 
     def options(self) -> dict[str, object]:
         return super().options() | {"body_model": self.body.statement}

@@ -268,7 +268,7 @@ def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
         blob = gltf.binary_blob() or b""
         nodes = [gltf.nodes[node] for node in gltf.skins[0].joints]
         animation = gltf.animations[0]
-        stated = animation.extras["fps"]
+        fps = number(animation.extras["fps"], f"{path}: fps", 1000, 0.1)
 
         def values(place: int) -> NDArray[np.float64]:
             accessor = gltf.accessors[place]
@@ -281,6 +281,15 @@ def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
                 raise ValueError("numbers that are not finite")
             return flat.reshape(-1, width).astype(np.float64)
 
+        for sampler in animation.samplers:
+            times = values(sampler.input)[:, 0]
+            if sampler.interpolation != "LINEAR" or np.abs(times - np.arange(len(times)) / fps).max() > 1e-3:
+                raise ValueError("its frames are not those of its rate")
+        for node in gltf.nodes:
+            if node.matrix or (node.scale or [1, 1, 1]) != [1, 1, 1]:
+                raise ValueError("it is scaled or turned as a whole")
+            if node not in nodes and (node.rotation or node.translation):
+                raise ValueError("it is moved as a whole")
         tracks = {
             (channel.target.node, channel.target.path): values(animation.samplers[channel.sampler].output)
             for channel in animation.channels
@@ -296,11 +305,12 @@ def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
         rotations = Rotation.from_quat(turns.reshape(-1, 4)).as_matrix().reshape(frames, len(names), 3, 3)
         root = np.broadcast_to(tracks[0, "translation"], (frames, 3))
     except Exception as error:  # a file from anywhere breaks this in many ways
-        if isinstance(error, MemoryError):
+        if isinstance(error, (MemoryError, UserError)):
             raise
+        reason = error if type(error) is ValueError else type(error).__name__
         raise UserError(
-            f"{path}: not a GLB file that motionloom wrote ({type(error).__name__}); give its BVH or npz"
+            f"{path}: not a GLB file that motionloom wrote ({reason}); give its BVH or npz"
         ) from None
     joints, _ = forward_kinematics(rotations, root, offsets, skeleton.parents)
     figure = RigidMotion.posed(with_offsets(skeleton, offsets), rotations, root, joints)
-    return figure, number(stated, f"{path}: fps", 1000, 0.1), str(animation.name or "")
+    return figure, fps, str(animation.name or "")

@@ -35,9 +35,7 @@ def compare_with_paper(
     """
     console = console or make_console()
     if out is not None:
-        if out.suffix.lower() != ".md":
-            raise UserError(f"{out}: a table is written as Markdown; name a file that ends in .md")
-        require_file_place(out)
+        require_file_place(out, ".md")
     names = [name for name in shipped_tables() if name.startswith(f"{table}/")] or [table]
     tables = [fill(name, paper_table(name), runs) for name in names]
     page = "\n".join(filled.markdown() for filled in tables)

@@ -31,8 +31,8 @@ Scalar = bool | int | float | str | None
 class Bounds(Config):
     """A number between bounds, themselves left out."""
 
-    above: float = -math.inf
-    below: float = math.inf
+    above: float = Field(-math.inf, allow_inf_nan=True)
+    below: float = Field(math.inf, allow_inf_nan=True)
 
 
 Condition = Bounds | list[Scalar] | Scalar

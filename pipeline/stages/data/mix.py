@@ -36,7 +36,7 @@ _INPUTS = Every("data", gives="data")
 class MixStageConfig(StageConfig):
     """Sampling weight of each data stage."""
 
-    weights: dict[str, Annotated[float, Field(gt=0, allow_inf_nan=False)]] = Field(default_factory=dict)
+    weights: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     """Share of the batches of a stage, by its name, relative to the others; 1 for a stage not named. One of
     another run is called after both: `other:data`."""
     allow_leaks: bool = Field(False, json_schema_extra=RUNTIME)

@@ -32,7 +32,7 @@ class GenerateConfig(StageConfig):
 
     captions: list[str] = Field(default_factory=list)
     """Captions to perform; empty takes `count` from the test split."""
-    seconds: float | None = Field(None, gt=0, allow_inf_nan=False)
+    seconds: float | None = Field(None, gt=0)
     """Length of each; None lets the model decide, or else takes the recorded clip's."""
     count: int = Field(8, ge=0)
     dances: int = Field(4, ge=0)

@@ -19,13 +19,17 @@ from typing import Any
 
 import pytest
 import torch
+from annotated_types import Ge, Gt, Le, Lt
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from safetensors.torch import save_file
 
 from motionloom.datasets.convert.captions.humanml_text import parse_caption
-from motionloom.datasets.schema import UserError, number, parse_json, whole
+from motionloom.datasets.schema import Config, UserError, number, parse_json, whole
 from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.contract.stage import stage_kinds
+from motionloom.pipeline.results.paper.schema import Bounds
 from motionloom.pipeline.store.weights import exact_tensors, load_weights
 
 ROOT = Path(__file__).parents[3]
@@ -34,6 +38,13 @@ FOLDERS = ("datasets/convert", "datasets/shards", "pipeline/serve", "pipeline/in
 LETTERS = st.text(st.characters(exclude_categories=()), max_size=6)
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats() | LETTERS
 VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner) | st.dictionaries(LETTERS, inner), max_leaves=8)
+
+
+def configs(base: type[Config]) -> Iterator[type[Config]]:
+    """Every config of every stage, and what else has been imported."""
+    assert stage_kinds()
+    for kind in base.__subclasses__():
+        yield from (kind, *configs(kind))
 
 
 def fine(value: Any) -> bool:
@@ -89,7 +100,24 @@ def test_times_are_an_hour_at_most(seconds: float, key: str) -> None:
     except UserError:
         assert not 0 < seconds <= 3600
     else:
-        assert abs(seconds) <= 3600
+        assert abs(seconds) <= 3600 and (seconds >= 0 or key in ("path", "pins"))
+
+
+def test_no_setting_is_infinite_and_none_has_two_bounds_of_a_kind() -> None:
+    """Of two only the last counts. Each number of each config is tried."""
+    tried = 0
+    for config in (one for one in configs(Config) if not inspect.isabstract(one)):
+        for name, field in config.model_fields.items():
+            bounds = [type(one) for one in field.metadata if isinstance(one, (Ge, Gt, Le, Lt))]
+            assert len(bounds) == len(set(bounds)), f"{config.__name__}.{name}"
+            if field.annotation in (float, float | None) and config is not Bounds:
+                for value in (math.inf, -math.inf, math.nan):
+                    tried += 1
+                    with pytest.raises(ValidationError) as error:
+                        config(**{name: value})
+                    found = {one["loc"][0] for one in error.value.errors()}
+                    assert name in found, f"{config}.{name} = {value}"
+    assert tried > 200
 
 
 @settings(max_examples=200, deadline=None)

@@ -128,7 +128,8 @@ BROKEN: list[tuple[dict[str, Any], str]] = [
     ({"poses": None}, "'poses', nor root_orient and pose_body"),
     ({"trans": None}, "'trans'"),
     ({"mocap_framerate": None}, "set source_fps"),
-    ({"mocap_framerate": np.array(0.0)}, "mocap_framerate is 0.0"),
+    ({"mocap_framerate": np.array(0.0)}, "state it: --set source_fps=120"),
+    ({"mocap_frame_rate": np.array(90.0)}, "mocap_framerate 60 and mocap_frame_rate 90 differ"),
     ({"poses": np.zeros((181, 155))}, "poses is [T, 155]"),
     ({"poses": np.zeros((156,))}, "poses is [156]"),
     ({"poses": np.zeros((0, 156)), "trans": np.zeros((0, 3))}, "no frames"),
@@ -150,7 +151,7 @@ def test_broken_clips_are_left_out_with_their_reason(
     monkeypatch.chdir(tmp_path)
     bad: dict[str, Any] = amass.walk(60.0)
     for key, value in change.items():
-        bad[key] = bad[key].copy()
+        bad[key] = bad.get(key, np.zeros(1)).copy()
         if value is None:
             del bad[key]
         elif isinstance(value, str):
@@ -181,11 +182,14 @@ def test_source_fps_and_up_override_the_file(amass: ModuleType, tmp_path: Path) 
     upright[:, 0] = (flat * Rotation.from_rotvec(upright[:, 0])).as_rotvec()
     changed = {"poses": upright.reshape(-1, 156), "trans": flat.apply(clip["trans"]),
                "mocap_framerate": np.array(30.0)}  # fmt: skip
-    amass.save(tmp_path / "in/A/b/c_poses.npz", **(clip | changed))
-    amass.make(tmp_path / "in", tmp_path / "out", up="y", source_fps=60)
-    (motion,) = amass.features(tmp_path / "out").values()
-    joints = decode(motion, MotionLayout.named("body133"))
-    np.testing.assert_allclose(joints, amass.expected_joints(20.0), atol=3e-4)
+    for number, stated in enumerate((30.0, 0.0, math.nan)):
+        changed["mocap_framerate"] = np.array(stated)
+        source, out = tmp_path / f"in{number}", tmp_path / f"out{number}"
+        amass.save(source / "A/b/c_poses.npz", **(clip | changed))
+        amass.make(source, out, up="y", source_fps=60)
+        (motion,) = amass.features(out).values()
+        joints = decode(motion, MotionLayout.named("body133"))
+        np.testing.assert_allclose(joints, amass.expected_joints(20.0), atol=3e-4)
 
 
 def test_captions_splits_and_missing_clips(amass: ModuleType, tmp_path: Path) -> None:

@@ -122,6 +122,16 @@ def test_ten_files_later_only_what_changed_is_converted(
     assert "new" in {clip.id for shard in manifest.shards for clip in entries(tmp_path / "out", shard.name)}
 
 
+def test_captions_of_other_times_than_the_clips_are_noted_and_left_out(copy: Path) -> None:
+    name = clip_file(copy, "bow_angry").relative_to(copy)
+    lines = [f"{name},a person bows,0,1e9", f"{name},a person runs,500,501", f"{name},a person nods,0,1"]
+    (copy / "words.csv").write_text("\n".join(["file,caption,start,end", *lines]))
+    plan = prepare(config(copy, captions=copy / "words.csv", uncaptioned="keep")).plan
+    said = {clip.id: [text.text for text in clip.texts] for _, clip in plan.items}
+    assert [texts for texts in said.values() if texts] == [["a person nods"]]
+    assert sum("is beyond its" in note for note in plan.notes) == 2
+
+
 def entries(out: Path, shard: str) -> list[ClipEntry]:
     return ShardIndex.load_json(index_path(out / shard)).clips
 

@@ -145,6 +145,17 @@ def test_one_folder_stands_in_for_the_other(copy: Path, tmp_path: Path) -> None:
         plan(copy)
 
 
+def test_a_file_changed_in_place_is_converted_again(copy: Path, tmp_path: Path) -> None:
+    convert(copy, tmp_path / "out")
+    path = copy / "new_joint_vecs/900001.npy"
+    np.save(path, np.load(path) + np.float32(0.01))
+    convert(copy, tmp_path / "out")
+    convert(copy, tmp_path / "fresh")
+    found, fresh = (motions(tmp_path / name) for name in ("out", "fresh"))
+    np.testing.assert_array_equal(found["900001"], np.load(path))
+    assert all(np.array_equal(found[clip_id], motion) for clip_id, motion in fresh.items())
+
+
 def test_texts_one_folder_too_deep_or_still_packed(copy: Path) -> None:
     (copy / "texts").rename(copy / "unpacked")
     (copy / "texts.zip").touch()

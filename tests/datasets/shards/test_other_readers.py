@@ -224,7 +224,10 @@ def killed(here, there, name, *rest):
     global count
     count += 1
     if count == 5:
-        there.system().pipe_file(there.where(name), b"half")
+        if isinstance(there, copy.LocalStore):
+            (there.root / f".{name}.tmp").write_bytes(b"half")
+        else:
+            there.system().pipe_file(there.where(name), b"half")
         os.kill(os.getpid(), signal.SIGKILL)
     return carry(here, there, name, *rest)
 copy._send_file = killed
@@ -240,7 +243,15 @@ def test_killed_in_the_middle_and_given_again(aws: Any, data: Path, tmp_path: Pa
             ShardDataset.open(target, "train")
         assert copy_dataset(str(data), target) == (len(files(data)) - 4, 4)
         assert ShardDataset.open(target, "train").motion(0).tobytes()
+    for half in (tmp_path / "k").glob(".*.tmp"):
+        half.unlink()
     assert files(tmp_path / "k") == files(data)
+
+
+def test_a_folder_that_cannot_be_written_is_no_server(data: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(NotADirectoryError):  # of which the command line makes one sentence
+        copy_dataset(str(data), str(tmp_path / "file/x"))
 
 
 def test_a_later_state_takes_the_place_of_an_older_one(

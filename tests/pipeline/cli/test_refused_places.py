@@ -57,6 +57,7 @@ WRITING: dict[str, Sequence[str]] = {
         "data", "convert", "bvh", "{root}/mocap", "{out}", "--set", "joint_map={root}/map.json",
         "--licence", "x", "--workers", "1",
     ),
+    "data copy": ("data", "copy", "{root}/shards", "{out}"),
     "data report": ("data", "report", "{root}/shards", "--out", "{out}/page.html"),
 }  # fmt: skip
 
@@ -98,6 +99,15 @@ def test_a_disk_that_takes_no_more(name: str, places: Path, tmp_path: Path, call
     assert not [path for path in files_of(tmp_path) if path.suffix in (".tmp", ".html")]
     if name == "export":
         assert not out.exists() and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["report", "table", "data report"])
+def test_a_page_takes_the_place_of_no_data(name: str, places: Path, tmp_path: Path, call: Call) -> None:
+    words = words_of(name, places, tmp_path)
+    words[-1] = str(tmp_path / "manifest.json")
+    (tmp_path / "manifest.json").write_text("{}")
+    assert "name a file that ends in ." in require_sentence(call(*words))
+    assert (tmp_path / "manifest.json").read_text() == "{}"
 
 
 def test_a_checkpoint_that_finds_no_room(places: Path, tmp_path: Path, call: Call) -> None:

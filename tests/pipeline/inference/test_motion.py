@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import errno
 import html
 import json
 import re
@@ -183,7 +184,9 @@ def test_all_files_show_one_figure_of_constant_bones(motions: list[GeneratedMoti
     assert ["weights" in found for found in paths_of] == [True, False]
 
 
-def test_new_motions_take_the_place_of_old_ones(motions: list[GeneratedMotion], tmp_path: Path) -> None:
+def test_new_motions_take_the_place_of_old_ones(
+    motions: list[GeneratedMotion], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "out"
     write(out, motions)
     (out / "notes.txt").write_text("mine")
@@ -193,6 +196,19 @@ def test_new_motions_take_the_place_of_old_ones(motions: list[GeneratedMotion], 
     assert [path.name for path in paths] == ["00-歩く-ひと.npz", "01-шаг-вперёд.npz", "index.html"]
     left = {path.name for path in out.iterdir() if not path.name.startswith(".")}
     assert left == {"notes.txt", "mine.npz", *(path.name for path in paths)}
+    # What they are made from stays, and all of it does where they cannot be written.
+    write_motions(out, motions, ["npz"], title="t", made_from=out / "00-歩く-ひと.npz")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert "00-歩く-ひと.npz" in before and "01-шаг-вперёд.npz" not in before
+
+    def full(path: Path, outputs: object) -> None:
+        path.write_text("half")
+        raise OSError(errno.ENOSPC, "full", str(path))
+
+    monkeypatch.setitem(WRITERS, "html", replace(WRITERS["html"], write=full))
+    with pytest.raises(OSError, match=re.escape(str(out / "index.html"))):
+        write_motions(out, motions, ["npz", "html"], title="t", names=names)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
 def test_faces_are_written_as_arkit_weights_by_the_users_bases(

@@ -97,6 +97,7 @@ MISTAKES = {
         r"show\.yaml: segments\.1: song.wav@9- is 6.0 s long and 9 s to its end was asked for; shorten it",
     "segments: [{music: song.wav@2-20}]": r"segments\.0: song.wav@2-20 is 6.0 s long",
     "segments: [{music: other.wav}]": "other.wav: no such sound file",
+    "segments: [{text: a, seconds: 1e308}]": r"segments\.0\.seconds' = 1e\+308: .*3600",
     "segments: [{music: .}]": "no such sound file",
     "segments: [{music: show.wav}]": "show.wav",
     "segments: [{text: a, seconds: 1": "show.yaml",

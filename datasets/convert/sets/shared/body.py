@@ -18,6 +18,7 @@ from pydantic import Field
 
 from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features, rows_at
 from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
+from motionloom.datasets.base.files import content_of
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.common.config import END_TOLERANCE
@@ -161,8 +162,8 @@ class BodyRelease(Release[Cfg]):
 
     def depends_on(self, clip: ReleaseClip) -> list[object]:
         sound = clip.entry.sound
-        size = (self.sound_folder / sound).stat().st_size if sound else 0
-        return [*super().depends_on(clip), sound, size]
+        content = content_of(self.sound_folder / sound) if sound else ""
+        return [*super().depends_on(clip), sound, content]
 
     def song(self, clip: ReleaseClip) -> str | None:
         """Name of what is heard; clips with the same one dance to the same piece."""

@@ -88,7 +88,7 @@ def test_a_papers_name_is_all_of_its_tables(call: Call, tmp_path: Path) -> None:
         (["--table", "humantomato/70"], "no such table; did you mean 'humantomato/7'?"),
         (["--table", "ude/1", "nowhere"], "nowhere: no such folder"),
         (["--table", "ude/1", "--clips", "4"], "--clips, --repeats and --device measure anew"),
-        (["--table", "ude/1", "-o", "x.csv"], "x.csv: a table is written as Markdown"),
+        (["--table", "ude/1", "-o", "x.csv"], "x.csv: name a file that ends in .md"),
         (["--table", "list", "runs"], "--table list names the tables alone"),
         (["runs", "-o", "x.md"], "--out is of a table"),
         (["one", "two"], "2 run folders to evaluate; name one"),
