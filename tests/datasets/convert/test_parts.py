@@ -126,7 +126,7 @@ def source_of(kind: str, root: Path, shared: Path, mocap: Path) -> Path:
     return root
 
 
-@pytest.mark.parametrize("tries", [3, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("tries", [3, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", CASES)
 def test_one_damaged_or_misnamed_file_leaves_the_others(
     kind: str, tries: int, source: Path, shared: Path, tmp_path: Path

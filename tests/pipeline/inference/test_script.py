@@ -343,8 +343,8 @@ print(len(motions[0].joints), (peak() - before) // 1024)
 
 
 @pytest.mark.slow
-def test_a_song_of_five_minutes_takes_little_memory(ude_run: Any, tmp_path: Path) -> None:
-    for name, seconds in (("short", 3.0), ("long", 300.0)):
+def test_a_song_of_two_minutes_takes_little_memory(ude_run: Any, tmp_path: Path) -> None:
+    for name, seconds in (("short", 3.0), ("long", 120.0)):
         soundfile.write(tmp_path / f"{name}.wav", song(seconds), 22_050)
     done = subprocess.run(
         [sys.executable, "-P", "-c", LONG, str(ude_run.folder), str(tmp_path)],
@@ -352,5 +352,5 @@ def test_a_song_of_five_minutes_takes_little_memory(ude_run: Any, tmp_path: Path
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     frames, grown = map(int, done.stdout.split()[-2:])
-    assert frames == 6000
-    assert grown < 1500, f"{grown} MiB more than for three seconds"
+    assert frames == 2400
+    assert grown < 600, f"{grown} MiB more than for three seconds"
