@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.runs.resolve import Tree
 from motionloom.pipeline.store.artifact import Change
@@ -52,7 +52,10 @@ class Started(Config):
     def find(folder: Path) -> Started | None:
         """The stage that was last started in a folder."""
         path = folder / "started.json"
-        return Started.load_json(path) if path.is_file() else None
+        try:
+            return Started.load_json(path) if path.is_file() else None
+        except UserError as error:
+            raise UserError(f"{error}; delete that file, and the stage is made anew") from None
 
 
 @dataclass(frozen=True)

@@ -139,11 +139,12 @@ class ShardWatch:
             raise JointError(self._say(int(number)))
 
     def explain(self, error: Exception) -> Exception:
-        """Return `error`, or the error of a changed shard where this process finds one that `error`, which
-        not all processes have found together, may come from.
+        """Return `error`, or the error of a changed shard where this process finds one that `error` may come
+        from: a loss that is not finite, or what not all processes have found together.
         """
-        number = None if isinstance(error, (JointError, TeamError)) else self._changed(0, 1)
-        return error if number is None else UserError(self._say(number))
+        joint = isinstance(error, (JointError, TeamError))
+        number = None if joint and not isinstance(error, NotFiniteError) else self._changed(0, 1)
+        return error if number is None else (JointError if joint else UserError)(self._say(number))
 
     def _changed(self, first: int, every: int) -> int | None:
         """Return the first changed shard among numbers `first`, `first + every`, ...; None if none is."""

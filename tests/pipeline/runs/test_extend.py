@@ -281,6 +281,9 @@ def test_what_differs_in_more_or_has_nothing_to_go_on_from_begins_anew(tmp_path:
     started = json.loads((folder / "started.json").read_text())
     (folder / "started.json").write_text(json.dumps({"fingerprint": started["fingerprint"]}))
     assert planned(LONG)[0] == "run"
+    (folder / "started.json").write_text("{")
+    with pytest.raises(UserError, match=r"started\.json: not valid JSON .*; delete that file"):
+        planned(LONG)
     (folder / "started.json").write_text(json.dumps(started))
     assert planned(LONG)[0] == "resume"
     shutil.rmtree(folder / "checkpoints")

@@ -90,6 +90,7 @@ stages:
         ("tma.optim.lr=fast", "optim.lr"),
         ("tma.train.steps=0", "train.steps"),
         ("hardware.device=2", "did you mean 'hardware.devices'|did you mean 'devices'"),
+        ("tma={train: {stepz: 3}}", "stages.tma: unknown key 'train.stepz'; did you mean 'steps'"),
         ("tma.kind=tmaa", "is no stage kind; did you mean 'tma'"),
         ("gpt.net.heads=7", "with --set: stages.gpt: .*dim 160 must be a multiple of heads 7"),
         ("tma.net.heads=3", "latent 128 must be a multiple of heads 3"),

@@ -64,7 +64,7 @@ def test_a_loss_that_is_not_finite_stops_the_training(recipe: Path) -> None:
 def test_a_shard_that_changes_ends_the_training_before_its_next_checkpoint(
     recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is named, also where reading it has failed."""
+    """It is named, also where reading it has failed or a loss of what was read is not finite."""
     shards = [recipe.parent / name for name in ("one.tar", "two.tar")]
     info = ShardInfo(name="a.tar", split="train", samples=1, frames=1, bytes=1, sha256="0" * 64)
     monkeypatch.setattr(Data, "local_shards", lambda _: [LocalShard(path, info) for path in shards])
@@ -80,7 +80,8 @@ def test_a_shard_that_changes_ends_the_training_before_its_next_checkpoint(
 
     monkeypatch.setattr(ToyBatches, "__getitem__", touched)
     never = "hardware.verify_shards=never"  # these are none
-    for sets in ([never], [never, f"toy.fails_at={FAILS}", "toy.failure=error"]):
+    fails = f"toy.fails_at={FAILS}"
+    for sets in ([never], [never, fails], [never, fails, "toy.failure=error"]):  # the second: not finite
         for path in shards:
             path.write_text("a")
         run = recipe.parent / f"touched{len(sets)}"
