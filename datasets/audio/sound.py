@@ -156,7 +156,7 @@ class Sound:
         """Return the sound from second `start` to `end`, or to its own end; the samples are not copied."""
         first = round(max(0.0, start) * self.rate)
         last = len(self.samples) if end is None else round(max(0.0, end) * self.rate)
-        if first >= min(last, len(self.samples)):
+        if np.isnan([start, end or 0.0]).any() or first >= min(last, len(self.samples)):
             raise UserError(
                 f"nothing between second {start:g} and {'the end' if end is None else f'{end:g}'} of sound "
                 f"of {self.seconds:.3f} s"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import threading
@@ -12,7 +13,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.connection import wait
-from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -62,7 +62,7 @@ class Workers:
                 self._pool = ProcessPoolExecutor(
                     min(self.count, len(tasks)), context, initializer=_exit_with_parent
                 )
-            with _starting():
+            with _starting(needs_program=b"__main__" in pickle.dumps((work, tasks[0]))):
                 futures = {
                     self._pool.submit(on_one_thread, work, task): position
                     for position, task in enumerate(tasks)
@@ -95,20 +95,21 @@ def on_one_thread(work: Callable[[T], R], task: T) -> R:
 
 
 @contextmanager
-def _starting() -> Iterator[None]:
-    """Start workers that leave Ctrl-C to their parent and never import a program read from stdin."""
+def _starting(needs_program: bool) -> Iterator[None]:
+    """Start workers that leave Ctrl-C to their parent and, unless what they do is from there, do not import
+    its program: a script without `if __name__ == "__main__"` would run anew in each, one of stdin is gone.
+    """
     program = sys.modules["__main__"]
-    file = getattr(program, "__file__", None)
-    lost = file is not None and not Path(file).exists()
+    found = {name: getattr(program, name) for name in ("__file__", "__spec__") if hasattr(program, name)}
     # Blocked here, it is blocked in them from their first instruction on, up to `_exit_with_parent`.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        if lost:
-            del program.__file__
+        if not needs_program:
+            program.__spec__ = None
+            vars(program).pop("__file__", None)
         yield
     finally:
-        if lost:
-            program.__file__ = file
+        vars(program).update(found)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 

@@ -28,10 +28,13 @@ class Steps(IterableDataset[T_co]):
     Args:
         make: (rank, world) -> batches of that rank; called on first use, when the process group is there.
         last: Batches of the whole training; `len`, also of one that begins at `first`.
-        first: Batches that an earlier process has gone through.
+        first: Batches that an earlier process has gone through. Or what counts those that have been trained
+            with: each `last` of them are an epoch then, and the next one's numbers go on.
     """
 
-    def __init__(self, make: Callable[[int, int], Numbered[T_co]], last: int, first: int = 0) -> None:
+    def __init__(
+        self, make: Callable[[int, int], Numbered[T_co]], last: int, first: int | Callable[[], int] = 0
+    ) -> None:
         self.make, self.first, self.last = make, first, last
 
     @cached_property
@@ -40,17 +43,25 @@ class Steps(IterableDataset[T_co]):
         together = dist.is_available() and dist.is_initialized()
         return self.make(dist.get_rank(), dist.get_world_size()) if together else self.make(0, 1)
 
+    def span(self) -> tuple[int, int]:
+        """Numbers of the next batch, and of the one behind the last that there is in this epoch."""
+        if isinstance(self.first, int):
+            return self.first, self.last
+        first = self.first()
+        return first, (first // self.last + 1) * self.last
+
     def __len__(self) -> int:
         return self.last
 
     def __iter__(self) -> Iterator[T_co]:
         worker = get_worker_info()
         # A loader takes one item of each worker in turn: worker w of n reads every n-th batch from w on.
-        begin, stride = (self.first, 1) if worker is None else (self.first + worker.id, worker.num_workers)
-        for k in range(begin, self.last, stride):
+        begin, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        first, last = self.span()
+        for k in range(first + begin, last, stride):
             yield self.batches[k]
 
     def __getstate__(self) -> dict[str, object]:
         """Workers get the rank's batches; they know nothing of the process group."""
-        batches = self.batches
-        return {"make": None, "first": self.first, "last": self.last, "batches": batches}
+        batches, (first, last) = self.batches, self.span()
+        return {"make": None, "first": first, "last": last, "batches": batches}

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError, nearest
+from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.options import At, Device, ModelFolder, Settings, settings_of
-from motionloom.pipeline.inference.writers import WRITERS, default_formats, formats_help
+from motionloom.pipeline.inference.writers import default_formats, formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
 
@@ -143,14 +143,12 @@ def generate(
 
 def formats_of(formats: str | None) -> list[str]:
     """The formats of `--format`, in its words; the default ones without."""
-    wanted = default_formats()
-    if formats is not None:
-        wanted = [name.strip() for name in formats.split(",") if name.strip()]
-    for name in wanted:
-        if name not in WRITERS:
-            raise UserError(f"--format {name}: no such format{nearest(name, list(WRITERS))}")
-    if not wanted:
-        raise UserError(f"--format {formats!r} names no format; known: {', '.join(WRITERS)}")
+    from motionloom.pipeline.inference.outputs import require_formats
+
+    if formats is None:
+        return default_formats()
+    wanted = [name.strip() for name in formats.split(",") if name.strip()]
+    require_formats(wanted)
     return wanted
 
 

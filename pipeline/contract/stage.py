@@ -125,12 +125,13 @@ class CompletedStage:
 
 
 class StageCache:
-    """Completed stages, each loaded once, all on one device."""
+    """Completed stages, each loaded once, all on one device. A caller's own draws stay what they are."""
 
     def __init__(self, device: torch.device = CPU) -> None:
         self.device = device
         self._loaded: dict[Path, object] = {}
 
+    @torch.random.fork_rng(devices=[])
     def get(self, stage: CompletedStage) -> Any:
         if stage.folder not in self._loaded:
             require_unchanged(stage.folder)
@@ -140,10 +141,12 @@ class StageCache:
     def given(self, inputs: Mapping[str, CompletedStage]) -> Inputs:
         return Inputs({role: partial(self.get, stage) for role, stage in inputs.items()})
 
+    @torch.random.fork_rng(devices=[])
     def generator(self, stage: CompletedStage) -> MotionGenerator:
         require_unchanged(stage.folder)
         return stage.kind.generator(stage, self.given(stage.inputs), self.device)
 
+    @torch.random.fork_rng(devices=[])
     def captioner(self, stage: CompletedStage) -> MotionCaptioner:
         require_unchanged(stage.folder)
         return stage.kind.captioner(stage, self.given(stage.inputs), self.device)

@@ -21,7 +21,7 @@ from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.schema import UserError
-from motionloom.models.layers.seeds import sample_seeds
+from motionloom.models.layers.seeds import FACES, sample_seeds
 from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator, Prompt, Stretch
 from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported
@@ -38,6 +38,7 @@ from motionloom.pipeline.inference.requests import (
     prompts_of,
     repeated_rows,
     require_driven,
+    require_samples,
     require_seed,
     require_used,
     require_words,
@@ -239,12 +240,12 @@ class Bundle:
         require_driven(self.generator, prompts)
         frames = frames_of(self.generator, seconds, prompts)
         begun = seeds_of(self.generator, seed_motions, len(prompts))
-        # One seed per motion, so that results do not depend on batching; the second half draws faces.
-        seeds = sample_seeds(seed, 2 * len(prompts))
+        # One seed per motion, and one for its face, so that results do not depend on the others.
+        seeds, face_seeds = sample_seeds(seed, len(prompts)), sample_seeds(seed, len(prompts), FACES)
         noise = seeds if noise_seed is None else sample_seeds(noise_seed, len(prompts))
         out: dict[int, GeneratedMotion] = {}
         for rows in alike(frames, batch):
-            own = tuple([draws[row] for row in rows] for draws in (seeds, seeds[len(prompts) :], noise))
+            own = tuple([draws[row] for row in rows] for draws in (seeds, face_seeds, noise))
             some = [prompts[row] for row in rows], [frames[row] for row in rows]
             made = self._batch(*some, own, sampling, begun and [begun[row] for row in rows])
             out.update((row, replace(one, seed=seed)) for row, one in zip(rows, made, strict=True))
@@ -291,6 +292,7 @@ class Bundle:
         """One motion driven by segments of text and music in turn, and other samples of it (`script.py`)."""
         sampling, generator, fps = self.drawing(sampling), self.generator, self.layout.fps
         require_seed(seed)
+        require_samples(samples)
         drive = generator.capabilities.drive
         if drive is None:
             raise UserError(
@@ -298,8 +300,6 @@ class Bundle:
             )
         require_driven(generator, [segment.prompt for segment in segments])
         frames = [segment_frames(generator, segment, number) for number, segment in enumerate(segments)]
-        # The first half draws bodies, the second faces, so that neither depends on the other.
-        seeds = sample_seeds(seed, 2 * samples)
         stretches = [
             Stretch(
                 repeated_rows(self.encode(self.main, [segment.prompt], [segment.prompt.text]), samples),
@@ -310,9 +310,9 @@ class Bundle:
         idle = [segment.prompt.idle for segment in segments]
         body = [
             blend_to_idle(motion, idle, frames, self.layout, generator.part)
-            for motion in drive(stretches, seeds[:samples], sampling)
+            for motion in drive(stretches, sample_seeds(seed, samples), sampling)
         ]
-        faces = self._faces(segments, frames, seeds[samples:], sampling)
+        faces = self._faces(segments, frames, sample_seeds(seed, samples, FACES), sampling)
         # Segments last whole units of the generator, so the time line goes by frames, not by what was asked.
         starts = np.concatenate([[0], np.cumsum(frames)]) / fps
         bands = tuple(s.band(a, b) for s, a, b in zip(segments, starts, starts[1:], strict=False))

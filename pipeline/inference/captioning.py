@@ -64,6 +64,8 @@ def captions(
     A clip is a motion, a file, or an archive or folder of files (`read_clips`). `UserError` where the model
     has no captioner.
     """
+    if isinstance(clips, (str, Path, GeneratedMotion)):
+        raise UserError(f"clips is one, {clips!r:.60}; give a list, also of one")
     captioner = model.bundle.captioner
     layout, columns = captioner.layout, captioner.layout.part(captioner.part)
     least = max(captioner.min_frames, LEAST_FRAMES)

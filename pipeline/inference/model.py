@@ -50,7 +50,14 @@ from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
-from motionloom.pipeline.inference.requests import require_seed, weight_bytes
+from motionloom.pipeline.inference.requests import (
+    caption_list,
+    lengths_of,
+    require_samples,
+    require_seed,
+    sound_list,
+    weight_bytes,
+)
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.inference.shown import shown
@@ -115,6 +122,9 @@ class MotionModel(
         frames theirs begin: a file (.npz, .bvh, .glb), or the layout's columns [T, D]; without it they take
         the start of a training dance.
         """
+        captions = None if captions is None else caption_list(captions)
+        sounds = None if sounds is None else sound_list(sounds)
+        seconds = lengths_of(seconds)
         if isinstance(seed_motion, Path | str):
             seed_motion = read_seed_motion(Path(seed_motion), self.bundle.layout)
         with threads_for(len(sounds or captions or ()), weight_bytes(self.bundle.stages)):
@@ -135,7 +145,7 @@ class MotionModel(
 
     def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
         """Captions that are far from all that it was trained on, and what it knows nearest to each."""
-        return self.bundle.unknown_captions(captions, face)
+        return self.bundle.unknown_captions(caption_list(captions), caption_list(face, "face"))
 
     def perform(
         self,
@@ -216,6 +226,7 @@ def edit_clip(
 ) -> list[EditedMotion]:
     """Edit a clip as `MotionModel.edit`."""
     require_seed(seed)
+    require_samples(samples)
     layout, sampling = bundle.layout, bundle.drawing(sampling)
     if task.changes_clip:
         before = edit_frames(EditTask(), clip, layout)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, nearest
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions, shown
 from motionloom.pipeline.inference.writers import WRITERS, OutputClip, Outputs, cell_of, writer_for
@@ -32,8 +32,8 @@ def file_stem(number: int, name: str) -> str:
 
 
 def write_motions(
-    folder: Path,
-    motions: Sequence[GeneratedMotion],
+    folder: Path | str,
+    motions: Iterable[GeneratedMotion],
     formats: Sequence[str],
     *,
     title: str,
@@ -55,7 +55,9 @@ def write_motions(
     each, `notes` the lines below. `figure` says how the shown figure follows the generated joints, and `say`
     is given a line on each motion that it is far from.
     """
+    folder, motions = Path(folder), list(motions)
     require_folder(folder)
+    require_formats(formats)
     options = figure or FigureOptions()
     scores = [score_of(motion) for motion in motions] if scores is None else scores
     writers = [(name, writer) for name, writer in WRITERS.items() if name in formats]
@@ -87,6 +89,15 @@ def write_motions(
             path.unlink()
     write_text(folder / WRITTEN, "".join(f"{path.name}\n" for path in paths))
     return paths
+
+
+def require_formats(formats: Sequence[str]) -> None:
+    """Refuse names of formats that there are not, and none at all."""
+    if not formats or isinstance(formats, str):
+        raise UserError(f"formats {formats!r}: give a list of some; known: {', '.join(WRITERS)}")
+    for name in formats:
+        if name not in WRITERS:
+            raise UserError(f"format {name}: no such format{nearest(name, list(WRITERS))}")
 
 
 def _written(folder: Path) -> list[Path]:

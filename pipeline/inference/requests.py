@@ -56,6 +56,39 @@ def require_seed(seed: int) -> None:
         raise UserError(f"seed {seed}: a seed is a whole number, 0 or more")
 
 
+def require_samples(samples: int) -> None:
+    """Refuse what is no number of motions."""
+    if not isinstance(samples, Integral) or isinstance(samples, bool) or samples < 1:
+        raise UserError(f"samples {samples}: a whole number, 1 or more")
+
+
+def lengths_of(seconds: object) -> float | list[float] | None:
+    """Lengths in seconds as plain numbers: one, one for each motion, or None; arrays and tensors too."""
+    if seconds is None or isinstance(seconds, float):
+        return seconds
+    try:
+        values = np.asarray(seconds, np.float64) if not isinstance(seconds, str) else None
+    except (TypeError, ValueError):
+        values = None
+    if values is None or values.ndim > 1:
+        raise UserError(f"seconds {seconds!r:.60}: a number, or a list with one for each motion")
+    plain: float | list[float] = values.tolist()
+    return plain
+
+
+def sound_list(given: object) -> list[Sound | None]:
+    """The sounds as a list; refuses what are no sounds, such as names of files."""
+    from motionloom.datasets.audio.sound import Sound
+
+    if isinstance(given, (Sound, str)) or not isinstance(given, Iterable):
+        raise UserError("sounds: give a list, also of one: sounds=[Sound.read('song.wav')]")
+    out = list(given)
+    for row, sound in enumerate(out):
+        if not isinstance(sound, (Sound, type(None))):
+            raise UserError(f"sounds[{row}] = {sound!r:.60}: no sound; read a file by Sound.read")
+    return out
+
+
 def prompts_of(
     captions: Sequence[str] | None,
     faces: Sequence[str] | None,

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from motionloom.datasets.base.places import hub_is_away, means_folder, no_such_folder
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.schema import UserError, nearest
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 
 _FILES = ["*.json", "*.safetensors", "*.txt", "*.model"]
 """Files of an export; a hub's folder may hold others."""
+_HUB_OPTIONS = ("revision", "token", "cache_dir", "force_download", "local_files_only")
 CARD_FIGURES = "card.json"
 """Beside a model's card: its figures, and what it is in one line."""
 
@@ -63,9 +64,11 @@ def model_folder(name: Path | str) -> Path:
 def find_model(name: Path | str, **options: Any) -> Path:
     """The folder of a model: as `model_folder`, or else, of a name `owner/name`, a copy from the hub.
 
-    `options` are the hub's (revision, token, cache_dir, force_download, local_files_only). Raises `UserError`
+    `options` are the hub's, `_HUB_OPTIONS`. Raises `UserError`
     where no folder, no model of the package and no model of the hub has this name; a `Path` is no hub name.
     """
+    for option in options.keys() - set(_HUB_OPTIONS):
+        raise UserError(f"{option}: no such option{nearest(option, ('device', *_HUB_OPTIONS))}")
     folder = model_folder(name)
     if folder.exists():
         return folder

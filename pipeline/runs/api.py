@@ -35,7 +35,7 @@ from motionloom.pipeline.store.run_state import RunState, run_state
 
 def run_recipe(
     recipe: str | Path,
-    out: Path | None = None,
+    out: Path | str | None = None,
     *,
     overrides: Sequence[str] = (),
     select: Selection | None = None,
@@ -57,7 +57,7 @@ def run_recipe(
     """
     console = console or make_console()
     loaded = load_recipe(recipe, overrides)
-    run = out or Path("runs") / loaded.name
+    run = Path(out or Path("runs") / loaded.name)
     if verify:
         count = sum(require_unchanged(stage_folder(run, stage.name), again=True) for stage in loaded.stages)
         say(console, f"{run}: {count} files have the sha256 that their stages noted")
@@ -180,7 +180,7 @@ def _inputs_again(
 
 
 def evaluate_run(
-    folder: Path,
+    folder: Path | str,
     *,
     at: str | None = None,
     clips: int | None = None,
@@ -197,6 +197,7 @@ def evaluate_run(
     With `share` all processes of the recipe's hardware take part, as in `run_recipe`, which start by the
     command that started this one; else this process alone.
     """
+    folder = Path(folder)
     console = console or make_console()
     changes = {"clips": clips, "repeats": repeats}
     with run_at(folder, at) as run:
@@ -211,8 +212,8 @@ def _beside(folder: Path, run: Path) -> Path:
 
 
 def report_run(
-    folder: Path,
-    out: Path | None,
+    folder: Path | str,
+    out: Path | str | None,
     *,
     at: str | None = None,
     device: str = "auto",
@@ -222,6 +223,7 @@ def report_run(
 
     With `at` it shows what the trainings make at a checkpoint (`snapshot.run_at`), and lies in RUN/at.
     """
+    folder, out = Path(folder), None if out is None else Path(out)
     console = console or make_console()
     if out is not None:
         require_file_place(out, ".html")
@@ -239,8 +241,8 @@ def report_run(
 
 
 def export_run(
-    folder: Path,
-    out: Path,
+    folder: Path | str,
+    out: Path | str,
     *,
     at: str | None = None,
     half: bool = False,
@@ -253,6 +255,7 @@ def export_run(
     otherwise. With `at` trainings that are not finished are taken from a checkpoint (`snapshot.run_at`);
     their artifacts say the step.
     """
+    folder, out = Path(folder), Path(out)
     from motionloom.pipeline.inference.exported import CARD, write_bundle
 
     console = console or make_console()

@@ -32,6 +32,14 @@ def training(
     given = Path(run_or_recipe)
     is_run = (given / "recipe.yaml").is_file()
     recipe = load_recipe(given / "recipe.yaml" if is_run else run_or_recipe, overrides)
+    if is_run and overrides:
+        made = load_recipe(given / "recipe.yaml")
+        for one in recipe.stages:
+            if one.name != stage and one.config != made.stage(one.name, "overrides").config:
+                raise UserError(
+                    f"overrides: {given} has its stage '{one.name}' already, made as it was; change only "
+                    f"{stage}.*, or give the recipe"
+                )
     run = given if is_run else Path("runs") / recipe.name
     opened = recipe.stage(stage)
     if not isinstance(opened.kind, TrainedStage):

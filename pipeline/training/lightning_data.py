@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch
 from torch.utils.data import DataLoader
 
 from motionloom.datasets.loading.plan import Share
@@ -23,9 +24,9 @@ from motionloom.pipeline.training.trained_stage import Batches, TrainedStage, de
 class StageData(L.LightningDataModule):
     """The batches of a stage's training, each rank's own, and those of its validation.
 
-    Step k reads the same global batch as in the pipeline's own loop, on any number of processes; a Trainer
-    that resumes goes on behind the last step. `train.batch_size` is the global batch. Batches are loaded in
-    workers where `hardware.workers` says how many.
+    Step k reads the same global batch as in the pipeline's own loop, on any number of processes and in any
+    epoch; a Trainer that resumes goes on behind the last step. `train.batch_size` is the global batch.
+    Batches are loaded in workers where `hardware.workers` says how many.
     """
 
     def __init__(self, batches: Batches, train: TrainConfig, hardware: Hardware | None = None) -> None:
@@ -42,7 +43,7 @@ class StageData(L.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[Batch]:
         trainer = self.trainer
-        module, done = (None, 0) if trainer is None else (trainer.lightning_module, trainer.global_step)
+        module = None if trainer is None else trainer.lightning_module
         parts = module.accumulate if isinstance(module, StageModule) else self.config.accumulate
         steps = self.config.steps if trainer is None or trainer.max_steps < 0 else trainer.max_steps
         size, batches = self.config.batch_size, self.batches.train
@@ -50,7 +51,13 @@ class StageData(L.LightningDataModule):
         def make(rank: int, world: int) -> Numbered[Batch]:
             return batches(size, Share(rank, world, parts))
 
-        return loader(Steps(make, steps * parts, done * parts), self.hardware)
+        def done() -> int:
+            if trainer is None or getattr(trainer, "overfit_batches", False):  # the same ones over and over
+                return 0
+            return trainer.global_step * parts
+
+        # A worker that is kept would begin its next epoch where it began this one.
+        return loader(Steps(make, steps * parts, done), self.hardware, once=True)
 
     def val_dataloader(self) -> DataLoader[Batch] | list[DataLoader[Batch]]:
         validation = self.batches.validation
@@ -70,6 +77,7 @@ def open_training(
     return module, StageData(batches, config.train, hardware)
 
 
+@torch.random.fork_rng(devices=[])  # a caller's own draws stay what they are
 def _open_module(
     kind: TrainedStage[Any, Any, Any], config: Any, given: Mapping[str, CompletedStage], seed: int
 ) -> tuple[StageModule, Inputs]:

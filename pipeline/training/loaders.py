@@ -162,9 +162,10 @@ class _Loader(DataLoader[Batch]):
             self._iterator = None
 
 
-def loader(steps: Steps[Batch], hardware: Hardware) -> _Loader:
-    """Return a loader of ready batches."""
-    workers = hardware.workers_for(steps.last - steps.first)
+def loader(steps: Steps[Batch], hardware: Hardware, *, once: bool = False) -> _Loader:
+    """Return a loader of ready batches; with `once`, of which no worker is kept for the next epoch."""
+    first, last = steps.span()
+    workers = hardware.workers_for(last - first)
     # torch pins nothing where it finds no GPU, whatever was asked for.
     pinned = hardware.resolved_accelerator() == "gpu" and torch.accelerator.is_available()
     return _Loader(
@@ -172,7 +173,8 @@ def loader(steps: Steps[Batch], hardware: Hardware) -> _Loader:
         batch_size=None,
         num_workers=workers,
         pin_memory=pinned,
-        persistent_workers=workers > 0,  # from validation to validation; their start takes seconds
+        persistent_workers=workers > 0
+        and not once,  # from validation to validation; their start takes seconds
         multiprocessing_context="spawn" if workers else None,
         worker_init_fn=partial(end_with_parent, os.getpid()) if workers else None,
     )

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -18,6 +19,16 @@ if __name__ == "__main__":
     with Workers(2) as workers:
         list(workers.run(time.sleep, [SECONDS] * 2))
 """
+
+
+def test_a_script_without_a_guard_runs_once(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(
+        PROGRAM.replace('if __name__ == "__main__":', "if print('begun') is None:").replace("SECONDS", "0.1")
+    )
+    done = subprocess.run(
+        [sys.executable, "-P", str(tmp_path / "script.py")], capture_output=True, text=True, timeout=50
+    )
+    assert (done.returncode, done.stdout.count("begun"), done.stderr) == (0, 1, "")
 
 
 @pytest.mark.parametrize(("seconds", "after"), [(0.1, None), (60, 0.5), (60, 3.0)])

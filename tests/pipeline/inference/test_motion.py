@@ -196,6 +196,10 @@ def test_new_motions_take_the_place_of_old_ones(
     assert [path.name for path in paths] == ["00-歩く-ひと.npz", "01-шаг-вперёд.npz", "index.html"]
     left = {path.name for path in out.iterdir() if not path.name.startswith(".")}
     assert left == {"notes.txt", "mine.npz", *(path.name for path in paths)}
+    for formats, said in ((["npy"], "npy: no such format"), ("npz", "give a list"), ([], "give a list")):
+        with pytest.raises(UserError, match=said):
+            write_motions(str(out), iter(motions), formats, title="t")
+    assert all(path.is_file() for path in paths)
     # What they are made from stays, and all of it does where they cannot be written.
     write_motions(out, motions, ["npz"], title="t", made_from=out / "00-歩く-ひと.npz")
     before = {path.name: path.read_bytes() for path in out.iterdir()}

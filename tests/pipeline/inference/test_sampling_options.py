@@ -109,6 +109,15 @@ def test_lengths_out_of_reach_are_refused_with_the_true_range(fps: float, least:
     assert len(model.generate(CAPTIONS[:1], seconds=float(least))[0].joints) == 4
 
 
+def test_body_and_face_are_those_of_each_motion_alone() -> None:
+    model, before = bundle(faces=("gpt",)), torch.get_rng_state()
+    first, *_ = model.generate(CAPTIONS, seconds=1.0, seed=3)
+    (alone,) = model.generate(CAPTIONS[:1], seconds=1.0, seed=3)
+    np.testing.assert_allclose(alone.features, first.features, atol=1e-5)
+    np.testing.assert_allclose(alone.face, first.face, atol=1e-5)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_temperature_zero_is_greedy() -> None:
     model, greedy = bundle(faces=("gpt",)), SamplingConfig(temperature=0)
     first, second = (model.generate(CAPTIONS, seconds=1.0, seed=s, sampling=greedy) for s in (1, 2))

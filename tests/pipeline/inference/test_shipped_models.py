@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from motionloom.datasets.base.places import hub_is_away, means_folder, no_such_folder, require_hub_name
 from motionloom.datasets.schema import UserError
@@ -20,6 +21,7 @@ from motionloom.pipeline.cli.main import _exit_code
 from motionloom.pipeline.inference import shipped_models as module
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.script import Script, ScriptSegment
 from motionloom.pipeline.inference.shipped_models import model_folder, shipped_models
 
 CAPTION = "a person waves with the left hand"
@@ -84,8 +86,20 @@ def synthetic() -> Path:
 
 def test_the_model_that_ships_is_small_and_whole(synthetic: Path) -> None:
     assert shipped_models()["synthetic"].bytes <= 20e6
+    before = torch.get_rng_state()
     model = MotionModel.from_pretrained("synthetic", device="cpu")
+    assert torch.equal(torch.get_rng_state(), before)
     assert model.modalities == {"text"} and model.bundle.faces and model.bundle.layout.has("face")
+    one, other = (model.generate([CAPTION], seconds=given) for given in (2.0, np.array([2], np.float32)))
+    assert one[0].features.tobytes() == other[0].features.tobytes()
+    with pytest.raises(UserError, match="devcie: no such option; did you mean 'device'"):
+        MotionModel.from_pretrained("synthetic", devcie="cpu")
+    for wrong, said in (({"sounds": ["a.wav"]}, "read a file by Sound.read"), ({"seconds": "3"}, "a number")):
+        with pytest.raises(UserError, match=said):
+            model.generate(None if "sounds" in wrong else [CAPTION], **wrong)
+    for samples in (0, -1, 2.0, True):
+        with pytest.raises(UserError, match=r"samples .*: a whole number, 1 or more"):
+            model.perform(Script(segments=[ScriptSegment(text="a", seconds=1.0)]), samples=samples)
 
 
 def test_the_readmes_first_line_waves_with_the_left_hand(

@@ -273,6 +273,23 @@ def test_resumes_from_its_checkpoint_and_monitors(name: str, tmp_path: Path) -> 
     assert_equal(whole.state_dict(), resumed.state_dict())
 
 
+@pytest.mark.parametrize("name", ["mq", "utt"])
+def test_epochs_go_on_where_the_last_one_ended(name: str, tmp_path: Path) -> None:
+    """Also one that a limit ends, and one in which a training stops and goes on."""
+    whole, short, stopped, resumed = (opened(name)[0] for _ in range(4))
+    trainer(tmp_path, max_steps=2 * STEPS).fit(whole, stage_data(name))
+    trainer(tmp_path, max_steps=2 * STEPS, limit_train_batches=2).fit(short, stage_data(name))
+    assert_equal(whole.state_dict(), short.state_dict())
+    epochs: dict[str, Any] = {"max_steps": -1, "max_epochs": 2}
+    half = trainer(tmp_path, **{**epochs, "max_steps": STEPS + 2})
+    half.fit(stopped, data := stage_data(name))
+    half.save_checkpoint(tmp_path / "half.ckpt")
+    assert half.global_step == STEPS + 2
+    trainer(tmp_path, **epochs).fit(resumed, data, ckpt_path=tmp_path / "half.ckpt")
+    assert resumed.step == 2 * STEPS
+    assert_equal(whole.state_dict(), resumed.state_dict())
+
+
 def worker(folder: Path) -> None:
     for name in ude_training.NAMES:
         own = ude_training.train(name, folder / name, devices=2, dropout=0.1, steps=STEPS, validate_every=0)
