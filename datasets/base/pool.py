@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import sys
 import threading
@@ -13,6 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.connection import wait
+from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
@@ -62,7 +62,7 @@ class Workers:
                 self._pool = ProcessPoolExecutor(
                     min(self.count, len(tasks)), context, initializer=_exit_with_parent
                 )
-            with _starting(needs_program=b"__main__" in pickle.dumps((work, tasks[0]))):
+            with _starting():
                 futures = {
                     self._pool.submit(on_one_thread, work, task): position
                     for position, task in enumerate(tasks)
@@ -95,16 +95,18 @@ def on_one_thread(work: Callable[[T], R], task: T) -> R:
 
 
 @contextmanager
-def _starting(needs_program: bool) -> Iterator[None]:
-    """Start workers that leave Ctrl-C to their parent and, unless what they do is from there, do not import
-    its program: a script without `if __name__ == "__main__"` would run anew in each, one of stdin is gone.
+def _starting() -> Iterator[None]:
+    """Start workers that leave Ctrl-C to their parent, and do not import a program that would run anew in
+    each, being without `if __name__ == "__main__"`, or that is gone, having come from stdin.
     """
     program = sys.modules["__main__"]
+    file = Path(getattr(program, "__file__", None) or "")
+    hidden = not file.is_file() or "__main__" not in file.read_text(encoding="utf-8", errors="replace")
     found = {name: getattr(program, name) for name in ("__file__", "__spec__") if hasattr(program, name)}
     # Blocked here, it is blocked in them from their first instruction on, up to `_exit_with_parent`.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        if not needs_program:
+        if hidden:
             program.__spec__ = None
             vars(program).pop("__file__", None)
         yield

@@ -79,8 +79,8 @@ def prepare(
     if kind is None:
         raise UserError(f"no converter takes a {type(config).__name__}; register its converter, or name it")
     converter = kind(config)
-    plan = converter.plan(PlanSettings(workers, progress, out))
+    plan = converter.plan(settings := PlanSettings(workers, progress, out))
     if out is None:
-        return Conversion(converter, plan)
+        return Conversion(converter, plan, settings)
     plan.leave_removed(Removed.of(out).has, REMOVED_FILE)
-    return Conversion(converter, plan, moved_clips(out, plan))
+    return Conversion(converter, plan, settings, moved_clips(out, plan))

@@ -11,7 +11,7 @@ from motionloom.datasets.motion.layout import Part
 from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.schedule import Sampler
 
-Guidance = Annotated[float, Field(ge=1, le=100)]
+Guidance = Annotated[float, Field(ge=1, le=1e6)]
 
 
 class SamplingConfig(Config):

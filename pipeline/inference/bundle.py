@@ -213,7 +213,7 @@ class Bundle:
         face: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
         conditions: Mapping[str, Sequence[object]] | None = None,
-        seconds: float | Sequence[float] | None = None,
+        seconds: float | Sequence[float | None] | None = None,
         seed: int = 0,
         noise_seed: int | None = None,
         sampling: SamplingConfig | None = None,
@@ -266,7 +266,7 @@ class Bundle:
         prompts: Sequence[Prompt],
         motions: Sequence[GeneratedMotion] = (),
         face_model: str | None = None,
-        seconds: float | Sequence[float] | None = None,
+        seconds: float | Sequence[float | None] | None = None,
     ) -> list[Unknown | str]:
         """Return the notes on prompts, and on motions whose length is not the one asked for (`seconds`)."""
         texts, faces = [prompt.text for prompt in prompts], [prompt.face_text for prompt in prompts]

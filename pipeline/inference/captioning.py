@@ -61,7 +61,7 @@ def captions(
 ) -> Iterator[CaptionedClip | Dropped]:
     """Yield up to `count` sentences about each clip, likeliest first, or why it cannot be read.
 
-    A clip is a motion, a file, or an archive or folder of files (`read_clips`). `UserError` where the model
+    A clip is a motion, a file, or a folder of files (`read_clips`). `UserError` where the model
     has no captioner.
     """
     if isinstance(clips, (str, Path, GeneratedMotion)):

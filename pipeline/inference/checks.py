@@ -41,7 +41,9 @@ def unknown_captions(source: object, captions: Sequence[str], *, face: bool = Fa
 
 
 def rounded_lengths(
-    generator: MotionGenerator, seconds: float | Sequence[float] | None, motions: Sequence[GeneratedMotion]
+    generator: MotionGenerator,
+    seconds: float | Sequence[float | None] | None,
+    motions: Sequence[GeneratedMotion],
 ) -> list[str]:
     """Return a sentence for each of `seconds` that a motion's length, in whole units, is not."""
     asked = [seconds] * len(motions) if isinstance(seconds, int | float) else seconds or ()
@@ -50,7 +52,7 @@ def rounded_lengths(
     return [
         f"{wanted:g} s were asked for and {made:g} s are made: this model makes whole {unit / fps:.2g} s"
         for wanted, made in lengths
-        if abs(wanted - made) > 0.5 / fps
+        if wanted is not None and abs(wanted - made) > 0.5 / fps
     ]
 
 

@@ -106,7 +106,7 @@ class MotionModel(
         *,
         face: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
-        seconds: float | Sequence[float] | None = None,
+        seconds: float | Sequence[float | None] | None = None,
         seed: int = 0,
         sampling: SamplingConfig | Mapping[str, object] | None = None,
         seed_motion: Path | str | NDArray[np.float32] | None = None,

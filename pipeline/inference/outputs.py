@@ -83,7 +83,9 @@ def write_motions(
             if writer.together and (len(clips) > 1 or not writer.alone):
                 out.append(new / writer.together)
                 writer.write(out[-1], Outputs(clips, title, note))
-    paths = [folder / path.name for path in out]
+        paths = [folder / path.name for path in out]
+        if made_from is not None and any(path.exists() and path.samefile(made_from) for path in paths):
+            raise UserError(f"{made_from}: would be replaced by a motion made from it; choose another folder")
     for path in set(_written(folder)) - set(paths):
         if made_from is None or not path.samefile(made_from):
             path.unlink()

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -62,18 +62,20 @@ def require_samples(samples: int) -> None:
         raise UserError(f"samples {samples}: a whole number, 1 or more")
 
 
-def lengths_of(seconds: object) -> float | list[float] | None:
-    """Lengths in seconds as plain numbers: one, one for each motion, or None; arrays and tensors too."""
-    if seconds is None or isinstance(seconds, float):
-        return seconds
+def lengths_of(seconds: Any) -> float | list[float | None] | None:
+    """Lengths in seconds as plain numbers: one, or one for each motion; None where the model decides."""
+
+    def plain(value: Any) -> float | None:
+        if isinstance(value, (str, bool, np.bool_)):
+            raise TypeError
+        return None if value is None else float(value)
+
     try:
-        values = np.asarray(seconds, np.float64) if not isinstance(seconds, str) else None
+        if isinstance(seconds, Iterable) and getattr(seconds, "ndim", 1) != 0:
+            return [plain(value) for value in seconds]
+        return plain(seconds)
     except (TypeError, ValueError):
-        values = None
-    if values is None or values.ndim > 1:
-        raise UserError(f"seconds {seconds!r:.60}: a number, or a list with one for each motion")
-    plain: float | list[float] = values.tolist()
-    return plain
+        raise UserError(f"seconds {seconds!r:.60}: a number, or a list with one for each motion") from None
 
 
 def sound_list(given: object) -> list[Sound | None]:
@@ -152,7 +154,7 @@ def require_used(
 
 
 def frames_of(
-    generator: MotionGenerator, seconds: float | Sequence[float] | None, prompts: Sequence[Prompt]
+    generator: MotionGenerator, seconds: float | Sequence[float | None] | None, prompts: Sequence[Prompt]
 ) -> list[int | None]:
     """Length of each motion in frames, in whole units of the generator; None where the model decides.
 

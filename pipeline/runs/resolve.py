@@ -200,10 +200,11 @@ def _override(data: Tree, text: str) -> Tree:
         _require_there(parts[1], stages, f"--set {text}:")
         return {**data, "stages": {name: entry for name, entry in stages.items() if name != parts[1]}}
     # A value replaces what is there, a mapping too, but for settings of a whole stage.
-    if parts[0] == "stages" and len(parts) == 2 and isinstance(new, dict) and "kind" not in new:
-        new = merge(stages.get(parts[1]) or {}, new)
+    old = stages.get(parts[1]) if parts[0] == "stages" and len(parts) == 2 else None
+    if isinstance(old, dict) and isinstance(new, dict) and "kind" not in new:
+        new = merge(old, new)
     out: Tree = _put(data, parts, new)
-    if parts[0] == "stages" and len(parts) > 2:
+    if parts[0] == "stages" and len(parts) > 1 and isinstance(out["stages"][parts[1]], dict):
         out["stages"][parts[1]] = _placed(out["stages"][parts[1]], None)
     return out
 

@@ -8,9 +8,10 @@ from pathlib import Path
 from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.lookup import finished_stages
+from motionloom.pipeline.contract.stage import Stage, fingerprint_fields
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
-from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.training.lightning_data import StageData, open_training
 from motionloom.pipeline.training.trained_stage import TrainedStage
 
@@ -33,13 +34,7 @@ def training(
     is_run = (given / "recipe.yaml").is_file()
     recipe = load_recipe(given / "recipe.yaml" if is_run else run_or_recipe, overrides)
     if is_run and overrides:
-        made = load_recipe(given / "recipe.yaml")
-        for one in recipe.stages:
-            if one.name != stage and one.config != made.stage(one.name, "overrides").config:
-                raise UserError(
-                    f"overrides: {given} has its stage '{one.name}' already, made as it was; change only "
-                    f"{stage}.*, or give the recipe"
-                )
+        _require_as_made(load_recipe(given / "recipe.yaml"), recipe, recipe.above(recipe.stage(stage)))
     run = given if is_run else Path("runs") / recipe.name
     opened = recipe.stage(stage)
     if not isinstance(opened.kind, TrainedStage):
@@ -53,3 +48,14 @@ def training(
     inputs = {role: stages[name] for role, name in opened.inputs.items()}
     seed = opened.config.train.seed_of(recipe.seed)
     return open_training(opened.kind, opened.config, inputs, seed, recipe.hardware)
+
+
+def _require_as_made(made: Recipe, wanted: Recipe, stages: Sequence[Stage]) -> None:
+    """Refuse overrides of finished stages, which are taken as they are."""
+    for one in stages:
+        if fingerprint_fields(one.config) != fingerprint_fields(made.stage(one.name, "overrides").config):
+            raise UserError(
+                f"overrides: the run has its stage '{one.name}' already, made as it was; leave that out, or "
+                f"give the recipe"
+            )
+        _require_as_made(made, wanted, wanted.above(one))

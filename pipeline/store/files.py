@@ -29,7 +29,7 @@ def require_file_place(path: Path, ending: str) -> None:
     shard or a recording does, which it would take the place of; creates nothing."""
     if path.is_dir():
         raise UserError(f"{path}: is a folder; name a file, like {path / f'NAME{ending}'}")
-    if path.suffix.lower() != ending:
+    if path.suffix.lower() != ending and (path.is_file() or not path.exists()):  # a pipe takes anything
         raise UserError(f"{path}: name a file that ends in {ending}, as what is written does")
     require_folder(path.parent)
 
@@ -103,6 +103,8 @@ def _aside(folder: Path, place: Path) -> Iterator[Path]:
                 setattr(error, side, str(name).replace(str(temporary), str(folder), 1))
         raise
     except UserError as error:
+        if str(temporary) not in str(error):
+            raise
         raise UserError(str(error).replace(str(temporary), str(folder))) from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

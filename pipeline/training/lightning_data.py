@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -38,8 +39,15 @@ class StageData(L.LightningDataModule):
 
     def setup(self, stage: str) -> None:
         """Use as many CPU threads as the pipeline's own loop: the number of threads changes rounding."""
-        if self.trainer is not None:
-            set_threads(self.trainer.lightning_module, self.hardware)
+        if self.trainer is None:
+            return
+        set_threads(self.trainer.lightning_module, self.hardware)
+        counts: dict[str, object] = {"precision": self.trainer.precision}
+        if self.trainer.lightning_module.automatic_optimization:
+            counts["accumulate"] = self.trainer.accumulate_grad_batches
+        for key, value in counts.items():
+            if stage == "fit" and (own := getattr(self.config, key)) != value:
+                warnings.warn(f"train.{key} is {own}; what counts is this Trainer's, {value}", stacklevel=2)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         trainer = self.trainer

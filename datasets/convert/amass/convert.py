@@ -16,7 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from motionloom.datasets.convert.amass.smpl_npz import MotionHeader, read_motion, read_motion_header
+from motionloom.datasets.convert.amass.smpl_npz import (
+    MotionHeader,
+    RateError,
+    read_motion,
+    read_motion_header,
+)
 from motionloom.datasets.convert.captions.humanml_index import (
     INDEX_FPS,
     HumanmlConfig,
@@ -154,7 +159,10 @@ class Amass(Release[AmassConfig]):
         return listed
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
-        header = self.headers[label] = read_motion_header(path, label, self.config.source_fps)
+        try:
+            header = self.headers[label] = read_motion_header(path, label, self.config.source_fps)
+        except RateError as error:
+            raise UserError(f"{error}; state it: --set source_fps=120") from None
         if not header.fps:
             raise UserError("no mocap_framerate and no mocap_frame_rate in it; set source_fps")
         return header.frames, header.fps

@@ -6,6 +6,7 @@ Only the named arrays are opened, so pickled extras of a file (marker lists) are
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,10 @@ class MotionHeader:
     gender: str
     hands: bool
     """Whether there are finger rotations."""
+
+
+class RateError(UserError):
+    """The frame rate that a file states cannot be."""
 
 
 def read_motion_header(path: Path, label: str, fps: float | None = None) -> MotionHeader:
@@ -139,14 +144,11 @@ def _rate(file: NpzFile) -> float | None:
             value = file.numbers(name, limit=4096)
             fps = float(value.reshape(-1)[0]) if value.size == 1 else float("nan")
             if not 0 < fps <= 10_000:
-                raise UserError(
-                    f"{file.label}: {name} is {value.tolist()}, not a number of frames a second; state it: "
-                    f"--set source_fps=120"
-                )
+                raise RateError(f"{file.label}: {name} is {value.tolist()}, not a number of frames a second")
             found[name] = fps
-    if len(set(found.values())) > 1:
+    if found and not math.isclose(min(found.values()), max(found.values()), rel_tol=1e-3):
         stated = " and ".join(f"{name} {fps:g}" for name, fps in found.items())
-        raise UserError(f"{file.label}: {stated} differ; state the frame rate: --set source_fps=120")
+        raise RateError(f"{file.label}: {stated} differ")
     return next(iter(found.values()), None)
 
 

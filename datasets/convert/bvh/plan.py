@@ -340,7 +340,8 @@ def _decide(config: BvhConfig, folder: Path, found: list[FoundFile], stated: str
             or listing.problem(clip.path)
             or config.length_problem(frames / fps)
         )
-        texts = captions_within(listing.texts_of(clip.path), frames / fps, clip_id, draft.notes)
+        notes = [] if reason else draft.notes
+        texts = captions_within(listing.texts_of(clip.path), frames / fps, clip_id, notes)
         split, about = listing.split_of(clip.path), config.about(clip.path)
         planned = BvhClip(folder, clip, clip_id, split, texts, frames, fps, about, config.licence)
         keep = config.uncaptioned == "keep"

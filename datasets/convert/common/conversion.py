@@ -13,7 +13,8 @@ from typing import Any, Generic
 
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.converter import Converter
+from motionloom.datasets.convert.common.converter import Converter, PlanSettings
+from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.look import Look, look_at
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.schema import SPLITS, Manifest, Split, UserError
@@ -32,6 +33,7 @@ class Conversion(Generic[C]):
 
     converter: Converter[Any, C]
     plan: ConversionPlan[C]
+    settings: PlanSettings
     moved: str = ""
     """Clips of an earlier run that are in another split now, counted."""
 
@@ -43,7 +45,9 @@ class Conversion(Generic[C]):
     @cached_property
     def options(self) -> dict[str, object]:
         """Everything the output depends on, as plain JSON; never a local path."""
-        content = [self.converter.depends_on(clip) for _, clip in self.plan.items]
+        clips = [clip for _, clip in self.plan.items]
+        read, settings = self.converter.depends_on, self.settings
+        content = [*read_in_threads(read, clips, workers=settings.workers, progress=settings.progress)]
         return self.converter.options() | {"source_sha256": sha256_of_json(content)}
 
     def facts(self) -> DatasetFacts:

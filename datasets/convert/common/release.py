@@ -88,8 +88,6 @@ class ReleaseClip:
     last: int
     fps: float
     licence: str
-    content: str
-    """sha256 of the motion file."""
 
     @property
     def id(self) -> str:
@@ -236,21 +234,21 @@ class Release(Converter[Cfg, ReleaseClip]):
         """The last frame before the sound ends, and why the clip is left out if it ends too early."""
         return last, ""
 
-    def _scan(self, file: str) -> tuple[int, float, str] | Exception | None:
-        """Frames, rate and sha256 of a motion file; None when it is absent, an error when it is damaged."""
+    def _scan(self, file: str) -> tuple[int, float] | Exception | None:
+        """Frames and rate of a motion file; None when it is not there, an error when it is damaged."""
         try:
             path = self.path_of(file)
             if not path.is_file():
                 return None
-            return (*self.length(path, file), content_of(path))
+            return self.length(path, file)
         except Exception as error:  # whatever a bad file or name makes of the libraries below
             return error
 
     def _clip(
-        self, entry: Entry, state: tuple[int, float, str], draft: ConversionPlan[ReleaseClip]
+        self, entry: Entry, state: tuple[int, float], draft: ConversionPlan[ReleaseClip]
     ) -> tuple[ReleaseClip, str]:
         """The clip of an entry whose file is there, and why it is left out."""
-        config, (frames, fps, content) = self.config, state
+        config, (frames, fps) = self.config, state
         entry = self.fitted(entry, frames, fps, draft)
         last, mute = self.cut_to_sound(entry, min(frames if entry.last is None else entry.last, frames), fps)
         seconds = max(last - entry.first, 0) / fps
@@ -258,7 +256,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         listed = self.listed if self.listed is not None else {entry.id: entry.split}
         split = listed.get(entry.id) or entry.split or hash_split(entry.group or entry.id)
         licence = config.licence or entry.licence or self.terms
-        clip = ReleaseClip(entry, split, min(entry.first, last), last, fps, licence, content)
+        clip = ReleaseClip(entry, split, min(entry.first, last), last, fps, licence)
         reason = (
             mute or ("" if entry.id in listed else "in no split file") or config.length_problem(clip.seconds)
         )
@@ -267,7 +265,8 @@ class Release(Converter[Cfg, ReleaseClip]):
     def depends_on(self, clip: ReleaseClip) -> list[object]:
         entry = clip.entry
         texts = [caption.dump() for caption in entry.texts]
-        return [clip.id, entry.file, clip.content, clip.first, clip.last, texts, clip.licence]
+        content = content_of(self.path_of(entry.file))
+        return [clip.id, entry.file, content, clip.first, clip.last, texts, clip.licence]
 
     def licence(self, plan: ConversionPlan[ReleaseClip]) -> str:
         alone = next(iter(plan.licences), self.terms) if len(plan.licences) <= 1 else self.terms

@@ -132,20 +132,6 @@ def require_known(names: list[str] | None, known: Collection[str], what: str) ->
     return names
 
 
-def values_of(attribute: str, action: object = None) -> set[object] | None:
-    """Values that clips of an action, or of any, may have in an attribute; None: of those no list is kept."""
-    lists = {"action": ACTIONS, "left_hand": HANDS, "right_hand": HANDS, "face": FACES}
-    if attribute in lists:
-        return set(lists[attribute])
-    kinds = [ACTIONS[action]] if isinstance(action, str) and action in ACTIONS else ACTIONS.values()
-    if attribute == "count":
-        return {None, *range(1, 1 + max(kind.most for kind in kinds))}
-    if attribute not in ("side", "direction", "speed", "style"):
-        return None
-    found = {value for kind in kinds for value in getattr(kind, attribute)}
-    return {None, *(found - {OWN}), *(SIDES if OWN in found else ())}
-
-
 def draw(action: str, rng: np.random.Generator, hand_shapes: Sequence[str] = HANDS[1:]) -> Truth:
     """Truth of one clip of `action`; hands that are free take one of `hand_shapes` now and then."""
     kind = ACTIONS[action]

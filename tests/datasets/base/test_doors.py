@@ -44,7 +44,8 @@ def configs(base: type[Config]) -> Iterator[type[Config]]:
     """Every config of every stage, and what else has been imported."""
     assert stage_kinds()
     for kind in base.__subclasses__():
-        yield from (kind, *configs(kind))
+        if kind.__module__.startswith("motionloom"):  # no other test's
+            yield from (kind, *configs(kind))
 
 
 def fine(value: Any) -> bool:

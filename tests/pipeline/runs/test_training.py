@@ -108,6 +108,7 @@ def test_a_recipe_makes_what_the_stage_needs(
     assert module.schedule.get_last_lr() == [0.0], "the cosine has ended"
     with pytest.raises(UserError, match="has its stage 'data' already"):
         training(small_run.folder, "tokenizer", ["data.clips=24"])
+    assert training(small_run.folder, "tokenizer", ["tma.train.steps=3", "tokenizer.train.steps=3"])
     with pytest.raises(UserError, match="'text' is not finished"):
         training(tmp_path / "runs/small", "gpt")
     with pytest.raises(UserError, match=r"'stats'.*trains nothing"):

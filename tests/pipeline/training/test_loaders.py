@@ -290,6 +290,13 @@ def test_epochs_go_on_where_the_last_one_ended(name: str, tmp_path: Path) -> Non
     assert_equal(whole.state_dict(), resumed.state_dict())
 
 
+def test_a_trainer_that_counts_otherwise_says_so(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match=r"train\.accumulate is 2; what counts is this Trainer's, 1"):
+        trainer(tmp_path, max_steps=1).fit(opened("mq")[0], stage_data("mq", parts=2))
+    with pytest.warns(UserWarning, match=r"train\.precision is 32-true; .* bf16-mixed"):
+        trainer(tmp_path, max_steps=1, precision="bf16-mixed").fit(opened("mq")[0], stage_data("mq"))
+
+
 def worker(folder: Path) -> None:
     for name in ude_training.NAMES:
         own = ude_training.train(name, folder / name, devices=2, dropout=0.1, steps=STEPS, validate_every=0)
