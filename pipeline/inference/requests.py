@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, SupportsFloat
 
 import numpy as np
 import torch
@@ -62,16 +62,22 @@ def require_samples(samples: int) -> None:
         raise UserError(f"samples {samples}: a whole number, 1 or more")
 
 
-def lengths_of(seconds: Any) -> float | list[float | None] | None:
+def lengths_of(seconds: object) -> float | list[float | None] | None:
     """Lengths in seconds as plain numbers: one, or one for each motion; None where the model decides."""
 
-    def plain(value: Any) -> float | None:
-        if isinstance(value, (str, bool, np.bool_)):
+    def plain(value: object) -> float | None:
+        if value is None:
+            return None
+        if not isinstance(value, SupportsFloat) or isinstance(value, (bool, np.bool_)):
             raise TypeError
-        return None if value is None else float(value)
+        return float(value)
 
     try:
-        if isinstance(seconds, Iterable) and getattr(seconds, "ndim", 1) != 0:
+        if (
+            isinstance(seconds, Iterable)
+            and not isinstance(seconds, str)
+            and getattr(seconds, "ndim", 1) != 0
+        ):
             return [plain(value) for value in seconds]
         return plain(seconds)
     except (TypeError, ValueError):
