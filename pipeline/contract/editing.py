@@ -22,7 +22,7 @@ MAX_SPEED = 12.0
 """Metres a second of a root; the fastest sprint that was measured (Bolt, Berlin 2009) reached 12.4."""
 Seconds = Annotated[float, Field(ge=-3600, le=3600)]
 Length = Annotated[float, Field(ge=0, le=3600)]
-"""Of two lower bounds on one number only the last counts, so none can be put on `Seconds`."""
+"""Seconds, not negative. A bound put on `Seconds` would be lost: the last of two lower ones counts."""
 Metres = Annotated[float, Field(ge=-1000, le=1000)]
 
 

@@ -49,11 +49,11 @@ def write_motions(
     """Write every motion in every format; the page holds all of them. Returns the paths.
 
     What was written there before is removed once all of it lies there, but for the file that the motions are
-    `made_from`. `title` and `note` are the page's. `scores`, one for each
-    motion, are sound, beats and segments for the page; without them each motion comes with what drove it.
-    `names` are what files are called after, instead of the captions; `labels` are what the page says above
-    each, `notes` the lines below. `figure` says how the shown figure follows the generated joints, and `say`
-    is given a line on each motion that it is far from.
+    `made_from`. `title` and `note` are the page's. `scores`, one for each motion, are sound, beats and
+    segments for the page; without them each motion comes with what drove it. `names` are what files are
+    called after, instead of the captions; `labels` are what the page says above each, `notes` the lines
+    below. `figure` says how the shown figure follows the generated joints, and `say` is given a line on each
+    motion that it is far from.
     """
     folder, motions = Path(folder), list(motions)
     require_folder(folder)

@@ -25,10 +25,10 @@ def training(
         run_or_recipe: A run folder, whose stages that feed this one are finished; or a recipe, of which
             those that are not finished in `runs/NAME` are run first.
         stage: A stage that trains, by its name in the recipe.
-        overrides: As `--set`: "tma.train.steps=2000".
+        overrides: As `--set`: "tma.train.steps=2000"; of a run, of no stage that feeds this one.
 
     Raises:
-        UserError: The stage trains nothing, or one that feeds it is not finished.
+        UserError: The stage trains nothing, or one that feeds it is not finished or is overridden.
     """
     given = Path(run_or_recipe)
     is_run = (given / "recipe.yaml").is_file()

@@ -163,9 +163,10 @@ class _Loader(DataLoader[Batch]):
 
 
 def loader(steps: Steps[Batch], hardware: Hardware, *, once: bool = False) -> _Loader:
-    """Return a loader of ready batches; with `once`, of which no worker is kept for the next epoch."""
+    """Return a loader of ready batches; with `once` no worker is kept for the next epoch."""
     first, last = steps.span()
     workers = hardware.workers_for(last - first)
+    kept = workers > 0 and not once  # from validation to validation; their start takes seconds
     # torch pins nothing where it finds no GPU, whatever was asked for.
     pinned = hardware.resolved_accelerator() == "gpu" and torch.accelerator.is_available()
     return _Loader(
@@ -173,8 +174,7 @@ def loader(steps: Steps[Batch], hardware: Hardware, *, once: bool = False) -> _L
         batch_size=None,
         num_workers=workers,
         pin_memory=pinned,
-        persistent_workers=workers > 0
-        and not once,  # from validation to validation; their start takes seconds
+        persistent_workers=kept,
         multiprocessing_context="spawn" if workers else None,
         worker_init_fn=partial(end_with_parent, os.getpid()) if workers else None,
     )

@@ -105,7 +105,7 @@ def test_times_are_an_hour_at_most(seconds: float, key: str) -> None:
 
 
 def test_no_setting_is_infinite_and_none_has_two_bounds_of_a_kind() -> None:
-    """Of two only the last counts. Each number of each config is tried."""
+    """Each number of each config is tried. The last of two bounds would count alone."""
     tried = 0
     for config in (one for one in configs(Config) if not inspect.isabstract(one)):
         for name, field in config.model_fields.items():

@@ -171,7 +171,7 @@ ANY_ORDER = {
 gradients that a gather or an index gives (scatter_add, index_put) it sorts."""
 
 FEW = {"repeats": 1, "shuffles": 1, "count": 1, "dances": 1, "clips": 4}
-"""Of what is drawn and judged: every operation takes as long as a hundred do without the second device."""
+"""Numbers of motions that are drawn and judged: an operation takes as long as a hundred on one device."""
 
 MAY_WAIT = {"ActorCriticModule"}
 """Its rewards are beats of dances, which numpy finds."""
