@@ -1,6 +1,6 @@
 from .datasets.audio.sound import Sound as Sound
+from .datasets.base.errors import UserError as UserError
 from .datasets.base.register import register as register
-from .datasets.schema import UserError as UserError
 from .pipeline.contract.sampling import SamplingConfig as SamplingConfig
 from .pipeline.inference.model import MotionModel as MotionModel
 from .pipeline.inference.motion import GeneratedMotion as GeneratedMotion

@@ -30,12 +30,12 @@ from numpy.typing import NDArray
 from results import page, read_records
 
 from motionloom.datasets.actions.measure import agrees
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.landing import landed
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.canonical import ground, heading, resample
 from motionloom.datasets.motion.easing import eased
 from motionloom.datasets.motion.features.joints import local_joints_of
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.sampling import SamplingConfig

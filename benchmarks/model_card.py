@@ -33,10 +33,10 @@ from rich.console import Console
 from rich.table import Table
 
 from motionloom.datasets.actions.hands import HANDS
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.expressions import FACES
 from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.synth.actions.truth import takes_part
 from motionloom.datasets.synth.generate import SynthConfig, captions_of, make_sample, split_of, truth_of

@@ -47,7 +47,7 @@ def base_run(recipe: str, work: Path) -> Path:
     """A finished run of a recipe; the stage under test is taken out of copies of it."""
     run = work / f"base-{recipe}"
     work.mkdir(parents=True, exist_ok=True)
-    words = [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", "run"]
+    words = [sys.executable, "-P", "-m", "motionloom", "run"]
     with (work / f"base-{recipe}.log").open("a") as log:
         words += [str(RECIPES / f"{recipe}.yaml"), "--out", str(run)]
         subprocess.run(words, check=True, stdout=log, stderr=log)

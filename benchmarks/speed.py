@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features, fitting_octaves
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatches
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.loading.steps import Numbered, Steps
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample

@@ -1,5 +1,7 @@
 from .audio.sound import Sound as Sound
 from .audio.sound import read_sound as read_sound
+from .base.errors import UserError as UserError
+from .base.records import Caption as Caption
 from .conditions import Condition as Condition
 from .convert.common.converter import Converter as Converter
 from .loading.batches import WindowBatches as WindowBatches
@@ -17,8 +19,6 @@ from .motion.features.codec import encode as encode
 from .motion.features.joints import joints_of as joints_of
 from .motion.layout import MotionLayout as MotionLayout
 from .motion.skeleton import Skeleton as Skeleton
-from .schema import Caption as Caption
-from .schema import UserError as UserError
 from .shards.options import DatasetFacts as DatasetFacts
 from .shards.options import WriteOptions as WriteOptions
 from .shards.reader import ShardDataset as ShardDataset

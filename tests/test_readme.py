@@ -20,9 +20,10 @@ import yaml
 from program import commands as options_by_command
 from rich.console import Console
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.contract.stage import stage_kinds
 from motionloom.pipeline.inference.script import Script

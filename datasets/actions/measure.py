@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from motionloom.datasets.actions.dances import Record, measure_dance
 from motionloom.datasets.actions.hands import SIDES, hand_shape
 from motionloom.datasets.actions.signals import Signals, rise_time, signals_of, tempo
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.expressions import emotion_of
 from motionloom.datasets.motion.canonical import runs
-from motionloom.datasets.schema import UserError
 
 CIRCLE = 4.0
 """Net turn (radians) of a walk or a run from which it is a circle."""

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.actions.hands import Array
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.canonical import runs
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 _REST = Skeleton.named("smplx52")
 STAND = float(-_REST.rest_joints[10, 1])

@@ -22,7 +22,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 
 BANDS = 64
 ROWS = 60

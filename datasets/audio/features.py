@@ -36,7 +36,8 @@ from pydantic import Field, field_validator
 
 from motionloom.datasets.audio.sound import Sound, resample_sound
 from motionloom.datasets.audio.spectra import HOP, load_librosa, separate, tuning
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 
 DIM = 438
 BEAT = 53

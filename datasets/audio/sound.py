@@ -25,7 +25,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 MAX_SECONDS = 3600
 """Longest sound that is read."""

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 LOCK_FILE = ".lock"
 _CANNOT_LOCK = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}

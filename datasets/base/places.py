@@ -10,7 +10,8 @@ import urllib.request
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from motionloom.datasets.schema import UserError, require_local
+from motionloom.datasets.base.config import require_local
+from motionloom.datasets.base.errors import UserError
 
 _HUB = re.compile(r"[A-Za-z0-9][\w.-]*(/[A-Za-z0-9][\w.-]*)?")
 _ENDPOINT = "https://huggingface.co"

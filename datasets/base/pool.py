@@ -18,8 +18,8 @@ from typing import Self, TypeVar
 
 import threadpoolctl  # type: ignore[import-untyped]
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.os_errors import of_the_machine, sentence_of
-from motionloom.datasets.schema import UserError
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -1,8 +1,10 @@
-"""Adding from outside: the tables by name, `register`, and the packages and files that call it.
+"""Adding from outside: the tables by name, `register` and `declare`, and the packages that call them.
 
 A package adds to the tables by an entry point of the group `motionloom.stages` that names a module, a lone
 file by the environment variable `MOTIONLOOM_STAGES`, a comma-separated list of modules or files. The module
-calls `register(thing)`. Recipes, exports and data name no code: reading one runs nothing.
+calls `register(thing)`, or `declare(table, {name: module})` for things whose modules are imported only when
+their name is asked for. What neither paper needs is added so, too: motionloom has an entry point for each of
+its folders behind the fence. Recipes, exports and data name no code: reading one runs nothing.
 """
 
 from __future__ import annotations
@@ -10,39 +12,133 @@ from __future__ import annotations
 import ast
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from importlib.util import resolve_name
+from importlib.util import find_spec, resolve_name
 from pathlib import Path
 from typing import Any, TypeVar
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of, sha256_of_json
-from motionloom.datasets.schema import UserError
 
 GROUP, VARIABLE = "motionloom.stages", "MOTIONLOOM_STAGES"
 
 T = TypeVar("T")
 
 
-class Table(dict[str, T]):
-    """All things of one class by their names, to which `register` adds; with `classes`, its subclasses."""
+class Table(Mapping[str, T]):
+    """All things of one class by their names, to which `register` and `declare` add; with `classes`, its
+    subclasses. A thing that was declared is imported when its name is looked up, or when all are listed.
+    """
 
     def __init__(self, of: type, called: str, *, classes: bool = False) -> None:
-        super().__init__()
         self.called, self.classes = called, classes
         self.followers: list[Callable[[T], object]] = []
+        self._things: dict[str, T] = {}
         _TABLES[of] = self
 
+    def __getitem__(self, name: str) -> T:
+        if name not in self:
+            raise KeyError(name)
+        if name not in self._things:
+            self._import(name)
+        return self._things[name]
+
+    def __contains__(self, name: object) -> bool:
+        if name not in self._things and name not in self._places:
+            self._import_others()
+        return name in self._things or name in self._places
+
+    def __iter__(self) -> Iterator[str]:
+        """Declared names first, then the others as they came."""
+        self._import_others()
+        return iter({**self._places, **self._things})
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    @property
+    def _places(self) -> dict[str, str]:
+        return _declared(self.called).places
+
+    def _import_others(self) -> None:
+        """Import what registers one thing of this table for each of another table."""
+        others = _declared(self.called).others
+        while others:
+            import_module(others.pop())
+
+    def _import(self, name: str) -> None:
+        """Import the module that registers a declared name, or call the function that does."""
+        module, _, function = self._places[name].partition(":")
+        try:
+            imported = import_module(module)
+        except ModuleNotFoundError as error:
+            raise UserError(f"{self.called} '{name}': {error}; install what {module} needs") from None
+        if function:
+            getattr(imported, function)(name)
+        if name not in self._things:
+            raise UserError(f"{module}: registers no {self.called} '{name}', which was declared of it")
+
     def follow(self, do: Callable[[T], object]) -> None:
-        """Call `do` with each thing that is there and each that comes; a `UserError` of it refuses one."""
-        for thing in list(self.values()):
+        """Call `do` with each thing that is imported and each that comes; a `UserError` of it refuses one."""
+        for thing in list(self._things.values()):
             do(thing)
         self.followers.append(do)
 
+    def add(self, name: str, thing: T) -> None:
+        """Take in a thing; `UserError` where another one has its name."""
+        if name in self._things:
+            taken = self._things[name] is not thing
+        else:
+            # Only the module that a name was declared of registers it, and that one is being imported now.
+            taken = name in self._places and self._places[name].partition(":")[0] not in sys.modules
+        if taken:
+            raise UserError(f"{self.called} '{name}': another one has this name; choose a new one")
+        if name not in self._things:
+            for do in self.followers:
+                do(thing)
+            self._things[name] = thing
+
+
+@dataclass
+class _Declared:
+    """What was declared of a table, which may not be imported yet."""
+
+    places: dict[str, str] = field(default_factory=dict)
+    """Name -> module that registers it, or "module:function"."""
+    others: list[str] = field(default_factory=list)
+    """Modules that register a thing for each of another table."""
+
 
 _TABLES: dict[type, Table[Any]] = {}
+_DECLARED: dict[str, _Declared] = {}
+"""By the titles of tables."""
+
+
+def _declared(called: str) -> _Declared:
+    return _DECLARED.setdefault(called, _Declared())
+
+
+def declare(called: str, places: Mapping[str, str], others: Iterable[str] = ()) -> None:
+    """Say which modules register things of a table, such as "stage kind".
+
+    Args:
+        called: The title of the table.
+        places: Name of a thing -> module that registers it, or "module:function" that registers it by name.
+        others: Modules that register things whose names are not known before, such as one for each of
+            another table; they are imported when a name is not found, and before all are listed.
+
+    Raises:
+        UserError: A name is taken by another module.
+    """
+    known = _declared(called)
+    for name, module in places.items():
+        if known.places.setdefault(name, module) != module:
+            raise UserError(f"{called} '{name}': {known.places[name]} has this name; choose a new one")
+    known.others += others
 
 
 def register(thing: T) -> T:
@@ -58,22 +154,17 @@ def register(thing: T) -> T:
     if table is None or table.classes != classes:
         known = ", ".join(one.called + " (its class)" * one.classes for one in _TABLES.values())
         raise UserError(f"register: {named!r} is nothing that can be added; known: {known}")
-    if table.get(named.name, thing) is not thing:
-        raise UserError(f"{table.called} '{named.name}': another one has this name; choose a new one")
-    if named.name not in table:
-        for do in table.followers:
-            do(thing)
-        table[named.name] = thing
+    table.add(named.name, thing)
     return thing
 
 
 @cache
-def discover(*, ours: bool = False) -> None:
-    """Import the modules that register something, each once; with `ours` motionloom's own kinds of stages
-    too, which bring in torch. `UserError` names a package or module that cannot be imported.
+def discover() -> None:
+    """Import the modules that register or declare something, each once. `UserError` names a package or module
+    that cannot be imported.
     """
     for point in entry_points(group=GROUP):
-        if ours or not point.module.startswith("motionloom."):
+        if not _left_out(point.module):
             _import(point.module, f"{distribution_of(point.module)}: entry point {point.value}", "update it")
     for name in filter(None, map(str.strip, os.environ.get(VARIABLE, "").split(","))):
         if name.endswith(".py"):
@@ -81,6 +172,12 @@ def discover(*, ours: bool = False) -> None:
             sys.path.append(str(Path(name).absolute().parent))
         module = Path(name).stem if name.endswith(".py") else name
         _import(module, f"{VARIABLE}={name}", "name a file, or a module on the path")
+
+
+def _left_out(module: str) -> bool:
+    """Whether somebody has taken a folder of ours out of the installation, which all others work without."""
+    package = module.rpartition(".")[0]
+    return module.startswith("motionloom.") and find_spec(package) is None
 
 
 def _import(module: str, where: str, fix: str) -> None:

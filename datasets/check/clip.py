@@ -17,9 +17,9 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.records import Caption, ClipMeta, ShardInfo
 from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, ShardInfo
 from motionloom.datasets.shards.sample import captions_from_json, meta_from_json, require_finite
 from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
 

@@ -24,14 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
-from motionloom.datasets.check.clip import CheckedClip, check_clip
-from motionloom.datasets.check.duplicates import ClipTable
-from motionloom.datasets.check.findings import Findings, Problem
-from motionloom.datasets.convert.common.removed import Removed
-from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.motion.plausibility import PlausibilityStats, measure
-from motionloom.datasets.schema import (
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import open_plain
+from motionloom.datasets.base.records import (
     INDEX_FILE,
     REMOVED_FILE,
     SPLITS,
@@ -39,9 +34,14 @@ from motionloom.datasets.schema import (
     Manifest,
     ShardInfo,
     Split,
-    UserError,
-    open_plain,
 )
+from motionloom.datasets.check.clip import CheckedClip, check_clip
+from motionloom.datasets.check.duplicates import ClipTable
+from motionloom.datasets.check.findings import Findings, Problem
+from motionloom.datasets.convert.common.removed import Removed
+from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.plausibility import PlausibilityStats, measure
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import (
     ShardIndex,

@@ -20,12 +20,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.json_doors import open_plain
+from motionloom.datasets.base.records import ClipMeta, ShardInfo
 from motionloom.datasets.check.findings import Findings
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import ClipMeta, ShardInfo, open_plain
 from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
 
 SAME_METRES = 0.005

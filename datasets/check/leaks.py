@@ -12,7 +12,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from motionloom.datasets.schema import SPLITS, Split
+from motionloom.datasets.base.records import SPLITS, Split
 from motionloom.datasets.shards.clips import ClipDataset
 
 _SAME = 1e-2

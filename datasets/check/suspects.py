@@ -18,22 +18,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_json
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.progress import Meter
+from motionloom.datasets.base.records import CLEANED_FILE, MANIFEST_FILE, SPLITS, Decisions, Manifest, Split
 from motionloom.datasets.check.duplicates import likeness, near, signature
 from motionloom.datasets.check.faults import Fault, motion_faults
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.schema import (
-    CLEANED_FILE,
-    MANIFEST_FILE,
-    SPLITS,
-    Decisions,
-    Manifest,
-    Split,
-    UserError,
-)
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 
 

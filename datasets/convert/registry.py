@@ -1,60 +1,38 @@
-"""The converters by name: every folder here whose `convert.py` holds a `Converter`, every file in `sets/`,
-and those that other packages have registered.
-"""
+"""The converters by name: those of the papers' data sets, and those that other packages have registered."""
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
 from pathlib import Path
 from typing import Any
 
-from motionloom.datasets import convert as _folder
-from motionloom.datasets.convert import sets as _sets
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import REMOVED_FILE
+from motionloom.datasets.base.register import declare, discover
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import Conversion, moved_clips
-from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter, Converter, PlanSettings
+from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter, PlanSettings
 from motionloom.datasets.convert.common.removed import Removed
-from motionloom.datasets.schema import REMOVED_FILE, UserError
 
-_HELPERS = ("captions", "common", "sets")
+declare(
+    "converter",
+    {
+        name: f"motionloom.datasets.convert.{name}.convert"
+        for name in ("aistpp", "amass", "bvh", "humanml3d", "motionx")
+    },
+)
 
 
 def names() -> list[str]:
-    """Names of the converters; ours are those of their folders or files."""
-    return sorted({*_own(), *CONVERTERS})
-
-
-def _own() -> set[str]:
-    folders = [entry.name for entry in pkgutil.iter_modules(_folder.__path__) if entry.ispkg]
-    return {*folders, *_set_files()} - set(_HELPERS)
-
-
-def _set_files() -> list[str]:
-    return [entry.name for entry in pkgutil.iter_modules(_sets.__path__) if not entry.ispkg]
+    """Names of the converters, sorted, those of other packages included."""
+    discover()
+    return sorted(CONVERTERS)
 
 
 def converter_named(name: str) -> type[AnyConverter]:
-    """The converter of a name; ours are imported when they are asked for, so that `--help` stays quick."""
-    if name in CONVERTERS:
-        return CONVERTERS[name]
-    if name not in _own():
+    """The converter of a name, which is imported when it is asked for, so that `--help` stays quick."""
+    if name not in names():
         raise UserError(f"unknown converter '{name}'; known: {', '.join(names())}")
-    place = f"{_sets.__name__}.{name}" if name in _set_files() else f"{_folder.__name__}.{name}.convert"
-    module = importlib.import_module(place)
-    return next(
-        kind
-        for kind in vars(module).values()
-        if isinstance(kind, type) and issubclass(kind, Converter) and kind.__module__ == module.__name__
-    )
-
-
-def _require_new(kind: type[AnyConverter]) -> None:
-    if kind.name in _own() and not kind.__module__.startswith(_folder.__name__):
-        raise UserError(f"converter '{kind.name}': another one has this name; choose a new one")
-
-
-CONVERTERS.follow(_require_new)
+    return CONVERTERS[name]
 
 
 def converters() -> list[type[AnyConverter]]:

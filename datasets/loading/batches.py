@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.loading.crops import Crops
 from motionloom.datasets.loading.plan import ALONE, BatchPlan, Share
 from motionloom.datasets.loading.statistics import FeatureStats
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 
 _WINDOW = 1

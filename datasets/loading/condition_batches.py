@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.randomness import uniform
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.loading.batches import MotionBatch
@@ -27,7 +28,6 @@ from motionloom.datasets.loading.plan import ALONE, Share
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import Rows
 from motionloom.datasets.modalities.table import MODALITIES, modality
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.text.cache import TextCache
 

@@ -19,9 +19,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import require_layout
-from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 
 

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.order import shares
 from motionloom.datasets.loading.plan import BatchPlan, Share
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, Source
 
 Kind = frozenset[str]

@@ -19,8 +19,9 @@ from itertools import accumulate
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption, ClipMeta
 from motionloom.datasets.motion.layout import require_layout
-from motionloom.datasets.schema import Caption, ClipMeta, UserError
 from motionloom.datasets.shards.clips import ClipDataset, Source
 
 

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.randomness import permutation, words
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import Source
 
 # Last elements of keys. `BatchPlan` draws its pools by (seed, epoch, n >= 1), so a zero in the third place

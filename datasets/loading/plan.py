@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.randomness import permutation
 from motionloom.datasets.loading.order import mixed_order, shares, source_order
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import Source
 
 POOL = 8

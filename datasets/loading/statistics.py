@@ -19,9 +19,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import number, read_plain
 from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
 from motionloom.datasets.motion.layout import ROOT, Family, MotionLayout
-from motionloom.datasets.schema import UserError, number, read_plain
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.tar import npy_from_bytes
 

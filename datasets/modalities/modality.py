@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file, sorted_header
-from motionloom.datasets.schema import UserError, require_plain, whole
+from motionloom.datasets.base.json_doors import require_plain, whole
 
 if TYPE_CHECKING:
     from motionloom.datasets.conditions import Condition

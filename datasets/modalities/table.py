@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from importlib import import_module
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import Table, register
 from motionloom.datasets.modalities.modality import Modality
-from motionloom.datasets.schema import UserError
 
 NAMES = ("text", "audio")
 """In the order in which networks read them."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.modalities.modality import Clips, Modality, Rows, condition_of
-from motionloom.datasets.schema import UserError
 
 if TYPE_CHECKING:
     from motionloom.datasets.conditions import Condition

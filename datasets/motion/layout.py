@@ -23,8 +23,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import FACE, HANDS, PRESENT_ALL, ClipMeta
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import FACE, HANDS, PRESENT_ALL, ClipMeta, UserError
 
 Family = Literal["exact", "h3d", "raw"]
 Part = Literal["all", "bodyhand", "body", "hand", "face"]

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.lib import format as npy_format
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError, open_plain, require_plain
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import open_plain, require_plain
 
 MAX_BYTES = 2**30
 """Largest array read by default: an hour at 200 frames a second of 156 doubles is 0.9 GB."""

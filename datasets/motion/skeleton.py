@@ -14,7 +14,7 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 
 @dataclass(frozen=True)

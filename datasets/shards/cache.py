@@ -21,8 +21,10 @@ from typing import BinaryIO
 
 from pydantic import Field
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import open_plain
 from motionloom.datasets.base.lock import file_lock
-from motionloom.datasets.schema import Config, UserError, open_plain
 
 _OURS = re.compile(r"[0-9a-f]{64}\.(tar|index\.npz|manifest\.json)")
 """Names of cached files. No other file is ever deleted: a recipe may name any folder for the cache."""

@@ -11,8 +11,10 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.schema import ShardInfo, UserError, require_plain
+from motionloom.datasets.base.json_doors import require_plain
+from motionloom.datasets.base.records import ShardInfo
 
 _ADVICE = "copy it back or convert again"
 

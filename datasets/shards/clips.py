@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.records import Caption, ClipMeta, Split
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, Split
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,10 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.schema import (
-    CLEANED_FILE,
-    INDEX_FILE,
-    MANIFEST_FILE,
-    REMOVED_FILE,
-    Manifest,
-    UserError,
-)
+from motionloom.datasets.base.records import CLEANED_FILE, INDEX_FILE, MANIFEST_FILE, REMOVED_FILE, Manifest
 from motionloom.datasets.shards.index import index_path
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE
 from motionloom.datasets.shards.reader import read_manifest

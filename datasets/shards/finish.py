@@ -12,19 +12,18 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from motionloom.datasets.base.config import Config, require_local
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import remove_temporaries, sync_folder, write_json
 from motionloom.datasets.base.lock import folder_lock
-from motionloom.datasets.schema import (
+from motionloom.datasets.base.records import (
     MANIFEST_FILE,
     SPLITS,
-    Config,
     Decisions,
     Dropped,
     Manifest,
     ShardInfo,
     Split,
-    UserError,
-    require_local,
 )
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out

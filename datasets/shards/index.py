@@ -27,18 +27,12 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file
+from motionloom.datasets.base.json_doors import open_plain
+from motionloom.datasets.base.records import INDEX_FILE, PRESENT_ALL, Dropped, ShardInfo, Split
 from motionloom.datasets.motion.npz import NpzFile, read_npy_header
-from motionloom.datasets.schema import (
-    INDEX_FILE,
-    PRESENT_ALL,
-    Config,
-    Dropped,
-    ShardInfo,
-    Split,
-    UserError,
-    open_plain,
-)
 from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.tar import scan_tar
 

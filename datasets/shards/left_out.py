@@ -11,9 +11,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.base.records import Dropped
 
 LEFT_OUT_FILE = "left-out.txt"
 """Beside the manifest, when there is anything to list: kind, source and reason of each, between tabs."""

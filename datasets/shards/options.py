@@ -8,8 +8,11 @@ from typing import Literal
 
 from pydantic import Field
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import whole
+from motionloom.datasets.base.records import SCHEMA_VERSION, Dropped, MotionType
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SCHEMA_VERSION, Config, Dropped, MotionType, UserError, whole
 from motionloom.datasets.shards.cache import CacheConfig
 
 SOURCE_CHECKSUM = "source_sha256"

@@ -25,9 +25,9 @@ from weakref import ReferenceType, ref
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.base.register import discover
-from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import (
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json
+from motionloom.datasets.base.records import (
     INDEX_FILE,
     MANIFEST_FILE,
     SCHEMA_VERSION,
@@ -37,9 +37,9 @@ from motionloom.datasets.schema import (
     Manifest,
     ShardInfo,
     Split,
-    UserError,
-    parse_json,
 )
+from motionloom.datasets.base.register import discover
+from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.clips import ClipDataset, Source
 from motionloom.datasets.shards.index import SplitIndex, read_index

@@ -20,9 +20,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json
+from motionloom.datasets.base.records import Caption, ClipMeta, MotionType, Split
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, ClipMeta, MotionType, Split, UserError, parse_json
 
 _OURS = ("audio.flac", "audio.npy", "face_texts.json", "meta.json", "motion.npy", "texts.json")
 MEMBERS = list(_OURS)

@@ -20,8 +20,10 @@ from pathlib import Path
 from typing import Any, BinaryIO, TypeVar, cast
 from urllib.parse import unquote, urlsplit
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file, sha256_of
-from motionloom.datasets.schema import INDEX_FILE, MANIFEST_FILE, ShardInfo, UserError, open_plain, read_plain
+from motionloom.datasets.base.json_doors import open_plain, read_plain
+from motionloom.datasets.base.records import INDEX_FILE, MANIFEST_FILE, ShardInfo
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 from motionloom.datasets.shards.checksums import LocalShard, fault_of
 

@@ -17,9 +17,10 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import open_plain, require_plain
 from motionloom.datasets.base.register import discover
 from motionloom.datasets.motion.npz import read_npy_header
-from motionloom.datasets.schema import UserError, open_plain, require_plain
 from motionloom.datasets.shards.sample import MEMBERS
 
 MOST_CLIPS = 10_000

@@ -14,11 +14,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import HashingFile, atomic_file, sha256_of_json, write_json
+from motionloom.datasets.base.json_doors import open_plain
 from motionloom.datasets.base.os_errors import of_the_machine
 from motionloom.datasets.base.randomness import permutation
+from motionloom.datasets.base.records import SPLITS, Dropped, MotionType, ShardInfo, Split
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SPLITS, Dropped, MotionType, ShardInfo, Split, UserError, open_plain
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, Written, clip_entries, index_path
 from motionloom.datasets.shards.left_out import drop

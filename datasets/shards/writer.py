@@ -22,18 +22,13 @@ from functools import partial
 from pathlib import Path
 from typing import Generic, TypeVar
 
+from motionloom.datasets.base.config import require_local
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.pool import Workers
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.schema import (
-    MANIFEST_FILE,
-    Manifest,
-    Split,
-    UserError,
-    parse_json,
-    read_plain,
-    require_local,
-)
+from motionloom.datasets.base.records import MANIFEST_FILE, Manifest, Split
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.finish import (
     OLD_FOLDER,

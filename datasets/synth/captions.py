@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.synth.actions.truth import Truth, takes_part
 from motionloom.datasets.synth.dances import DanceTruth
 from motionloom.datasets.synth.music.genres import GENRES

@@ -13,7 +13,8 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from motionloom.datasets.actions.dances import Record
-from motionloom.datasets.schema import Config, Split
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.records import Split
 from motionloom.datasets.synth.actions.pose import Track
 from motionloom.datasets.synth.actions.truth import Span, Truth
 from motionloom.datasets.synth.choreography import choreograph

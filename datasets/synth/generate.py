@@ -21,12 +21,13 @@ from motionloom.datasets.actions.dances import Record
 from motionloom.datasets.actions.hands import HANDS
 from motionloom.datasets.audio.features import VERSION as AUDIO_VERSION
 from motionloom.datasets.audio.features import settings_at
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.records import Caption, Manifest, Split
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.smpl75 import smpl75_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Caption, Config, Manifest, Split
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.progress import track
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file, remove_temporaries, write_json
 from motionloom.datasets.base.pool import Workers
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.cache import SIMILARITY, CacheInfo, TextCache, key_of
 from motionloom.datasets.text.encoder import EncodedText, TextEncoder, load_text_encoder
 

@@ -23,8 +23,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.datasets.motion.npz import map_npy
-from motionloom.datasets.schema import Config, UserError, parse_json, read_plain
 
 SIMILARITY = "similarity"
 _KEY = np.dtype("S32")

@@ -23,8 +23,9 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json, read_plain, require_plain
 from motionloom.datasets.base.places import hub_is_away, require_hub_name
-from motionloom.datasets.schema import UserError, parse_json, read_plain, require_plain
 
 if TYPE_CHECKING:
     from sentence_transformers import SentenceTransformer

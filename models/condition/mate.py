@@ -27,8 +27,8 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition, Conditions
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.transformer import StackConfig, Transformer, sinusoid
 
 

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.layout import LOWER, PIECES, ROOT, MotionLayout, piece_columns, step_columns
-from motionloom.datasets.schema import UserError
 
 PLACE_COLUMNS = 6
 """z, x, cosine and sine of the heading, whether the place is known, and whether the heading is."""

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.diffusion.dmd import Dmd
 from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.diffusion.schedule import Sampler, by_length

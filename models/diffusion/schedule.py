@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 
 Sampler = Literal["ddpm", "ddim", "dpm++"]
 

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.models.layers.strided import StridedEncoder
 from motionloom.models.layers.transformer import StackConfig, Transformer, length_mask, sinusoid
 from motionloom.models.training.distributed import masked_mean

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.distributed import gather_rows_with_grad, masked_mean
 

@@ -28,8 +28,8 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import Config
 from motionloom.models.layers.transformer import length_mask
 
 PART: Part = "bodyhand"

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.models.gpt.tokens import PAD, TokenNetwork
 from motionloom.models.tokenizer.base import Tokenizer
 from motionloom.models.training.distributed import masked_mean

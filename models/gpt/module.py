@@ -7,7 +7,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.losses import GptLossConfig, accuracy, corrupt, cross_entropy, soft_motion
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.samples import log_likelihood, policy_loss, rewards, sample

@@ -25,7 +25,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.tokens import TokenNetwork
 from motionloom.models.layers.attention import KVCache
 from motionloom.models.layers.transformer import StackConfig, Transformer

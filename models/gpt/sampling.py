@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
 from motionloom.models.layers.attention import KVCache

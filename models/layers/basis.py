@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.features.running_sum import running_sum
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
-from motionloom.datasets.schema import UserError
 
 FINGERS = (2, 5, 3)
 """Hands, fingers of a hand, joints of a finger from the wrist outwards: the order of `smplx52`."""

@@ -25,7 +25,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.models.layers.attention import CrossAttention, KVCache, LayerCache, SelfAttention, added_mask
 
 Norm = Literal["pre", "post"]

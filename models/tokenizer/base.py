@@ -18,8 +18,9 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import Config, UserError
 from motionloom.models.layers.basis import Basis
 from motionloom.models.quantize.base import Codebook, QuantizerConfig
 

@@ -24,8 +24,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.conv import Conv, ConvDecoder, ConvEncoder
 from motionloom.models.quantize.base import Codebook
 from motionloom.models.quantize.ema import EmaQuantizer

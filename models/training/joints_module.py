@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config
 from motionloom.models.training.stage_module import OptimConfig, StageModule
 
 

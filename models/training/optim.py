@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import nn
 from torch.optim import Optimizer
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 
 Beta = Annotated[float, Field(ge=0, lt=1)]
 """Share of a moving average that each step keeps."""

@@ -25,7 +25,7 @@ from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.layers.frozen import Frozen
 from motionloom.models.training.compiled import Compiled
 from motionloom.models.training.distributed import alone, rank

@@ -28,7 +28,8 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.condition.mate import Encoded, Mate, MateConfig
 from motionloom.models.discriminator.patch import AdversarialConfig, DiscriminatorConfig
 from motionloom.models.gpt.tokens import TokenNetwork

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.condition.mate import Encoded
 from motionloom.models.gpt.sampling import Drawing, Rows, requested_groups, seeds_of, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, as_codes, slot_codes

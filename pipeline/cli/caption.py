@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Dropped
 from motionloom.pipeline.cli.options import At, Device, ModelFolder
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_file_place

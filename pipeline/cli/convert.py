@@ -24,8 +24,10 @@ from rich.table import Table
 from typer.core import TyperGroup
 from typer.main import get_command
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError, nearest
+from motionloom.datasets.base.records import MANIFEST_FILE, Manifest
 from motionloom.datasets.convert.registry import converter_named, names
-from motionloom.datasets.schema import MANIFEST_FILE, Config, Manifest, UserError, nearest
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, tally
 from motionloom.datasets.shards.options import Part
 from motionloom.pipeline.cli.options import Commands, Workers, fields_of, set_option

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from motionloom.datasets.schema import Dropped, UserError
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Dropped
 from motionloom.datasets.shards.left_out import grouped
 from motionloom.pipeline.cli.convert import convert_app, say_manifest
 from motionloom.pipeline.cli.options import (
@@ -201,8 +202,8 @@ def clean(
     """
     console, page = make_console(), out or root / "clean.html"
     if decisions is not None:
+        from motionloom.datasets.base.records import Decisions
         from motionloom.datasets.check.suspects import decide, undo
-        from motionloom.datasets.schema import Decisions
 
         if decisions == Path("none"):
             manifest = undo(root)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.cli.generate import formats_of, print_note, write_files
 from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
 from motionloom.pipeline.inference.writers import formats_help

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.cli.options import At, Device, ModelFolder, Settings, settings_of
 from motionloom.pipeline.inference.writers import default_formats, formats_help
 from motionloom.pipeline.launch.console import make_console, say

@@ -19,9 +19,9 @@ from typing import Annotated
 
 import typer
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.base.register import discover
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.cli.caption import caption
 from motionloom.pipeline.cli.data import data_app
 from motionloom.pipeline.cli.edit import edit

@@ -11,7 +11,8 @@ from typing import Annotated, Any, TypeVar
 import typer
 from pydantic_core import to_jsonable_python
 
-from motionloom.datasets.schema import UserError, nearest, require_local
+from motionloom.datasets.base.config import require_local
+from motionloom.datasets.base.errors import UserError, nearest
 
 ModelFolder = Annotated[
     str,

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.cli.options import AsJson, print_json
 from motionloom.pipeline.launch.console import make_console, say
 

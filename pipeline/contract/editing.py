@@ -15,8 +15,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.layout import FigurePart
-from motionloom.datasets.schema import Config
 
 MAX_SPEED = 12.0
 """Metres a second of a root; the fastest sprint that was measured (Bolt, Berlin 2009) reached 12.4."""

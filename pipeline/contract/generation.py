@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.pipeline.contract.sampling import SamplingConfig
 

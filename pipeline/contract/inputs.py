@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 
 class _Kind(Protocol):

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from pydantic import Field
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import (
     CAPTIONER,

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.layout import Part
-from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.schedule import Sampler
 
 Guidance = Annotated[float, Field(ge=1, le=1e6)]

@@ -21,9 +21,10 @@ from pydantic import BaseModel, model_validator
 from pydantic.config import JsonDict
 from rich.console import Console
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import VARIABLE, Table, discover
 from motionloom.datasets.base.register import register as register
-from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.inputs import Every as Every
@@ -357,7 +358,7 @@ KINDS: Table[StageKind] = Table(StageKind, "stage kind")
 
 def stage_kinds() -> Mapping[str, StageKind]:
     """All kinds by name, those of other packages included."""
-    discover(ours=True)
+    discover()
     return KINDS
 
 

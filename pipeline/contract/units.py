@@ -18,8 +18,8 @@ from zlib import error as ZlibError
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.files import remove_tree
 
 Arrays = dict[str, NDArray[Any]]

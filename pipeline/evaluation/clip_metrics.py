@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.actions.dances import measure_dance
 from motionloom.datasets.actions.measure import agrees
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import Table, register
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.dance import SHORTEST, foot_contact_score, foot_skating, physics
 from motionloom.models.metrics.dance_beats import DEFINITIONS, beat_align
 from motionloom.models.metrics.position import KINDS, position_errors

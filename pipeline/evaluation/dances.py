@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from motionloom.datasets.actions.dances import beats_of
 from motionloom.datasets.audio.features import beats as track_beats
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.evaluation.truth import different_first
 from motionloom.pipeline.inference.bundle import Bundle

@@ -21,9 +21,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.base.records import HANDS
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
-from motionloom.datasets.schema import HANDS
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
 from motionloom.pipeline.contract.units import Row

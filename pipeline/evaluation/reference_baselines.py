@@ -12,10 +12,10 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.records import HANDS, PRESENT_ALL
 from motionloom.datasets.loading.crops import caption_spans
 from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.schema import HANDS, PRESENT_ALL
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.evaluation.dances import DanceClip

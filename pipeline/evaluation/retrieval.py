@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.retrieval import RECALLS, Distance, recall
 from motionloom.pipeline.contract.lookup import finished_stages, stages_giving
 from motionloom.pipeline.contract.stage import ALIGNMENT, CompletedStage, Role, StageCache

@@ -16,8 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file, sha256_of, sha256_of_json
+from motionloom.datasets.base.json_doors import read_plain
 from motionloom.datasets.base.progress import Meter
+from motionloom.datasets.base.records import HANDS, PRESENT_ALL
 from motionloom.datasets.check.faults import Fault
 from motionloom.datasets.check.suspects import Place, Splits, floored_joints, open_splits
 from motionloom.datasets.motion.canonical import canonicalize, resample
@@ -26,7 +29,6 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.npz import MAX_BYTES, NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError, read_plain
 from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tar import npy_from_bytes
 from motionloom.pipeline.contract.lookup import finished_stages, open_exported

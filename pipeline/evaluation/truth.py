@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import FACE, PRESENT_ALL
 from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
 from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import FACE, PRESENT_ALL, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.sampling import SamplingConfig

@@ -11,10 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import HANDS, PRESENT_ALL, Dropped
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.schema import HANDS, PRESENT_ALL, Dropped, UserError
 from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.sample import Sample
 from motionloom.pipeline.contract.captioning import Sentence

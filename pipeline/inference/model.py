@@ -22,10 +22,10 @@ import torch
 from huggingface_hub import ModelHubMixin
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.bvh.own_file import between_rows
 from motionloom.datasets.motion.layout import PIECES, piece_joints
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.seeds import sample_seeds
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.generation import Prompt

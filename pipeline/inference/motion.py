@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.render.sound import Segment

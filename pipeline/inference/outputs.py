@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 
 from motionloom.datasets.audio.features import beats
+from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError, nearest
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.shown import FigureOptions, shown
 from motionloom.pipeline.inference.writers import WRITERS, OutputClip, Outputs, cell_of, writer_for

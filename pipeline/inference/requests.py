@@ -12,10 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage

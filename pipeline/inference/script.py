@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from motionloom.datasets.audio.sound import Excerpt, Sound
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.yaml import read_yaml

@@ -14,8 +14,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.places import hub_is_away, means_folder, no_such_folder
-from motionloom.datasets.schema import UserError, nearest
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 
 _FILES = ["*.json", "*.safetensors", "*.txt", "*.model"]

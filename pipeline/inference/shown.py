@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.body.feet import FeetReport, foot_contacts, plant_feet
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.features.joints import rotations_of
-from motionloom.datasets.schema import Config
 from motionloom.pipeline.inference.motion import GeneratedMotion
 
 FAR_MM = 20.0

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import Table, register
-from motionloom.datasets.schema import UserError
 
 if TYPE_CHECKING:
     import numpy as np

@@ -16,7 +16,8 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field, field_validator
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.launch.process import local_rank
 
 _MOST_WORKERS = 4

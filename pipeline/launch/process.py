@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import NoReturn
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 SAVED = 75
 """Exit code of a run that a signal has ended with all its steps saved, whatever signal it was.

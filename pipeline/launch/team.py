@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch.distributed as dist
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import TeamError, srun_tasks, started
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.audio.sound import Sound, resample_sound
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 RATE = 44_100
 """Hz of every sound written: one that MP3 and all players know, whatever rate the features asked for."""

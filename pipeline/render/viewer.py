@@ -26,10 +26,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.face import CONTROLS, FACE_NEUTRAL
 from motionloom.pipeline.render.body.mesh import (
     Posing,

@@ -12,8 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from motionloom.datasets.base.printable import printable
+from motionloom.datasets.base.records import Decisions
 from motionloom.datasets.check.suspects import Place, Splits, Suspect, find_suspects, open_splits, ranked
-from motionloom.datasets.schema import Decisions
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.results.data_page import watch

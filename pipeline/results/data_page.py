@@ -15,11 +15,12 @@ from pathlib import Path
 import numpy as np
 from rich.progress import Progress
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.progress import duration
+from motionloom.datasets.base.records import SPLITS, Caption, Manifest
 from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.schema import SPLITS, Caption, Manifest, UserError
 from motionloom.datasets.shards.left_out import grouped
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest, manifest_layout
 from motionloom.pipeline.render.body.face import synthetic_face_controls

@@ -13,8 +13,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_path
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache

@@ -18,7 +18,8 @@ from pathlib import Path
 
 from pydantic import JsonValue
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.runs.resolve import Tree
 from motionloom.pipeline.store.artifact import Change

@@ -24,9 +24,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from motionloom import models, pipeline
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_json
 from motionloom.datasets.base.progress import duration
-from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.lookup import preview_of, previews
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.continuation import newest_step

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import remove_temporaries, write_text
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
-from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import alone
 from motionloom.pipeline.contract.stage import (
     GENERATOR,

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from motionloom.datasets.schema import UserError, nearest
+from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.pipeline.contract.lookup import outside_stage
 from motionloom.pipeline.contract.stage import CompletedStage, Every, Role, Stage
 from motionloom.pipeline.runs.resolve import place_name

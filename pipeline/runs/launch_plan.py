@@ -17,7 +17,8 @@ from typing import Annotated, Self
 
 from pydantic import AfterValidator, Field, field_validator
 
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.runs.plan import require_fit
 from motionloom.pipeline.runs.recipe import Recipe

@@ -19,9 +19,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.licences import UNKNOWN
 from motionloom.datasets.base.register import code_of
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import Every, NotThereError, Stage, fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.continuation import Continuation, Started, continuation, training_facts

@@ -24,8 +24,9 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.register import VARIABLE
-from motionloom.datasets.schema import Config, UserError, nearest
 from motionloom.pipeline.contract.stage import CompletedStage, Every, Stage, stage_kinds
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.inputs import Sources, as_stages

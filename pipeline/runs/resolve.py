@@ -15,7 +15,7 @@ The later layer wins: what is extended, the file itself, `--set`. Mappings merge
 replaced whole; a stage of another kind replaces the old one whole, and `null` removes it. Then each stage's
 entry goes over what the `start` model says of it and over the `defaults` of its kind, and those over
 `trained`, which concerns all stages that train. `published: true` puts between the two the settings by which
-the baselines were published (`pipeline/baselines/published.yaml`), for which `trained` is not meant.
+the baselines were published (`pipeline/runs/published.yaml`), for which `trained` is not meant.
 
 With `start`, a stage without a `kind` is trained on from the model's stage of that name: same kind, same
 settings but for `optim` and `train`. What the recipe does not train is the model's own: its statistics, its
@@ -32,8 +32,9 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from motionloom.datasets.base.config import explain, require_local
+from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError, explain, nearest, require_local
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import CompletedStage, Every, StageConfig, stage_kinds
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, is_place
@@ -71,8 +72,7 @@ def shipped_recipes() -> dict[str, Path]:
 
 def published_settings() -> dict[str, Tree]:
     """Settings of the baselines' papers and code by kind: `stage`, `judged`, `text`, `ours`."""
-    folder = Path(str(resources.files("motionloom.pipeline.baselines")))
-    table: dict[str, Tree] = read_yaml(folder / "published.yaml")
+    table: dict[str, Tree] = read_yaml(Path(__file__).with_name("published.yaml"))
     return table
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import torch
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
 from motionloom.pipeline.evaluation.dances import dance_to, dances_for
 from motionloom.pipeline.evaluation.estimate import row_estimates

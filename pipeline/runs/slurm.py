@@ -26,9 +26,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.progress import duration
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.launch.console import say
 from motionloom.pipeline.launch.process import SAVED
 from motionloom.pipeline.runs.dry_run import (
@@ -52,7 +52,7 @@ from motionloom.pipeline.store.run_folder import require_own
 LOG_FOLDER = ".slurm"
 """Inside the run folder: scripts and logs of the jobs. May be deleted when all is over."""
 
-PROGRAM = (sys.executable, "-P", "-m", "motionloom.pipeline.cli.main")
+PROGRAM = (sys.executable, "-P", "-m", "motionloom")
 """By this Python, which must lie under the same path on every node."""
 
 RECIPE_FILE = "recipe.yaml"

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import (
     CAPTIONER,

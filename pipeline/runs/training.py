@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import Stage, fingerprint_fields

@@ -19,7 +19,8 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 from starlette.types import ASGIApp
 
-from motionloom.datasets.schema import UserError, parse_json
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json
 from motionloom.pipeline.contract.editing import MAX_SPEED
 from motionloom.pipeline.inference.edits.edit import require_editor
 from motionloom.pipeline.inference.model import MotionModel

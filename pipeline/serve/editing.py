@@ -11,7 +11,8 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.inference.edits.clip_file import read_clip
 from motionloom.pipeline.inference.edits.edit import require_editor

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
 from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
-from motionloom.datasets.schema import Config, UserError
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel

@@ -10,7 +10,7 @@ from pathlib import Path
 import uvicorn
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.serve.app import Site

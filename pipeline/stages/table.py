@@ -1,18 +1,35 @@
-"""Our own stage kinds: every file of these folders, and every baseline's `stage`, registers its kinds."""
+"""The stage kinds of the two papers, by module; one is imported when a kind of it is used."""
 
 from __future__ import annotations
 
-from importlib import import_module
-from pkgutil import iter_modules
+from motionloom.datasets.base.register import declare
 
-STAGES = ("data", "networks", "results")
-"""Folders beside this file."""
-BASELINES = "motionloom.pipeline.baselines"
-"""Found by name: nothing imports a baseline."""
+_STAGES = "motionloom.pipeline.stages"
+_KINDS = {
+    "data.data": ("synth", "shards"),
+    "data.mix": ("mix",),
+    "data.features": ("audio",),
+    "data.prepare": ("stats", "text"),
+    "networks.tokenizer": ("h2vq", "vq", "rvq", "separate", "fsq", "mq"),
+    "networks.tokens": ("tokens",),
+    "networks.tma": ("tma",),
+    "networks.gpt": ("gpt",),
+    "networks.evaluator": ("evaluator",),
+    "networks.guo_evaluator": ("guo_evaluator",),
+    "networks.dmd": ("dmd",),
+    "networks.utt": ("utt",),
+    "networks.ude": ("ude",),
+    "results.evaluate": ("evaluate",),
+    "results.evaluate_captions": ("evaluate_captions",),
+    "results.evaluate_dances": ("evaluate_dances",),
+    "results.generate": ("generate",),
+    "results.report": ("report",),
+}
+"""Module -> the kinds that it registers."""
 
-for folder in STAGES:
-    package = import_module(f"motionloom.pipeline.stages.{folder}")
-    for module in iter_modules(package.__path__, f"{package.__name__}."):
-        import_module(module.name)
-for module in iter_modules(import_module(BASELINES).__path__, f"{BASELINES}."):
-    import_module(f"{module.name}.stage")
+declare(
+    "stage kind",
+    {name: f"{_STAGES}.{module}" for module, names in _KINDS.items() for name in names},
+    # A kind for each converter, and for each modality that has features.
+    others=[f"{_STAGES}.data.convert", f"{_STAGES}.data.features"],
+)

@@ -9,9 +9,10 @@ from typing import Literal
 
 from pydantic import Field
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.records import Caption, Manifest
 from motionloom.datasets.loading.mix import MixedDataset
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, Config, Manifest
 from motionloom.datasets.shards.cache import CacheConfig
 from motionloom.datasets.shards.checksums import LocalShard
 from motionloom.datasets.shards.clips import ClipDataset

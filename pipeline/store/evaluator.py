@@ -11,9 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import PRESENT_ALL
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import PRESENT_ALL, UserError
 from motionloom.models.evaluator.network import PART, Evaluator
 from motionloom.pipeline.store.networks import LoadedTma, device_of
 from motionloom.pipeline.store.text import TextSource

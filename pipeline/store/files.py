@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import IO, Any
 
 from motionloom.datasets.base import files
-from motionloom.datasets.schema import UserError, read_plain, require_local
+from motionloom.datasets.base.config import require_local
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import read_plain
 
 
 def require_folder(folder: Path) -> None:

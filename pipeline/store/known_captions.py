@@ -24,9 +24,11 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_path, write_json
+from motionloom.datasets.base.json_doors import require_plain
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.schema import Config, UserError, require_plain
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 

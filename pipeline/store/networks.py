@@ -12,9 +12,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import PRESENT_ALL
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import PRESENT_ALL, UserError
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes
 from motionloom.models.tma.network import Tma

@@ -22,10 +22,11 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config, UserError
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.pipeline.store.evaluator import LoadedEvaluator, Words
 from motionloom.pipeline.store.weights import Release, exact_tensors

@@ -13,8 +13,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.places import no_such_folder
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.store.files import fingerprint_of, read_record
 from motionloom.pipeline.store.yaml import read_yaml
 

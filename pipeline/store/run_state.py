@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.store.artifact import Artifact, Changed, changed_above
 from motionloom.pipeline.store.files import read_record
 from motionloom.pipeline.store.run_folder import (

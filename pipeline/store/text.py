@@ -15,8 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.places import hub_is_away
-from motionloom.datasets.schema import Config, UserError
 from motionloom.datasets.text.cache import CacheInfo, TextCache
 from motionloom.datasets.text.encoder import TextEncoder, load_text_encoder
 from motionloom.pipeline.store.files import copy_files, remove_tree, write_json

@@ -25,11 +25,11 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_path
 from motionloom.datasets.loading.crops import CaptionSpan, caption_spans
 from motionloom.datasets.loading.plan import ALONE, BatchPlan, Share
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset, Source
 from motionloom.models.gpt.tokens import TokenSequence, interleave, known_tokens, stream_names
 from motionloom.models.tokenizer.base import Tokenizer

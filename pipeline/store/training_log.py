@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.markup import escape
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 FILE_NAME = "metrics.jsonl"
 FLIGHT = "flight"

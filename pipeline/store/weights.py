@@ -22,9 +22,11 @@ from torch.nn.modules.module import (
     register_module_parameter_registration_hook,
 )
 
+from motionloom.datasets.base.config import Config, FrameRate
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_path
+from motionloom.datasets.base.json_doors import require_plain
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config, FrameRate, UserError, require_plain
 from motionloom.pipeline.store.files import write_json
 
 Fact = TypeVar("Fact")

@@ -18,7 +18,7 @@ from typing import Any
 
 import yaml
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 _CORE = (
     ("bool", re.compile(r"true|True|TRUE|false|False|FALSE"), "tTfF"),

@@ -35,8 +35,9 @@ from torch.distributed.checkpoint.state_dict import (
 from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import HashingFile, atomic_file, sync_folder
-from motionloom.datasets.schema import UserError, require_plain
+from motionloom.datasets.base.json_doors import require_plain
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Means, StageModule
 from motionloom.pipeline.training.metric_log import LogState

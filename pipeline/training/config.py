@@ -11,9 +11,10 @@ from typing import Any, ClassVar, Literal, Protocol
 
 from pydantic import BaseModel, Field, field_validator
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Numbered
-from motionloom.datasets.schema import Config, UserError
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import RUNTIME, StageConfig
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers

@@ -19,7 +19,7 @@ import torch
 import torch.distributed as dist
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.shards.checksums import state_of
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, StageModule

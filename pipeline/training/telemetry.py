@@ -23,9 +23,9 @@ from rich.console import Console
 from rich.progress import Progress
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.progress import Pace, bar
-from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
 from motionloom.pipeline.contract.stage import StageContext

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar, cast
 import torch
 from torch import nn
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.schema import UserError
 from motionloom.models.training.distributed import rank
 from motionloom.pipeline.contract.lookup import outside_stage
 from motionloom.pipeline.contract.showing import ModelCard

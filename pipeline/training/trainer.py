@@ -20,9 +20,9 @@ import torch.distributed as dist
 from lightning.fabric import Fabric
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import remove_temporaries
 from motionloom.datasets.base.os_errors import full_place
-from motionloom.datasets.schema import UserError
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule

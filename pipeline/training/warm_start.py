@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout, require_layout
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import CPU, Stage
 from motionloom.pipeline.store.run_folder import in_export, is_place
 from motionloom.pipeline.store.text import TextSource

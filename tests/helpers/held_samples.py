@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from shard_samples import write_made
 
+from motionloom.datasets.base.records import FACE, HANDS, Caption, Split
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import FACE, HANDS, Caption, Split
 from motionloom.datasets.shards.sample import Sample
 
 LAYOUT = MotionLayout.named("wholebody363")

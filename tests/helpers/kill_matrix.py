@@ -34,7 +34,7 @@ from typing import Any
 from step_records import RECORDS, rows_of, watch_steps
 
 PRELOADED = (
-    "motionloom.pipeline.cli.main",
+    "motionloom",
     "motionloom.pipeline.runs.api",
     "motionloom.pipeline.training.trainer",
     "s3fs",  # fsspec imports it to learn that a folder is none of S3's

@@ -46,7 +46,7 @@ def takes(folder: Path) -> Path:
 
 def program(site: Path | None, *arguments: object, code: int = 0, **variables: object) -> str:
     """What `motionloom` says, with the packages of `site` installed."""
-    return _run(site, ["-m", "motionloom.pipeline.cli.main", *map(str, arguments)], code, variables)
+    return _run(site, ["-m", "motionloom", *map(str, arguments)], code, variables)
 
 
 def python(site: Path | None, source: str, *arguments: object) -> str:

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from motionloom.datasets.base.records import Caption, Manifest, Split
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, Manifest, Split
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.sample import DropClip, Sample
 from motionloom.datasets.shards.writer import write_dataset

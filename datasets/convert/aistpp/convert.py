@@ -17,20 +17,16 @@ from typing import Literal
 
 import numpy as np
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption, Split
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.aistpp.accompaniment import GENRES, TEMPI, song_for
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
+from motionloom.datasets.convert.common.body import SOUND_SUFFIXES, BodyConfig, BodyRelease, analyse, cut_of
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import read_ids
-from motionloom.datasets.convert.sets.shared.body import (
-    SOUND_SUFFIXES,
-    BodyConfig,
-    BodyRelease,
-    analyse,
-    cut_of,
-)
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
-from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.synth.music.band import band_version
 from motionloom.datasets.synth.music.recording import render_song
@@ -200,3 +196,6 @@ class Aistpp(BodyRelease[AistppConfig]):
         label = clip.entry.file
         poses, trans = read_aist_motion(self.path_of(label), label)
         return Figure(rotations=poses.reshape(-1, SMPL_JOINTS, 3).astype(np.float64), trans=trans)
+
+
+register(Aistpp)

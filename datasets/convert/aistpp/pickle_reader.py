@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import read_plain
 from motionloom.datasets.convert.common.arrays import check_values
-from motionloom.datasets.schema import UserError, read_plain
 
 POSE_WIDTH = 72
 """24 joints x axis-angle."""

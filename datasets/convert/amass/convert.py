@@ -16,6 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption, Split
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.amass.smpl_npz import (
     MotionHeader,
     RateError,
@@ -47,7 +50,6 @@ from motionloom.datasets.convert.common.release import Entry, Figure, Release, R
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 
 SUFFIX = ".npz"
@@ -288,3 +290,6 @@ def list_files(source: Path, draft: ConversionPlan[ReleaseClip]) -> list[str]:
     if not labels:
         raise UserError(f"{source}: no {SUFFIX} file with motion in it")
     return labels
+
+
+register(Amass)

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.convert.common.release import Figure
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.npz import NpzFile
-from motionloom.datasets.schema import UserError
 
 KINDS = {72: "SMPL", 156: "SMPL-H", 165: "SMPL-X"}
 """Width of `poses` -> body model."""

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.licences import credits_of, strictest
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.bvh.plan import BvhClip, BvhConfig, JointMaps, load_maps, plan_bvh
 from motionloom.datasets.convert.bvh.settle import added_frames
 from motionloom.datasets.convert.captions.humanml_index import CREDITS, WORDS_CREDIT
@@ -21,7 +23,6 @@ from motionloom.datasets.motion.bvh.joint_map import JointMap, metres, skeleton_
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 
 
@@ -115,3 +116,6 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         # The index counts the recording's own frames: one is the writer's, those after it are only blended.
         first, last = clip.span
         return joints[min(added, 1) :][max(first, added - 1) : last], joint_map
+
+
+register(Bvh)

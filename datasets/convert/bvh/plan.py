@@ -16,7 +16,9 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map, summary
 from motionloom.datasets.convert.bvh.read import FoundFile, list_files, read_file, read_motion, scan_files
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
@@ -37,7 +39,6 @@ from motionloom.datasets.convert.common.tables import captions_within
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Caption, Split, UserError
 
 MAPS_FOLDER = "joint_maps"
 """In the folder of the shards: the maps that were guessed, one for each skeleton."""

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import read_plain
 from motionloom.datasets.convert.common.files import read_in_threads, walk_files
 from motionloom.datasets.motion.bvh.asf import FPS, JOINED, frame_marks, read_amc, skeleton_of
 from motionloom.datasets.motion.bvh.joint_map import skeleton_key
@@ -20,7 +22,6 @@ from motionloom.datasets.motion.bvh.text import (
     load_text,
     parse_hierarchy,
 )
-from motionloom.datasets.schema import UserError, read_plain
 from motionloom.datasets.shards.left_out import drop
 
 SUFFIX = (".bvh", ".amc")

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.captions.read import (
     CATALOGUE,
     CaptionRow,
@@ -17,7 +18,6 @@ from motionloom.datasets.convert.captions.read import (
     text_records,
 )
 from motionloom.datasets.convert.common.files import walk_files
-from motionloom.datasets.schema import UserError
 
 TABLES = (".csv", ".tsv", ".tab", ".jsonl", ".json")
 

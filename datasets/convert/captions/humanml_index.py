@@ -18,7 +18,10 @@ from pathlib import Path, PurePosixPath
 
 from pydantic import Field, model_validator
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import whole
 from motionloom.datasets.base.licences import CMU
+from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.captions.options import CaptionConfig
 from motionloom.datasets.convert.common.files import check_id
@@ -31,7 +34,6 @@ from motionloom.datasets.convert.common.splits import (
     split_files,
 )
 from motionloom.datasets.convert.common.tables import read_csv
-from motionloom.datasets.schema import Caption, Split, UserError, whole
 
 INDEX_FPS = 20
 """Frames a second that the index means."""

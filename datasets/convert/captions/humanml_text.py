@@ -14,9 +14,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import number
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.files import read_text_file
-from motionloom.datasets.schema import Caption, UserError, number
 from motionloom.datasets.text.clean import clean_caption, usable_caption
 
 _TOKEN = re.compile(r"\S+/[A-Z]+")

@@ -15,13 +15,14 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of, sha256_of_json
+from motionloom.datasets.base.records import SPLITS, Caption, Split
 from motionloom.datasets.convert.captions.collect import Captions, caption_files, holds_captions
 from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, place_of
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.convert.common.splits import SplitRule, hash_split, read_split_files
-from motionloom.datasets.schema import SPLITS, Caption, Split, UserError
 
 
 class FileNames:

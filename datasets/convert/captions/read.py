@@ -18,11 +18,14 @@ from typing import Any, TypeVar
 
 from pydantic import AliasChoices, ConfigDict, Field, FiniteFloat
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError, nearest
+from motionloom.datasets.base.json_doors import parse_json
+from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.files import check_id, read_text_file
 from motionloom.datasets.convert.common.splits import split_named
 from motionloom.datasets.convert.common.tables import DELIMITERS, table_rows
-from motionloom.datasets.schema import Caption, Config, Split, UserError, nearest, parse_json
 
 T = TypeVar("T")
 

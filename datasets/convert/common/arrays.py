@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.npz import MAX_BYTES, ArrayHeader, npy_header
-from motionloom.datasets.schema import UserError
 
 Limit = float | NDArray[np.float64]
 

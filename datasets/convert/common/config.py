@@ -8,9 +8,11 @@ from typing import ClassVar, get_args
 from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import MotionType
 from motionloom.datasets.convert.common.facts import parse_where
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
-from motionloom.datasets.schema import Config, MotionType, UserError
 
 END_TOLERANCE = 0.5
 """Seconds that a caption may reach past its clip: sources round their times."""

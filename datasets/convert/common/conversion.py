@@ -11,13 +11,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.base.records import SPLITS, Manifest, Split
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.look import Look, look_at
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
-from motionloom.datasets.schema import SPLITS, Manifest, Split, UserError
 from motionloom.datasets.shards.index import load_index
 from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions
 from motionloom.datasets.shards.reader import load_manifest

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.licences import credits_of
+from motionloom.datasets.base.records import ClipMeta
 from motionloom.datasets.base.register import Table
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import C, ConversionPlan, facts_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import ClipMeta
 from motionloom.datasets.shards.sample import Sample
 
 Cfg = TypeVar("Cfg", bound=ConvertConfig)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 Fact = str | float | tuple[str, ...]
 """Value of a fact of a clip: words, a number, or several words."""

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, resample, resample_quaternions, retarget
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS, smpl75_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.schema import UserError
 
 if TYPE_CHECKING:
     import torch

@@ -9,8 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import read_plain
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.schema import UserError, read_plain
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Table
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
+from motionloom.datasets.base.records import Dropped
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.motion.bvh.joint_map import METRES, NamedUnit, metres
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import MOST, PERSON_METRES, PlausibilityStats, measure
-from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards.left_out import drop, grouped
 
 ADULT_METRES = 1.7

@@ -15,12 +15,14 @@ from typing import Generic, Protocol, TypeVar
 from rich.markup import escape
 from rich.table import Table
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.base.json_doors import number
 from motionloom.datasets.base.printable import printable
+from motionloom.datasets.base.records import SPLITS, Dropped, Split
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import Facts, parse_where, require_known
 from motionloom.datasets.convert.common.look import Look
-from motionloom.datasets.schema import SPLITS, Dropped, Split, UserError, number
 from motionloom.datasets.shards.left_out import drop, grouped, grouped_notes
 
 

@@ -16,7 +16,9 @@ from typing import ClassVar, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import content_of
+from motionloom.datasets.base.records import Caption, ClipMeta, Split
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.facts import Fact
@@ -31,7 +33,6 @@ from motionloom.datasets.convert.common.splits import (
     split_files,
 )
 from motionloom.datasets.convert.common.tables import captions_within
-from motionloom.datasets.schema import Caption, ClipMeta, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 
 

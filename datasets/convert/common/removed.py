@@ -18,21 +18,20 @@ from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.files import sync_folder, write_json
+from motionloom.datasets.base.json_doors import whole
 from motionloom.datasets.base.lock import folder_lock
-from motionloom.datasets.convert.common.splits import original_of, subject_of
-from motionloom.datasets.schema import (
+from motionloom.datasets.base.records import (
     CLEANED_FILE,
     MANIFEST_FILE,
     REMOVED_FILE,
-    Config,
     Decisions,
     Manifest,
     ShardInfo,
-    UserError,
-    nearest,
-    whole,
 )
+from motionloom.datasets.convert.common.splits import original_of, subject_of
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.finish import OLD_FOLDER, Planned, finish
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, index_path

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, cast
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import whole
+from motionloom.datasets.base.records import SPLITS, Split
 from motionloom.datasets.convert.common.files import check_id, read_text_file
-from motionloom.datasets.schema import SPLITS, Split, UserError, whole
 
 TRAIN_SHARE, VAL_SHARE = 0.80, 0.05
 """80/5/15, the split of HumanML3D and Motion-X, where a source brings none."""

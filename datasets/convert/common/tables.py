@@ -6,9 +6,11 @@ import csv
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.convert.common.config import END_TOLERANCE
 from motionloom.datasets.convert.common.files import read_text_file
-from motionloom.datasets.schema import Caption, UserError, parse_json
 from motionloom.datasets.text.clean import clean_caption
 
 DELIMITERS = {",": "a ','", "\t": "a tab", ";": "a ';'"}

@@ -24,7 +24,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import content_of
+from motionloom.datasets.base.records import Caption, Split
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import features_of, require_human
@@ -56,7 +59,6 @@ from motionloom.datasets.convert.motionx.parameters import (
 )
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.text.clean import emotion_of
 
@@ -265,3 +267,6 @@ def parameters_to_joints(values: NDArray[np.float64], body: BodyModel) -> NDArra
     rotations = values[:, : 3 * count].reshape(len(values), count, 3)
     # The shape is one a clip; where a fit let it waver, the median is that of most frames.
     return smpl_joints(rotations, values[:, TRANS], body, np.median(values[:, BETAS], axis=0))
+
+
+register(MotionX)

@@ -19,8 +19,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption, Dropped
 from motionloom.datasets.convert.common.files import check_id, inside, read_text_file, walk_files
-from motionloom.datasets.schema import Caption, Dropped, UserError
 from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.text.clean import clean_caption, usable_caption
 

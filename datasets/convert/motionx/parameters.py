@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.canonical import resample, resample_quaternions
 from motionloom.datasets.motion.layout import FACE_DIMS, MotionLayout
-from motionloom.datasets.schema import UserError
 
 RAW = MotionLayout.named("smplx322")
 FACE_WIDTH = 153

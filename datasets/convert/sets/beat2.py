@@ -13,16 +13,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import number
+from motionloom.datasets.base.records import Caption, Split
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.common.arrays import check_values
+from motionloom.datasets.convert.common.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.tables import captions_of, read_csv
-from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.motion.npz import NpzFile
-from motionloom.datasets.schema import Caption, Split, UserError, number
 
 MOTION, SPEECH, WORDS, LISTS = "smplxflame_30", "wave16k", "textgrid", "train_test_split.csv"
 _SPLITS: dict[str, Split] = {"train": "train", "val": "val", "test": "test"}
@@ -140,3 +143,6 @@ class Beat2(BodyRelease[Beat2Config]):
             )
         check_values(face, 1e3, f"{label}: expressions")
         return replace(figure, face=face[:, :FACE_DIMS])
+
+
+register(Beat2)

@@ -14,11 +14,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import number, whole
+from motionloom.datasets.base.records import Caption
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.bvh.read import list_files
 from motionloom.datasets.convert.common.tables import captions_of, read_csv, read_json_lines
-from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row
-from motionloom.datasets.schema import Caption, UserError, number, whole
+from motionloom.datasets.convert.sets.bvh_sets import BvhSetConfig, Row
 
 FPS = 120.0
 _FACTS = (
@@ -105,3 +108,6 @@ class BonesSeed(Bvh):
     example = "bones-seed shards"
     config_class = BonesSeedConfig
     published = "card, 2026-03: 142,220 clips (half of them mirrored), 288 hours, 522 actors"
+
+
+register(BonesSeed)

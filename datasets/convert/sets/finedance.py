@@ -12,15 +12,17 @@ from typing import Literal
 
 import numpy as np
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Split
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
+from motionloom.datasets.convert.common.body import SOURCE_FPS, BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
-from motionloom.datasets.convert.sets.shared.body import SOURCE_FPS, BodyConfig, BodyRelease
-from motionloom.datasets.convert.sets.shared.vectors import rotvecs_of_rows
-from motionloom.datasets.schema import Split, UserError
+from motionloom.datasets.convert.sets.vectors import rotvecs_of_rows
 
 JOINTS = 52
 WIDTH = 3 + 6 * JOINTS
@@ -118,3 +120,6 @@ _LIMITS = np.concatenate([np.full(3, 1e3), np.full(6 * JOINTS, 10.0)])
 
 def _is(number: str, listed: Iterable[int]) -> bool:
     return (number.lstrip("0") or "0") in map(str, listed)
+
+
+register(FineDance)

@@ -22,6 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import whole
+from motionloom.datasets.base.records import SPLITS, Caption, Split
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.facts import Fact
@@ -30,9 +34,8 @@ from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
 from motionloom.datasets.convert.common.tables import captions_of
-from motionloom.datasets.convert.sets.shared.vectors import walked
+from motionloom.datasets.convert.sets.vectors import walked
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import SPLITS, Caption, Split, UserError, whole
 
 FPS, WIDTH = 30.0, 272
 _STEP, _TURN, _POSITIONS = slice(0, 2), slice(2, 8), slice(8, 8 + 3 * BODY_JOINTS)
@@ -133,3 +136,6 @@ def joints_of_272(values: NDArray[np.floating]) -> NDArray[np.float64]:
     heading = np.cumsum(np.arctan2(turns[:, 2], turns[:, 0]))  # first row of a turn about Y: cos, 0, sin
     positions = columns[:, _POSITIONS].reshape(len(columns), BODY_JOINTS, 3)
     return walked(positions, heading, columns[1:, _STEP])
+
+
+register(Motion272)

@@ -13,14 +13,16 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption, Split
+from motionloom.datasets.base.register import register
+from motionloom.datasets.convert.common.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import inside, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
-from motionloom.datasets.convert.sets.shared.body import BodyConfig, BodyRelease
-from motionloom.datasets.schema import Caption, Split, UserError
 
 TASKS = ("text_motion", "music_dance", "speech_gesture", "two_person_interaction")
 _MIRRORED = re.compile(r"(?<![^/])M(?=\d+(?:/|$))")
@@ -159,3 +161,6 @@ def _motions(row: dict[str, object]) -> Iterator[str]:
 def _sound(row: dict[str, object]) -> str | None:
     stated = row.get("music_path") or row.get("audio_path")
     return stated if isinstance(stated, str) else None
+
+
+register(MotionHub)

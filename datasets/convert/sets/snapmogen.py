@@ -21,12 +21,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import whole
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
-from motionloom.datasets.convert.sets.shared.vectors import walked
-from motionloom.datasets.schema import UserError, whole
+from motionloom.datasets.convert.sets.vectors import walked
 
 FPS, JOINTS = 30.0, 24
 WIDTH = 4 + 12 * JOINTS + 4
@@ -94,3 +96,6 @@ def joints_of_296(values: NDArray[np.floating]) -> NDArray[np.float64]:
     heading = np.concatenate([[0.0], np.cumsum(columns[:-1, 0])])
     positions = columns[:, _POSITIONS].reshape(len(columns), JOINTS, 3)
     return walked(positions, heading, columns[:-1, 1:3])
+
+
+register(SnapMoGen)

@@ -11,10 +11,12 @@ from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import whole
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.common.tables import captions_of, read_csv
-from motionloom.datasets.convert.sets.shared.bvh import BvhSetConfig, Row, stem
-from motionloom.datasets.schema import UserError, whole
+from motionloom.datasets.convert.sets.bvh_sets import BvhSetConfig, Row, stem
 
 CUTS, STYLES = "Frame_Cuts.csv", "Dataset_List.csv"
 MOVEMENTS = {
@@ -97,3 +99,6 @@ def _rows(source: Path, cuts: Iterable[str]) -> dict[str, Row]:
         texts += captions_of(f"{does}: {described[words]}", "description") if words in described else []
         found[name] = Row(tuple(texts), style, {"style": style, "movement": movement})
     return found
+
+
+register(Style100)

@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 RELAXED_FLEX = ((0.3, 0.4, 0.25), (0.38, 0.45, 0.3), (0.5, 0.5, 0.3), (0.45, 0.48, 0.3))
 """Flexion of (knuckle, middle joint, last joint) for index, middle, pinky, ring; radians."""

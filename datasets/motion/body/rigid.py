@@ -23,11 +23,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.canonical import ground, resample, resample_quaternions, retarget
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 Floats = NDArray[np.float64]
 

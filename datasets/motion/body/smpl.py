@@ -20,11 +20,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 SkeletonName = Literal["smpl22", "smplx52"]
 

@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.motion.body.rigid import FitError, RigidMotion, on_bones
 from motionloom.datasets.motion.body.smpl import FINGERS, BodyModel
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import UserError
 
 _BETAS = 16
 

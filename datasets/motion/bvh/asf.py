@@ -15,9 +15,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import number
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.bvh.text import LARGEST, Floats, is_number, shown
-from motionloom.datasets.schema import UserError, number
 
 INCH = 2.54
 """Centimetres."""

@@ -25,10 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.datasets.motion.bvh.motion import END, BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Config, UserError, parse_json, read_plain
 
 NamedUnit = Literal["m", "cm", "mm", "inch", "dm", "foot", "inch/0.45"]
 Unit = NamedUnit | Annotated[float, Field(gt=0, lt=1e6)]

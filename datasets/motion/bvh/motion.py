@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.bvh.text import Floats, find_motion, load_text, parse_hierarchy, read_values
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 WRITTEN_ORDER = "ZXY"
 """Rotation channels of written files: the usual order of motion-capture tools."""

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.bvh.joint_map import JointMap, Up
 from motionloom.datasets.motion.bvh.motion import BvhMotion, channel_columns, read_bvh
 from motionloom.datasets.motion.bvh.text import Floats, find_motion
 from motionloom.datasets.motion.easing import between_known, smooth
 from motionloom.datasets.motion.kinematics import forward_kinematics
-from motionloom.datasets.schema import UserError
 
 _FADE = 0.25
 """Seconds in which made joints leave the file's, from which the model's figure is millimetres away; more

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.schema import UserError, read_plain
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import read_plain
 
 Floats = NDArray[np.float64]
 

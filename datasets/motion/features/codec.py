@@ -26,10 +26,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.canonical import ground, heading
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import FACE_DIMS, MotionLayout
-from motionloom.datasets.schema import UserError
 
 _GROUP_FRAMES = 800
 """Clips are encoded in groups of about so many frames. Measured: larger groups leave the cache and run at

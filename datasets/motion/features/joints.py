@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import ground, heading
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
-from motionloom.datasets.schema import UserError
 
 
 def joints_of(features: NDArray[np.floating], layout: MotionLayout) -> NDArray[np.float64]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.features.running_sum import running_sum
 from motionloom.datasets.motion.kinematics import levels
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 
 
 def torch_joints_of(features: Tensor, layout: MotionLayout) -> Tensor:

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.song import Section, Song
 
 SOUND_FONT = Path("/usr/share/sounds/sf2/FluidR3_GM.sf2")

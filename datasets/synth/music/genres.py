@@ -18,7 +18,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.synth.actions.arms import Vec
 
 Style = Literal["step", "bounce", "sway"]

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from motionloom import register
+from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.schema import Caption, Split
 from motionloom.datasets.shards.sample import Sample
 
 

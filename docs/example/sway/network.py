@@ -6,7 +6,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 
 WAVES = 8
 """Sines of time that the network reads; the slowest lasts 256 frames."""

@@ -18,9 +18,9 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.features.running_sum import running_sum
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Config
 from motionloom.models.layers.conv import Conv, ConvTranspose, ResidualBlock, start_weights
 from motionloom.models.quantize.base import QuantizerConfig
 from motionloom.models.quantize.ema import EmaQuantizer

@@ -17,7 +17,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.layers.transformer import StackConfig, Transformer
 

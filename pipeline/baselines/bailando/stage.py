@@ -11,11 +11,11 @@ import torch
 from pydantic import Field
 from torch.utils.data import Dataset
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.dances import BeatBatches, JointCrops, danced_joints
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.schema import UserError
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.bailando.codes import DanceVq, DanceVqConfig, places
 from motionloom.pipeline.baselines.bailando.generator import BailandoGenerator

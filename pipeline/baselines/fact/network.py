@@ -24,8 +24,8 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.transformer import Block, StackConfig, Transformer
 
 Columns = Literal["features", "matrices"]

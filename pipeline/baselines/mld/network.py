@@ -20,9 +20,9 @@ import torch.nn.functional as F
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.features.torch_joints import present_joints, torch_joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config
 from motionloom.models.diffusion.network import step_waves
 from motionloom.models.diffusion.schedule import ScheduleConfig
 from motionloom.models.layers.transformer import SkipTransformer, StackConfig, length_mask

@@ -10,8 +10,8 @@ import torch
 from pydantic import model_validator
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.statistics import FeatureStats
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.sampling import sample_guided
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.layers.transformer import length_mask, name_in_torch

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor, nn
 
+from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.features.torch_joints import torch_smpl_joints
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Config
 from motionloom.models.layers.transformer import StackConfig, Transformer, sinusoid
 
 

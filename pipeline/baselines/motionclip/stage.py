@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.motionclip.network import (

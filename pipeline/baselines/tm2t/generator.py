@@ -12,8 +12,10 @@ import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import require_plain
+from motionloom.datasets.base.records import PRESENT_ALL
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import PRESENT_ALL, UserError, require_plain
 from motionloom.models.gpt.sampling import Drawing
 from motionloom.models.gpt.tokens import interleave
 from motionloom.pipeline.baselines.tm2t.network import END, START, Captioner, Reading, Vocabulary

@@ -24,7 +24,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.models.gpt.tokens import TokenNetwork
 from motionloom.models.layers.transformer import LayerNorm, StackConfig, sinusoid
 from motionloom.models.metrics.captions import words_of

@@ -17,7 +17,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.models.gpt.sampling import Drawing, Rows, requested_groups, uniform_numbers
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
 from motionloom.models.layers.frozen import evaluating

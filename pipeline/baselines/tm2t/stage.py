@@ -10,8 +10,8 @@ from pydantic import Field
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.cache import TextCache
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.tm2t.generator import (

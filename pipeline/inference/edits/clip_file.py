@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import number, parse_json
+from motionloom.datasets.base.records import FACE, HANDS
 from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
 from motionloom.datasets.convert.common.features import features_of, require_human
@@ -22,7 +25,6 @@ from motionloom.datasets.motion.canonical import facing, ground, mirror, resampl
 from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import FACE, HANDS, UserError, number, parse_json
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
 from motionloom.datasets.motion.body.landing import landed, reached
@@ -21,7 +22,6 @@ from motionloom.datasets.motion.features.codec import encode, place
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.layout import PIECES, piece_columns, piece_joints
-from motionloom.datasets.schema import UserError
 from motionloom.models.metrics.dance import ANKLES_TOES
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Motion, MotionGenerator

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.body.rigid import RigidMotion, at_rate, fit_rigid, moved
 from motionloom.datasets.motion.bvh.own_file import between_rows
@@ -27,7 +28,6 @@ from motionloom.datasets.motion.layout import (
     pieces_of,
     step_columns,
 )
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.observed import Places
 from motionloom.pipeline.contract.editing import MAX_SPEED, EditTask
 from motionloom.pipeline.inference.edits.recorded import RecordedClip

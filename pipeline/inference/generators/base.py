@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.tokens import Codes
 from motionloom.pipeline.contract.generation import Capabilities, GenerationRequest
 from motionloom.pipeline.store.networks import TrainedTokenizer

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Conditions
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.canonical import runs
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import Filling, KnownMotion
 from motionloom.models.diffusion.network import InBetweener, TextDenoiser
 from motionloom.models.diffusion.observed import Places, Recovery, known_columns

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.sampling import Drawing, generate, sample_seeds
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig

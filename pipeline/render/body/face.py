@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.npz import NpzFile
-from motionloom.datasets.schema import UserError
 
 Floats = NDArray[np.float64]
 Values = NDArray[np.floating]

@@ -18,11 +18,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file
+from motionloom.datasets.base.json_doors import number, parse_json, read_plain
 from motionloom.datasets.motion.body.rigid import RigidMotion, on_one_skeleton, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError, number, parse_json, read_plain
 from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS
 from motionloom.pipeline.render.body.mesh import FIRST_OF_HEAD, Body, body_for, colours
 

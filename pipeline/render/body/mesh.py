@@ -19,10 +19,10 @@ from importlib import resources
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS, ArkitBases, expression_weights
 
 Floats = NDArray[np.float64]

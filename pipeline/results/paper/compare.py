@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.markdown import Markdown
 from rich.table import Table
 
+from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError, nearest
 from motionloom.pipeline.launch.console import make_console
 from motionloom.pipeline.results.paper.fill import fill
 from motionloom.pipeline.results.paper.filled import FilledTable

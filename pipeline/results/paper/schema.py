@@ -21,7 +21,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from motionloom.datasets.schema import Config
+from motionloom.datasets.base.config import Config
 from motionloom.pipeline.store.run_state import StageRecord
 from motionloom.pipeline.store.yaml import flatten
 

@@ -6,11 +6,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from motionloom.datasets.base.register import declare
 from motionloom.datasets.convert.captions.options import digest_of
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter
-from motionloom.datasets.convert.registry import converters, prepare
+from motionloom.datasets.convert.registry import names, prepare
 from motionloom.datasets.shards.options import Part
 from motionloom.pipeline.contract.stage import NotThereError, StageConfig, StageContext, register
 from motionloom.pipeline.stages.data.data import DataStage, say_shards
@@ -80,6 +81,10 @@ def source_facts(config: ConvertConfig) -> dict[str, Any]:
     return {"files": files, "steering": steering}
 
 
+def open_kind(name: str) -> None:
+    """Import a converter, which registers the kind of its stage, too."""
+    CONVERTERS[name]
+
+
 CONVERTERS.follow(lambda kind: register(ConvertStage(kind)))
-for _kind in converters():
-    register(_kind)
+declare("stage kind", dict.fromkeys(names(), f"{__name__}:{open_kind.__name__}"))

@@ -9,10 +9,11 @@ import torch
 from pydantic import Field
 
 from motionloom.datasets.audio.beat_net import WEIGHTS
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.cache import CacheConfig
 from motionloom.datasets.shards.left_out import tally
 from motionloom.datasets.shards.options import Reading

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.statistics import frame_statistics
 from motionloom.datasets.modalities.modality import FrameStats, Modality
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import (
     CompletedStage,
     Inputs,

@@ -12,9 +12,10 @@ from typing import Annotated
 import torch
 from pydantic import Field
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import SPLITS
 from motionloom.datasets.check.leaks import Splits, find_leaks
 from motionloom.datasets.motion.layout import MotionLayout, require_layout
-from motionloom.datasets.schema import SPLITS, UserError
 from motionloom.pipeline.contract.stage import (
     RUNTIME,
     CompletedStage,

@@ -9,9 +9,10 @@ import torch
 from pydantic import Field, model_validator
 
 from motionloom.datasets.actions.measure import actions_of
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.records import Split
 from motionloom.datasets.loading.statistics import FeatureStats, compute
-from motionloom.datasets.schema import Split, UserError
 from motionloom.datasets.text.build import build_text_cache
 from motionloom.pipeline.contract.stage import (
     CPU,

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import nn
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.condition_batches import Captioned
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import Config, UserError
 from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.showing import Curve

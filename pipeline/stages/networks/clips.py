@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import Crops
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.training.config import SizedBatches

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig

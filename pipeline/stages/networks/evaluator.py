@@ -6,8 +6,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.evaluator.losses import MATCHING, MOVEMENT, EvaluatorLossConfig
 from motionloom.models.evaluator.network import UNIT, Evaluator, EvaluatorConfig
 from motionloom.models.training.optim import OptimConfig

@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.pipeline.contract.generation import MotionGenerator

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import model_validator
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.tma.losses import TmaLossConfig
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.pipeline.contract.generation import GenerationRequest, MotionGenerator

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from pydantic import Field, create_model
 from torch.utils.data import Dataset
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats
-from motionloom.datasets.schema import UserError
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer, TokenizerConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
 from motionloom.models.tokenizer.single import FsqConfig, MqConfig, RvqConfig, VqConfig

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.stage import (
     GENERATOR,

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 from pydantic import Field, field_validator
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.kinds import Balance, Drop
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import MateConfig
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.models.training.optim import OptimConfig

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import FACE_ALIGNMENT, GENERATOR, Every, StageContext, register
 from motionloom.pipeline.contract.units import Arrays, Row, as_rows
 from motionloom.pipeline.evaluation.clip_metrics import Performance, clip_figures, measure_clip, metrics_of

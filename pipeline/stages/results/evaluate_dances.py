@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from pydantic import Field
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import GENERATOR, Every, StageConfig, StageContext, register

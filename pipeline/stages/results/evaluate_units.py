@@ -8,8 +8,8 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.contract.units import Arrays, as_table, even_slices

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.contract.showing import FigureTable, Showing
 from motionloom.pipeline.contract.stage import (

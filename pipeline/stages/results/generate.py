@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 from pydantic import Field
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import (
     GENERATOR,

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 from pydantic import Field
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.features.codec import face_of
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.pipeline.contract.sampling import SamplingConfig

@@ -36,8 +36,8 @@ from motionloom.datasets.audio.features import (
     settings_at,
 )
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.music.recording import render_song
 from motionloom.datasets.synth.music.song import Song
 from motionloom.pipeline.contract.generation import Prompt

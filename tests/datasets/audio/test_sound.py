@@ -12,7 +12,7 @@ import soundfile
 
 from motionloom.datasets.audio import sound
 from motionloom.datasets.audio.sound import Sound, read_sound, resample_sound, sound_seconds
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 
 RATE = 16_000
 

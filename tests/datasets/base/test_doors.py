@@ -25,8 +25,10 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from safetensors.torch import save_file
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import number, parse_json, whole
 from motionloom.datasets.convert.captions.humanml_text import parse_caption
-from motionloom.datasets.schema import Config, UserError, number, parse_json, whole
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.stage import stage_kinds
 from motionloom.pipeline.results.paper.schema import Bounds

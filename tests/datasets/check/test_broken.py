@@ -20,6 +20,8 @@ import yaml
 from shard_samples import write
 
 from motionloom.datasets.audio.sound import MAX_RATE, read_sound
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest, ShardInfo
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.amass.smpl_npz import read_motion as read_amass
@@ -34,7 +36,6 @@ from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.npz import NpzFile, map_npy
-from motionloom.datasets.schema import Manifest, ShardInfo, UserError
 from motionloom.datasets.shards.index import read_index
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.tar import MOST_CLIPS, scan_tar

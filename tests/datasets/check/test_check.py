@@ -17,12 +17,13 @@ import pytest
 from rich.console import Console
 from shard_samples import LAYOUT, write_made
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.check.dataset import CheckReport, examine
 from motionloom.datasets.check.findings import LISTED, Findings
 from motionloom.datasets.check.leaks import find_leaks
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
-from motionloom.datasets.schema import Caption, Split, UserError
 from motionloom.datasets.shards import sample as sample_module
 from motionloom.datasets.shards import tar as shards
 from motionloom.datasets.shards.sample import Sample

@@ -12,12 +12,13 @@ import pytest
 from rich.console import Console
 from shard_samples import LAYOUT, write_made
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption, Decisions, Split
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.faults import motion_faults
 from motionloom.datasets.check.suspects import decide, find_suspects, open_splits, undo
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
-from motionloom.datasets.schema import Caption, Decisions, Split, UserError
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.sample import Sample

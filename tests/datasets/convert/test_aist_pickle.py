@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.schema import UserError
 
 
 def annotation(frames: int = 5, **changes: Any) -> dict[str, Any]:

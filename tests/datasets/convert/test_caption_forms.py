@@ -17,12 +17,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.convert.captions.options import list_clips
 from motionloom.datasets.convert.common.splits import hash_split, read_split_files, subject_of
 from motionloom.datasets.convert.registry import prepare
-from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.cli.convert import convert_command
 

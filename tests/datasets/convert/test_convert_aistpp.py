@@ -15,6 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from motionloom.datasets.audio.features import AudioSettings, audio_features
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.aistpp.accompaniment import kinematic_beats, phase_of
 from motionloom.datasets.convert.aistpp.convert import MOTION_LICENCE, MUSIC_LICENCE, AistppConfig
@@ -25,7 +27,6 @@ from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.music.band import band_version
 

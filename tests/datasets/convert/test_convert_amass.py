@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.captions.humanml_index import IndexRow, clip_key, read_index
 from motionloom.datasets.convert.common.splits import hash_split
@@ -21,7 +22,6 @@ from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 
 
 @pytest.mark.parametrize("fps", [60.0, 100.0, 120.0, 150.0, 250.0, 59.94])

@@ -14,6 +14,8 @@ import pytest
 from bvh_clips import unpack_bandai
 from shard_samples import digests
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest, Split
 from motionloom.datasets.convert.amass.convert import AmassConfig
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
 from motionloom.datasets.convert.bvh.plan import BvhClip
@@ -22,7 +24,6 @@ from motionloom.datasets.convert.common.facts import parse_where, require_known
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, Split, UserError
 from motionloom.datasets.shards.index import ClipEntry, ShardIndex, index_path
 from motionloom.datasets.shards.reader import ShardDataset
 

@@ -14,6 +14,8 @@ from foreign_figures import Built, build, write_figure
 from foreign_tools import FOREIGN
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest, Split
 from motionloom.datasets.convert.bvh.convert import BvhConfig
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import prepare
@@ -24,7 +26,6 @@ from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import Manifest, Split, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 
 BY_TOOL = {spec.tool: spec for spec in FOREIGN}

@@ -12,15 +12,16 @@ import pytest
 from amass_clips import features as motions
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import SPLITS, Caption, Manifest, Split
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.splits import hash_split
+from motionloom.datasets.convert.humanml3d.convert import HumanMl3dConfig
 from motionloom.datasets.convert.registry import prepare
-from motionloom.datasets.convert.sets.humanml3d import HumanMl3dConfig
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import SPLITS, Caption, Manifest, Split, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 
 H3D = MotionLayout.named("h3d263")

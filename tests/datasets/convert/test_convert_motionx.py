@@ -29,6 +29,8 @@ from motionx_clips import (
 )
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.motionx.convert import MotionX, parameters_to_joints
@@ -44,7 +46,6 @@ from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.canonical import facing, mirror
 from motionloom.datasets.motion.features.codec import decode, face_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.sample import Sample
 
 

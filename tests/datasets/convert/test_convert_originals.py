@@ -15,6 +15,8 @@ from bvh_clips import SKELETON, write_clip, write_map
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import REMOVED_FILE, Decisions, Manifest, Split
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.captions.humanml_index import ORIGINALS, IndexRow
@@ -27,7 +29,6 @@ from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.canonical import canonicalize, mirror, resample
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import REMOVED_FILE, Decisions, Manifest, Split, UserError
 from motionloom.datasets.shards import finish, tasks
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.cli.main import app

@@ -17,6 +17,8 @@ from bvh_clips import unpack_bandai, write_source
 from rich.console import Console
 from typer.testing import CliRunner
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.convert.bvh.convert import BvhConfig
 from motionloom.datasets.convert.bvh.read import list_files
@@ -26,7 +28,6 @@ from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.look import MOST_CLIPS, Look, SourceJoints, look_at
 from motionloom.datasets.convert.common.splits import hash_split, subject_of
 from motionloom.datasets.convert.registry import prepare
-from motionloom.datasets.schema import Manifest, UserError
 from motionloom.pipeline.cli.convert import convert_command
 from motionloom.pipeline.cli.main import app
 

@@ -18,9 +18,10 @@ import release_trees
 from bvh_clips import write_clip
 from shard_samples import digests
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.registry import converter_named, prepare
-from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.finish import join_parts
 from motionloom.datasets.shards.options import Part
 

@@ -11,6 +11,8 @@ import pytest
 import release_trees as trees
 from amass_clips import expected_joints, features, meta_of, reasons
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.common.conversion import Conversion, run_conversion
 from motionloom.datasets.convert.registry import converter_named, prepare
@@ -19,7 +21,6 @@ from motionloom.datasets.convert.sets.snapmogen import ORDER, joints_of_296
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, UserError
 
 QUICK = {"audio_features": False, "sound_rate": 8000}
 """Without the 438 features, whose first use compiles for half a minute."""

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.convert.captions.humanml_text import parse_caption, read_humanml_captions
 from motionloom.datasets.convert.common.arrays import load_array
 from motionloom.datasets.convert.common.files import inside
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, UserError
 
 
 @pytest.fixture

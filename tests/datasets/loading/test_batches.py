@@ -14,6 +14,8 @@ from rank_shares import require_shares
 from text_samples import WordLengths, caption_batches
 from torch.utils.data import DataLoader
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches, EvalBatches
 from motionloom.datasets.loading.crops import frame_span
@@ -21,7 +23,6 @@ from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.loading.steps import Steps
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache

@@ -12,6 +12,9 @@ from pydantic import Field
 from rank_shares import require_shares
 from text_samples import WordLengths
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.loading.condition_batches import ConditionBatch, ConditionBatches
 from motionloom.datasets.loading.kinds import Balance, Drop, all_kinds, key_of
 from motionloom.datasets.loading.mix import MixedDataset
@@ -20,7 +23,6 @@ from motionloom.datasets.loading.statistics import FeatureStats, compute, frame_
 from motionloom.datasets.modalities.audio import RECORD as AUDIO
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, Config, UserError
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample

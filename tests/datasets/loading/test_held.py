@@ -12,13 +12,14 @@ import pytest
 from rank_shares import require_rows
 from text_samples import OneToken, caption_batches
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import FACE, HANDS
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
 from motionloom.datasets.loading.mix import MixedDataset
 from motionloom.datasets.loading.statistics import STD_FLOOR, FeatureStats, Moments, compute, from_moments
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import FACE, HANDS, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from rank_shares import require_shares
 from text_samples import OneToken, caption_batches
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.randomness import permutation, uniform
 from motionloom.datasets.loading.batches import WindowBatches
 from motionloom.datasets.loading.condition_batches import EvalBatches
@@ -26,7 +27,6 @@ from motionloom.datasets.loading.order import shares
 from motionloom.datasets.loading.plan import BatchPlan, Share
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.clips import Source
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.statistics import STD_FLOOR, FeatureStats, Moments, compute, from_moments
 from motionloom.datasets.motion.layout import ROOT, MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reader import ShardDataset
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.bvh.asf import read_amc
-from motionloom.datasets.schema import UserError
 
 ASF = """:version 1.10
 :units

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh, write_bvh
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 TINY = """HIERARCHY
 ROOT hips

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.common.features import canonical_smpl75
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
@@ -24,7 +25,6 @@ from motionloom.datasets.motion.canonical import (
 from motionloom.datasets.motion.features.smpl75 import fit_smpl75, joints24_of
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 FPS = 20.0
 BODY = Skeleton.named("smpl22")

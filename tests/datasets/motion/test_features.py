@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.canonical import canonicalize, ground, retarget
 from motionloom.datasets.motion.features.codec import decode, encode, face_of
 from motionloom.datasets.motion.features.h3d import encode_h3d, uniform_joints
 from motionloom.datasets.motion.features.joints import joints_of, local_joints_of
 from motionloom.datasets.motion.features.torch_joints import present_joints, torch_joints_of
 from motionloom.datasets.motion.layout import LAYOUTS, MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, make_sample
 
 BODY = MotionLayout.named("body133")

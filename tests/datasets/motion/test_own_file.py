@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 BODY = Skeleton.named("smpl22")
 FRAMES, FPS = 151, 60

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
 from motionloom.datasets.motion.body.rigid import (
@@ -25,7 +26,6 @@ from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 Floats = NDArray[np.float64]
 

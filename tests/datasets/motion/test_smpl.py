@@ -12,10 +12,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 
 SMPL_TREE = [-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19]
 FINGER_STARTS = [0, 3, 6, 9, 12]

@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 from fsspec.implementations.local import LocalFileSystem
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import SPLITS, Caption, ClipMeta
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.convert.common.removed import remove
-from motionloom.datasets.schema import SPLITS, Caption, ClipMeta, UserError
 from motionloom.datasets.shards import store
 from motionloom.datasets.shards.copy import copy_dataset
 from motionloom.datasets.shards.reader import ShardDataset

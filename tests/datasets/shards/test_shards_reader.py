@@ -12,8 +12,8 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.check.dataset import check
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards import reader
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.tar import scan_tar

@@ -19,10 +19,11 @@ import numpy as np
 import pytest
 from shard_samples import digests
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.lock import LOCK_FILE, folder_lock
+from motionloom.datasets.base.records import Dropped
 from motionloom.datasets.check.dataset import check
 from motionloom.datasets.loading.plan import BatchPlan
-from motionloom.datasets.schema import Dropped, UserError
 from motionloom.datasets.shards import tasks
 from motionloom.datasets.shards.clips import Source
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, kind_of_reason, tally, write_left_out

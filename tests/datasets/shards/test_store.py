@@ -14,7 +14,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.shards import store as retry
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 from motionloom.datasets.shards.options import Reading

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.synth.music import band
 from motionloom.datasets.synth.music.band import band_version, sound_font
 from motionloom.datasets.synth.music.recording import render_song

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.actions.measure import action_of, agrees
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.actions.truth import ACTIONS, BASIC, SEATED, draw
 from motionloom.datasets.synth.generate import (

@@ -16,7 +16,7 @@ from sentence_transformers import SentenceTransformer
 from shard_samples import digests
 from text_samples import tiny_clip
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.text import build as build_module
 from motionloom.datasets.text.build import build_text_cache, build_with_encoder
 from motionloom.datasets.text.cache import TextCache

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition
-from motionloom.datasets.schema import UserError
 from motionloom.models.condition.mate import Mate, MateConfig, drop_conditions
 from motionloom.models.layers.transformer import sinusoid
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from toy_gpt import PATTERN, STREAMS, random_codes
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.dmd import Dmd, DmdConfig
 from motionloom.models.diffusion.module import DmdModule, hidden_stretch
 from motionloom.models.diffusion.sampling import blend_weights, decode_motions, window_starts

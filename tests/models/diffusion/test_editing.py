@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import LOWER, PIECES, MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import Filling, KnownMotion
 from motionloom.models.diffusion.module import InBetweenModule
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from toy_gpt import PATTERN, STREAMS, TINY, aligned_gpt, sequences, toy_gpt
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.losses import corrupt, cross_entropy, soft_codes, straight_through
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import InterleavedGPT

@@ -6,7 +6,7 @@ import pytest
 import torch
 from toy_gpt import STREAMS, row_of, toy_gpt
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.sampling import Drawing, filter_logits, generate, sample_seeds
 

@@ -7,8 +7,8 @@ import pytest
 import roma
 import torch
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.basis import Basis
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.tokenizer.module import TokenizerModule

@@ -10,9 +10,9 @@ from plain_training import take_steps
 from torch import Tensor, nn
 from torch.nn import functional
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.module import TextDenoiserModule
 from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.tma.module import TmaModule

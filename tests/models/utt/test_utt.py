@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from toy_gpt import PATTERN, STREAMS, closed, encoded
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.condition.mate import Encoded
 from motionloom.models.utt.network import Utt, UttConfig
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from toy_gpt import PATTERN, STREAMS, encoded, random_codes, row_of
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.condition.mate import Encoded
 from motionloom.models.gpt.sampling import Drawing, sample_seeds
 from motionloom.models.gpt.tokens import Codes, interleave

@@ -14,7 +14,7 @@ from rich.console import Console
 from safetensors.numpy import load_file
 
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import dances_for, dances_of

@@ -17,7 +17,7 @@ from bvh_clips import write_clip, write_map
 from program import commands
 from rich.console import Console
 
-from motionloom.datasets.schema import Manifest
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.shards.index import ShardIndex
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.cli.convert import say_manifest

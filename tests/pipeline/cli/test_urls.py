@@ -11,9 +11,10 @@ from typing import Any
 import pytest
 from program import commands
 
+from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import discover
 from motionloom.datasets.convert.registry import converter_named, names
-from motionloom.datasets.schema import Config, UserError
 from motionloom.pipeline.contract.stage import stage_kinds
 from motionloom.pipeline.stages.data.data import ShardsStageConfig
 

@@ -1,17 +1,17 @@
-"""A new baseline is its folder; a file of one's own is named by a variable: nothing else names them."""
+"""Kinds are declared by name and imported when used; a file of one's own is named by a variable."""
 
 from __future__ import annotations
 
-import runpy
 import sys
 from collections.abc import Iterator
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from motionloom.datasets.base import register
-from motionloom.pipeline import baselines
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract import stage
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.store.artifact import Artifact
@@ -30,25 +30,46 @@ register(FunctionStage("count", "counts clips", StageConfig, count, takes=("data
 
 
 @pytest.fixture(autouse=True)
-def kinds_are_put_back() -> Iterator[None]:
-    before = dict(stage.stage_kinds())
+def kinds_are_put_back(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    stage.stage_kinds()
+    declared = register._declared("stage kind")
+    monkeypatch.setattr(declared, "places", dict(declared.places))
+    monkeypatch.setattr(stage.KINDS, "_things", dict(stage.KINDS._things))
     yield
-    for name in stage.KINDS.keys() - before.keys():
-        del stage.KINDS[name]
     register.discover.cache_clear()
+    sys.modules.pop("swing", None)
 
 
-def test_a_folder_beside_the_baselines_is_a_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "swing").mkdir()
-    (tmp_path / "swing/__init__.py").touch()
-    (tmp_path / "swing/stage.py").write_text(
+def test_a_declared_kind_is_imported_when_it_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "swing.py").write_text(
         "from motionloom.pipeline.contract.stage import FunctionStage, StageConfig, register\n"
         "register(FunctionStage('swing', 'a toy', StageConfig, print))"
     )
-    monkeypatch.setattr(baselines, "__path__", [*baselines.__path__, str(tmp_path)])
-    runpy.run_module("motionloom.pipeline.stages.table")
-    assert sys.modules.pop("motionloom.pipeline.baselines.swing.stage")
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    register.declare("stage kind", {"swing": "swing", "hop": "swing", "gone": "no_such_module"})
+    assert "swing" in stage.stage_kinds() and "swing" not in sys.modules
     assert stage.stage_kind("swing", "here").summary == "a toy"
+    with pytest.raises(UserError, match="swing: registers no stage kind 'hop'"):
+        stage.stage_kind("hop", "here")
+    with pytest.raises(UserError, match="no_such_module"):
+        stage.stage_kind("gone", "here")
+    with pytest.raises(UserError, match="'swing'"):
+        register.declare("stage kind", {"swing": "other"})
+    with pytest.raises(UserError, match="another one"):
+        register.register(stage.FunctionStage("mdm", "a stranger", stage.StageConfig, print))
+
+
+def test_what_was_taken_out_of_the_installation_is_not_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = [
+        EntryPoint(name, f"motionloom.pipeline.{name}.table", register.GROUP) for name in ("stages", "gone")
+    ]
+    monkeypatch.setattr(register, "entry_points", lambda group: points)
+    register.discover.cache_clear()
+    register.discover()
+    points.append(EntryPoint("x", "motionloom.pipeline.stages.gone", register.GROUP))
+    register.discover.cache_clear()
+    with pytest.raises(UserError, match="cannot be imported"):
+        register.discover()
 
 
 def test_a_stage_of_one_file_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

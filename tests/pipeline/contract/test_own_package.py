@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from own_package import EXAMPLE, installed, program, python, takes
 
-from motionloom.datasets.schema import Manifest
+from motionloom.datasets.base.records import Manifest
 from motionloom.pipeline.store.training_log import read_training_log
 
 pytestmark = pytest.mark.slow
@@ -143,7 +143,7 @@ def test_a_changed_loss_is_a_reason(site: Path, command: list[object], run: Path
 
 
 REFUSED = """
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom import register
 from sway import converter, extras, stages
 

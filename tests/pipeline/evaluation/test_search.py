@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 import torch
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Decisions
 from motionloom.datasets.check.suspects import decide
 from motionloom.datasets.loading.statistics import FeatureStats, compute
-from motionloom.datasets.schema import Decisions, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.models.tma.network import Tma, TmaConfig

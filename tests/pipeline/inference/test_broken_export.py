@@ -15,8 +15,8 @@ import pytest
 from rich.console import Console
 from text_samples import tiny_clip, tiny_distilbert
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.build import build_text_cache
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.sampling import SamplingConfig

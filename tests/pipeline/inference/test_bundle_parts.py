@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.lookup import finished_stages, generators_of
 from motionloom.pipeline.contract.stage import GENERATOR
 from motionloom.pipeline.inference.bundle import Bundle

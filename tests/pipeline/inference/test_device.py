@@ -9,7 +9,7 @@ import pytest
 import torch
 from second_device import second_device
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.launch.hardware import Hardware, choose_device

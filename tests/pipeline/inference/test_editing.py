@@ -13,12 +13,12 @@ import torch
 from numpy.typing import NDArray
 from toy_stages import FixedEncoder, MadeStage
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.canonical import canonicalize, ground, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.editing import Filling
 from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
 from motionloom.pipeline.contract.editing import EditTask

@@ -21,13 +21,13 @@ from pydantic import ValidationError
 from scipy.optimize import lsq_linear
 
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body import feet
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.checks import STANDS, standing
 from motionloom.pipeline.inference.motion import GeneratedMotion

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from toy_stages import FixedEncoder, MadeStage
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT
 from motionloom.models.tokenizer.body_hand import H2VQConfig

@@ -19,7 +19,7 @@ import pytest
 import soundfile
 
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import DrivenSegment, Script, sound_of

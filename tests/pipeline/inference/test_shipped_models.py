@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.places import hub_is_away, means_folder, no_such_folder, require_hub_name
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.cli.info import info
 from motionloom.pipeline.cli.main import _exit_code

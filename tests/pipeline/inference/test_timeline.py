@@ -12,9 +12,9 @@ import torch
 from motionloom.datasets.audio import features
 from motionloom.datasets.audio.features import features_of
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition, Conditions
 from motionloom.datasets.modalities.modality import FrameStats
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.synth.dances import DanceConfig
 from motionloom.datasets.synth.music.recording import render_song
 from motionloom.models.condition.mate import MateConfig

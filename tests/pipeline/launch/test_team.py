@@ -25,7 +25,7 @@ from lightning.fabric.strategies.launchers import subprocess_script
 from rich.console import Console
 from watched_training import Jobs, end_of, is_gone, pid_of, until, wait_for_step
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import LOST, TeamError, process_rank, srun_tasks
 from motionloom.pipeline.launch.team import Team, environment, give_time

@@ -19,11 +19,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.body.face import (
     ARKIT,
     EXPRESSIONS,

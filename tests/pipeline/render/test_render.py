@@ -20,9 +20,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from motionloom.datasets.audio.sound import Sound
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import score_of

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from shard_samples import LAYOUT, write_made
 
+from motionloom.datasets.base.records import Caption, Dropped
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, Dropped
 from motionloom.datasets.shards.options import DatasetFacts, WriteOptions
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample

@@ -12,9 +12,9 @@ import pytest
 import torch
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.tokenizer.module import TokenizerModule
 from motionloom.models.tokenizer.single import VqConfig
 from motionloom.models.training.stage_module import OptimConfig

@@ -15,7 +15,7 @@ from rich.console import Console
 from tiny_adversaries import Duel, Vectors
 from toy_stages import register_toys
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.contract.stage import FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.runs.dry_run import replaced_stages

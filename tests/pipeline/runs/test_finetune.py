@@ -16,7 +16,7 @@ from bvh_clips import write_clip
 from rich.console import Console
 from safetensors.torch import load_file
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.lookup import BundleFile
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.runs.api import export_run, run_recipe

@@ -13,8 +13,8 @@ from pydantic import Field
 from rich.console import Console
 from toy_stages import register_toys
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.lock import file_lock
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.stage import RUNTIME, Every, FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.runs.execute import execute
 from motionloom.pipeline.runs.plan import REQUEST_FILE, Selection, make_plan

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.runs.launch_plan import LaunchPlan, SlurmOptions, make_launch_plan
 from motionloom.pipeline.runs.plan import Selection, selected
 from motionloom.pipeline.runs.recipe import load_recipe

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 from toy_stages import register_toys
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.lookup import finished_stages, generators_of
 from motionloom.pipeline.contract.stage import (
     GENERATOR,

@@ -8,8 +8,8 @@ import pytest
 from preempted import write_recipe
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.lock import file_lock
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import load_recipe

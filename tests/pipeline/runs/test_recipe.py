@@ -9,7 +9,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection

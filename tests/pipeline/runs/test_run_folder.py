@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 from toy_stages import register_toys
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import ALIGNMENT, GENERATOR, FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.evaluation.retrieval import retrieve

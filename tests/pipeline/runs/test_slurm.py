@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.runs import slurm
 from motionloom.pipeline.runs.launch_plan import SlurmOptions, make_launch_plan
 from motionloom.pipeline.runs.recipe import load_recipe

@@ -19,7 +19,7 @@ import yaml
 from rich.console import Console
 from safetensors.torch import load_file
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.stage import StageCache, StageContext, stage_kind
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.launch.hardware import Hardware

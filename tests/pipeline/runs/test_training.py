@@ -12,8 +12,8 @@ import pytest
 import torch
 from rank_shares import require_rows
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.plan import ALONE
-from motionloom.datasets.schema import UserError
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.runs.training import training

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.schema import ShardInfo, UserError
+from motionloom.datasets.base.records import ShardInfo
 from motionloom.datasets.shards.checksums import LocalShard
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import JointError

@@ -18,7 +18,7 @@ import pytest
 import soundfile
 from rich.console import Console
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.serve import guard, server
 from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.server import listen

@@ -241,7 +241,7 @@ def test_a_damaged_shard_ends_both_ranks_with_one_sentence(tried: Tried, tmp_pat
     shard.write_bytes(raw)
     words = ["run", tried.recipe, "--out", run, "--until", "tokenizer", "--set", "hardware.devices=2"]
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "motionloom.pipeline.cli.main", *map(str, words)],
+        [sys.executable, "-P", "-m", "motionloom", *map(str, words)],
         capture_output=True, text=True, timeout=240, env={**os.environ, "OMP_NUM_THREADS": "1"},
     )  # fmt: skip
     assert done.returncode == 2, done.stderr

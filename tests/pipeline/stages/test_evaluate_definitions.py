@@ -15,9 +15,9 @@ import torch
 from rich.console import Console
 from text_samples import tiny_clip, tiny_distilbert
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.layout import WRISTS, MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.metrics import retrieval
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache

@@ -21,8 +21,8 @@ from tiny_adversaries import Steps, context
 from torch import Tensor
 from two_ranks import pair_of, work
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.gpt.losses import GptLossConfig
 from motionloom.models.gpt.module import GptModule
 from motionloom.models.gpt.network import GptConfig, InterleavedGPT

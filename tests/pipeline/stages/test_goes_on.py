@@ -25,7 +25,7 @@ from same_stage import (
 from tiny_adversaries import Duel, train
 from two_ranks import pair_of, work
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import Interrupted
 from motionloom.pipeline.launch.team import lead_finds

@@ -22,10 +22,11 @@ from safetensors.torch import load_file, save_file
 from shard_samples import write_made
 from torch import Tensor, nn
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample
 from motionloom.pipeline.evaluation.figures import MODEL, FigureFile
 from motionloom.pipeline.store.evaluator import embed_motions

@@ -16,10 +16,11 @@ import torch.multiprocessing as mp
 from shard_samples import write_made
 from toy_gpt import encode_split
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import FACE, HANDS, Caption, Split
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.datasets.schema import FACE, HANDS, Caption, Split, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.models.gpt.tokens import stream_names

@@ -12,7 +12,7 @@ from lightning.pytorch.loggers.logger import Logger
 from rich.console import Console
 from tiny_adversaries import train
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.tma import TmaStageConfig
 from motionloom.pipeline.store.artifact import Artifact

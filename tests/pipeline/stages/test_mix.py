@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.loading.plan import BatchPlan
-from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, synthesize

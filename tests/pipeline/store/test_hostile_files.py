@@ -21,13 +21,13 @@ import numpy as np
 import pytest
 import torch
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.common.arrays import load_array
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.modality import FrameStats
 from motionloom.datasets.motion.body.smpl import BodyModel
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.index import read_index
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import captions_from_json

@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 from toy_stages import register_toys
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_bytes
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import FunctionStage, StageCache, StageConfig, StageContext
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe

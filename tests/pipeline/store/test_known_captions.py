@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.store.known_captions import (

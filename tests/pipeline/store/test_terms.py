@@ -15,10 +15,11 @@ from bvh_clips import write_clip
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.licences import CMU, CREDITS, UNKNOWN, credits_of, strictest
+from motionloom.datasets.base.records import Manifest
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Manifest, UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.encoder import EncodedText

@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.store.yaml import dump_yaml, load_yaml, read_yaml
 
 CORE: list[tuple[str, Any]] = [

@@ -23,8 +23,8 @@ from same_stage import assert_equal, assert_same_stage
 from tiny_adversaries import train
 from ude_training import train as train_ude
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import HashingFile, remove_temporaries
-from motionloom.datasets.schema import UserError
 from motionloom.models.training import compiled
 from motionloom.pipeline.launch.process import Interrupted
 from motionloom.pipeline.store.training_log import read_training_log

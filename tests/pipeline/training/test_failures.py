@@ -18,7 +18,8 @@ from rich.console import Console
 from second_device import SECOND, WAITS, Far, second_device
 from toy_training import ToyBatches, toy_recipe
 
-from motionloom.datasets.schema import ShardInfo, UserError
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import ShardInfo
 from motionloom.datasets.shards.checksums import LocalShard
 from motionloom.models.training.stage_module import Batch, StepFigures
 from motionloom.pipeline.contract.stage import CompletedStage

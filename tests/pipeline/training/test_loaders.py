@@ -30,10 +30,10 @@ from torch.utils.data import DataLoader
 from torch.utils.data._utils.pin_memory import pin_memory
 from two_ranks import pair_of, work
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.loading.steps import Steps
-from motionloom.datasets.schema import UserError
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig

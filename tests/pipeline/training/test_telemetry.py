@@ -12,8 +12,8 @@ import torch
 from rich.console import Console
 from tiny_adversaries import DIM, Duel, Vectors, train
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
-from motionloom.datasets.schema import UserError
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.stages.results.report_parts import draw_flights
 from motionloom.pipeline.store.run_state import RunState, StageState

@@ -10,9 +10,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.transformer import Block
 from motionloom.models.training.optim import OptimConfig
 from motionloom.pipeline.baselines.fact.module import FactModule

@@ -10,9 +10,9 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import UserError
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.baselines.mld.module import MotionVaeModule

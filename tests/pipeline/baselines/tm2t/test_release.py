@@ -17,9 +17,9 @@ from safetensors.torch import load_file, save_file
 from shard_samples import write_made
 from torch import Tensor, nn
 
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption
 from motionloom.datasets.shards.sample import Sample
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache

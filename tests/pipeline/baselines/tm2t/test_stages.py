@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import HANDS, PRESENT_ALL
 from motionloom.datasets.motion.body.rigid import fit_rigid
 from motionloom.datasets.motion.bvh.motion import write_bvh
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.datasets.schema import HANDS, PRESENT_ALL, UserError
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.evaluation.figures import COMMON_CAPTION, MODEL, NEAREST, OWN_CAPTION, FigureFile
 from motionloom.pipeline.inference.bundle import Bundle

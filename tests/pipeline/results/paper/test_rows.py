@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import run_records as records
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.evaluation.figures import CHANCE, STILL, TRAINING, FigureFile
 from motionloom.pipeline.results.paper.compare import paper_table
 from motionloom.pipeline.results.paper.fill import fill

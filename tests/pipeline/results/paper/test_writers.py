@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from motionloom.datasets.schema import UserError
+from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.evaluation.figures import CHANCE, RECORDED, STILL
 from motionloom.pipeline.results.paper.compare import paper_table, shipped_tables
 from motionloom.pipeline.results.paper.fill import Evaluation, evaluations_of, fill

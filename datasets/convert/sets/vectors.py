@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.canonical import ground
-from motionloom.datasets.schema import UserError
 
 
 def walked(

@@ -22,6 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import Caption
+from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import features_of, require_human
@@ -33,7 +36,6 @@ from motionloom.datasets.motion.canonical import resample
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.features.h3d import encode_h3d
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.datasets.schema import Caption, UserError
 from motionloom.datasets.shards.sample import Sample
 
 FPS = 20.0
@@ -163,3 +165,6 @@ def _joints(stored: NDArray[np.floating]) -> NDArray[np.float64]:
     if stored.ndim == 2:
         return decode(stored, MotionLayout.named("h3d263"))
     return stored.astype(np.float64)
+
+
+register(HumanMl3d)

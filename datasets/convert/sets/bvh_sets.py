@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
+from motionloom.datasets.base.records import Caption
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.captions.options import Listing, list_clips
 from motionloom.datasets.convert.captions.read import CaptionRow
 from motionloom.datasets.convert.common.facts import Facts
 from motionloom.datasets.convert.common.splits import hash_split, read_split_files
 from motionloom.datasets.motion.bvh.joint_map import Unit, Up
-from motionloom.datasets.schema import Caption
 
 
 class Row(NamedTuple):

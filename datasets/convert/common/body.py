@@ -18,6 +18,7 @@ from pydantic import Field
 
 from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_features, rows_at
 from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import content_of
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
@@ -30,7 +31,6 @@ from motionloom.datasets.convert.common.release import Entry, Figure, Release, R
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.motion.layout import BODY_JOINTS
-from motionloom.datasets.schema import UserError
 from motionloom.datasets.shards.sample import Sample
 
 SOUND_SUFFIXES = (".wav", ".flac", ".mp3", ".ogg")

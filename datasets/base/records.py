@@ -1,0 +1,170 @@
+"""The records of a data set: captions, facts of clips, the manifest, decisions about clips.
+
+Everything read from outside (`meta.json`, `manifest.json`) passes through one of these models.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BeforeValidator, Field, PlainSerializer
+
+from motionloom.datasets.base.config import Config, FrameRate
+from motionloom.datasets.base.json_doors import MOST, parse_json
+
+SCHEMA_VERSION = 3
+
+HANDS, FACE = 1, 2
+"""Bits of what a clip has beside its body."""
+PRESENT_ALL = HANDS | FACE
+
+Split = Literal["train", "val", "test"]
+SPLITS: tuple[Split, ...] = get_args(Split)
+MotionType = Literal["float32", "float16"]
+"""Number type of motion in shards."""
+
+MANIFEST_FILE, INDEX_FILE = "manifest.json", "index.npz"
+"""In the folder of a data set, beside its shards."""
+CLEANED_FILE = "cleaned.json"
+"""Beside them where somebody has cleaned the set."""
+REMOVED_FILE = "removed.json"
+"""Beside them where clips were removed from the set."""
+
+# Readers that infer columns from the first rows (Arrow, so Hugging Face `datasets`) refuse a field that is
+# null or of other keys there and filled later: what a clip does not have is stored as a value of its type.
+_Text = Annotated[
+    str | None, BeforeValidator(lambda text: text or None), PlainSerializer(lambda text: text or "")
+]
+"""None is stored as empty text."""
+_Written = Annotated[
+    str, BeforeValidator(lambda text: str(text).encode("utf-8", "backslashreplace").decode())
+]
+"""Bytes of a file's name that are no UTF-8, lone surrogates here, are stored as `\\udc8f`."""
+_End = Annotated[
+    Annotated[float, Field(le=MOST)] | None,
+    BeforeValidator(lambda end: None if end == -1 else end),
+    PlainSerializer(lambda end: -1.0 if end is None else end),
+]
+"""None is stored as -1."""
+_Tokens = Annotated[
+    list[str] | None,
+    BeforeValidator(lambda tokens: (tokens.split() if isinstance(tokens, str) else tokens) or None),
+    PlainSerializer(lambda tokens: " ".join(tokens or ())),
+]
+"""Stored as one text with spaces between, as HumanML3D has them; None is empty text."""
+_Record = Annotated[
+    dict[str, Any] | None,
+    BeforeValidator(lambda record: parse_json(record or "null", "truth") if type(record) is str else record),
+    PlainSerializer(lambda record: "" if record is None else json.dumps(record, allow_nan=False)),
+]
+"""Stored as JSON text, since the keys of one clip are not another's; None is empty text."""
+
+
+class Caption(Config):
+    """One caption of a clip. `start`/`end` are seconds; `end` None means to the end of the clip."""
+
+    text: str
+    start: float = Field(0.0, le=MOST)
+    end: _End = None
+    source: str = ""
+    tokens: _Tokens = None
+    """`word/POS` tags where the source brings them (HumanML3D)."""
+
+
+class ClipMeta(Config):
+    """`meta.json` of one sample: where a clip comes from and what its features mean.
+
+    `MotionLayout.clip_meta` makes one and fills in what the layout knows.
+    """
+
+    id: str
+    source: str
+    split: Split
+    layout: str
+    family: Literal["exact", "h3d", "raw"]
+    fps: FrameRate
+    skeleton: str
+    frames: int
+    licence: str
+    has_hands: bool = True
+    has_face: bool = True
+    mirror_of: _Text = None
+    truth: _Record = None
+    """True content of a synthetic clip (action, direction, side, count, hand, face)."""
+    song: _Text = None
+    """The piece of music of a recorded dance, by the source's name; several clips may have one."""
+
+    @property
+    def present(self) -> int:
+        """`has_hands` and `has_face` as bits."""
+        return HANDS * self.has_hands | FACE * self.has_face
+
+
+class ShardInfo(Config):
+    """One tar file of the manifest."""
+
+    name: str
+    split: Split
+    samples: int
+    frames: int
+    bytes: int
+    sha256: str
+
+
+class Dropped(Config):
+    """A source clip that did not become a sample, and why."""
+
+    source: _Written
+    reason: _Written
+    kind: Literal["rejected", "unreadable", "missing"] = "rejected"
+    """`rejected`: it is in the source, but cannot or must not become a sample. `unreadable`: a file, of
+    motion or of texts, that is damaged. `missing`: listed somewhere, but not in the source."""
+
+
+class Manifest(Config):
+    """`manifest.json` beside the shards; written last, so a folder without one is unfinished."""
+
+    schema_version: int = SCHEMA_VERSION
+    name: str
+    layout: str
+    family: Literal["exact", "h3d", "raw"]
+    fps: FrameRate
+    skeleton: str
+    licence: str
+    converter: str
+    converter_version: int
+    options: dict[str, Any]
+    shards: list[ShardInfo]
+    dropped: list[Dropped] = Field(default_factory=list)
+    licences: dict[str, int] = Field(default_factory=dict)
+    """Clips under each licence, for sources that mix several."""
+    credits: list[str] = Field(default_factory=list)
+    """Sentences that these licences ask for, wherever the data or what was made from it is shown."""
+    audio: dict[str, Any] | None = None
+    """Settings the audio features were made with; a model trained on them keeps these."""
+    notes: list[str] = Field(default_factory=list)
+    excluded: dict[str, str] = Field(default_factory=dict)
+    """Ids of clips that readers skip, and why: what `motionloom data clean` was told to leave out."""
+
+
+class Decisions(Config):
+    """`cleaned.json`, and what the page of `motionloom data clean` saves: verdicts about suspect clips."""
+
+    left_out: dict[str, str] = Field(default_factory=dict)
+    """Id of a clip -> why."""
+    kept: tuple[str, ...] = ()
+    """Ids of suspects that are good, which nobody is asked about again."""
+
+    @classmethod
+    def of(cls, root: Path) -> Decisions:
+        """Read the decisions about a data set; none where it has no file of them."""
+        path = root / CLEANED_FILE
+        return cls.load_json(path) if path.is_file() else cls()
+
+    def then(self, later: Decisions) -> Decisions:
+        """These and `later` ones, which count where a clip is in both."""
+        left_out = {clip: why for clip, why in self.left_out.items() if clip not in later.kept}
+        left_out |= later.left_out
+        return Decisions(left_out=left_out, kept=tuple(sorted({*self.kept, *later.kept} - {*left_out})))

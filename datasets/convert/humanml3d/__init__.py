@@ -1,0 +1,1 @@
+"""AMASS to shards."""

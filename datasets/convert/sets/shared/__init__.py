@@ -1,1 +1,0 @@
-"""Base converters of published sets, and readers of their lists and vectors."""
