@@ -10,9 +10,12 @@ from typing import Annotated, Any, TypeVar
 
 import typer
 from pydantic_core import to_jsonable_python
+from typer.core import TyperGroup
+from typer.main import get_command
 
 from motionloom.datasets.base.config import require_local
 from motionloom.datasets.base.errors import UserError, nearest
+from motionloom.pipeline.contract.command import COMMANDS
 
 ModelFolder = Annotated[
     str,
@@ -43,8 +46,36 @@ Workers = Annotated[int, typer.Option(help="Processes; the shards are the same b
 F = TypeVar("F", bound=Callable[..., object])
 
 
+class Group(TyperGroup):
+    """The commands of a `Commands`, and those of `COMMANDS` that belong to its group, each built when it is
+    asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*self.commands, *self._added(ctx)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        added = self._added(ctx)
+        if cmd_name not in added:
+            return super().get_command(ctx, cmd_name)
+        app = Commands(add_completion=False, rich_markup_mode="markdown")
+        app.command(cmd_name)(COMMANDS[added[cmd_name]].function)
+        return get_command(app)
+
+    def _added(self, ctx: Any) -> dict[str, str]:
+        """Names in `COMMANDS` by the word that is typed in this group; nothing is imported for it."""
+        group = ctx.command_path.split()[1:]
+        words = {name: name.split() for name in COMMANDS}
+        added = {word: name for name, (*before, word) in words.items() if before == group}
+        for word in added.keys() & self.commands.keys():
+            raise UserError(f"command '{added[word]}': motionloom has one of this name; choose a new one")
+        return added
+
+
 class Commands(typer.Typer):
     """A `typer.Typer` whose commands refuse a URL for any of their paths before they do anything."""
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(**{"cls": Group, **how})
 
     def command(self, name: str | None = None) -> Callable[[F], F]:  # type: ignore[override]
         decorate = super().command(name)

@@ -9,10 +9,13 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
 from motionloom.datasets.base import register
 from motionloom.datasets.base.errors import UserError
+from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.contract import stage
+from motionloom.pipeline.contract.command import COMMANDS
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.store.artifact import Artifact
 
@@ -57,6 +60,28 @@ def test_a_declared_kind_is_imported_when_it_is_used(tmp_path: Path, monkeypatch
         register.declare("stage kind", {"swing": "other"})
     with pytest.raises(UserError, match="another one"):
         register.register(stage.FunctionStage("mdm", "a stranger", stage.StageConfig, print))
+
+
+@pytest.mark.parametrize("words", [["hop"], ["data", "hop"]])
+def test_a_declared_command_is_imported_when_it_is_asked_for(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "swing.py").write_text(
+        "from motionloom.datasets.base.register import register\n"
+        "from motionloom.pipeline.contract.command import Command\n"
+        "def hop(times: int):\n    print('hop ' * times)\n"
+        f"register(Command('{' '.join(words)}', hop))"
+    )
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.setattr(COMMANDS, "_things", {})
+    monkeypatch.setitem(register._DECLARED, "command", register._Declared({" ".join(words): "swing"}))
+    run = CliRunner().invoke
+    assert "hop" not in run(app, ["info", "--help"]).output and "swing" not in sys.modules
+    assert run(app, [*words, "2"]).output == "hop hop \n"
+    assert "hop" in run(app, [*words[:-1], "--help"]).output
+    register.declare("command", {"data join": "swing"})
+    with pytest.raises(UserError, match="'data join': motionloom has one"):
+        run(app, ["data", "--help"], catch_exceptions=False)
 
 
 def test_what_was_taken_out_of_the_installation_is_not_missed(monkeypatch: pytest.MonkeyPatch) -> None:
