@@ -40,7 +40,6 @@ from motionloom.pipeline.cli.options import (
     print_json,
     set_option,
 )
-from motionloom.pipeline.cli.search import search
 from motionloom.pipeline.launch.console import SafeConsole, make_console, quiet_libraries
 from motionloom.pipeline.launch.process import Interrupted, JointError, TeamError, leave, process_rank
 
@@ -248,7 +247,6 @@ def serve(
 
 
 app.command()(evaluate)
-app.command()(search)
 
 
 @app.command()

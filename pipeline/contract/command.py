@@ -1,11 +1,11 @@
 """Commands that a package adds to the command line, beside `run`, `generate` and the others.
 
-    # my_package/commands.py
-    register(Command("mine", mine))              # motionloom mine …
-    register(Command("data mine", mine_data))    # motionloom data mine …
+# my_package/commands.py
+register(Command("mine", mine))              # motionloom mine …
+register(Command("data mine", mine_data))    # motionloom data mine …
 
-    # my_package/table.py, which the entry point names: the command's module is imported where it is asked for
-    declare("command", {"mine": "my_package.commands", "data mine": "my_package.commands"})
+# my_package/table.py, which the entry point names: the command's module is imported where it is asked for
+declare("command", {"mine": "my_package.commands", "data mine": "my_package.commands"})
 """
 
 from __future__ import annotations

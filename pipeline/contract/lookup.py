@@ -21,6 +21,7 @@ from motionloom.pipeline.contract.stage import (
     Stage,
     StageKind,
     stage_kind,
+    stage_kinds,
 )
 from motionloom.pipeline.store.files import read_record
 from motionloom.pipeline.store.run_folder import (
@@ -194,6 +195,8 @@ def open_exported(folder: Path, what: str = GENERATOR) -> list[CompletedStage]:
         record = reader.find(folder / name) if re.fullmatch(STAGE_NAME, name) else None
         if record is None:
             raise UserError(not_here(folder, name))
+        if what == CAPTIONER and record.kind not in stage_kinds():
+            continue  # a model generates where the folder of its captioner was taken out
         stage = _finished(record, made)
         if not stage.gives(what):
             does = "captions" if what == CAPTIONER else "generates"

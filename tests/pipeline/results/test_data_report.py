@@ -24,7 +24,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.shards.writer import write_dataset
 from motionloom.datasets.synth.generate import SynthConfig, make_clip, make_sample, split_of
-from motionloom.pipeline.results.clean_page import suspects_of
+from motionloom.pipeline.curation.clean_page import suspects_of
 from motionloom.pipeline.results.data_page import to_watch, write_data_report
 
 NASTY = "</script><script>window.hacked=1</script><img src=x onerror='window.hacked=1'><b>bold</b> & \"q\""

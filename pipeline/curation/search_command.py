@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.register import register
 from motionloom.pipeline.cli.options import AsJson, print_json
+from motionloom.pipeline.contract.command import Command
 from motionloom.pipeline.launch.console import make_console, say
 
 _CLIPS = 12
@@ -38,7 +40,7 @@ def search(
     console = make_console(aside=as_json)
     if bool(words) == bool(like):
         raise UserError("search: give words or --like, one of them")
-    from motionloom.pipeline.evaluation.search import Search
+    from motionloom.pipeline.curation.search import Search
 
     found = Search.open(root, model, progress=True)
     file = Path(like)
@@ -56,3 +58,6 @@ def search(
         hits.append({"id": hit.id, "split": hit.place.split, "score": hit.score, "caption": caption})
     if as_json:
         print_json(hits)
+
+
+register(Command("search", search))

@@ -16,13 +16,13 @@ import torch
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Decisions
-from motionloom.datasets.check.suspects import decide
 from motionloom.datasets.loading.statistics import FeatureStats, compute
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.models.tma.network import Tma, TmaConfig
-from motionloom.pipeline.evaluation import search as searching
-from motionloom.pipeline.evaluation.search import INDEX_FILE, Search, alignment_model
+from motionloom.pipeline.curation import search as searching
+from motionloom.pipeline.curation.search import INDEX_FILE, Search, alignment_model
+from motionloom.pipeline.curation.suspects import decide
 from motionloom.pipeline.store.networks import LoadedTma
 
 

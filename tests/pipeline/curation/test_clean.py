@@ -16,13 +16,13 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Caption, Decisions, Split
 from motionloom.datasets.check.dataset import examine
 from motionloom.datasets.check.faults import motion_faults
-from motionloom.datasets.check.suspects import decide, find_suspects, open_splits, undo
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.sample import Sample
 from motionloom.datasets.synth.generate import SynthConfig, make_clip
+from motionloom.pipeline.curation.suspects import decide, find_suspects, open_splits, undo
 from motionloom.pipeline.runs.api import run_recipe
 
 CONFIG = SynthConfig(clips=30, seed=3, layout="body133")

@@ -22,7 +22,6 @@ from motionloom.datasets.base.json_doors import read_plain
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.base.records import HANDS, PRESENT_ALL
 from motionloom.datasets.check.faults import Fault
-from motionloom.datasets.check.suspects import Place, Splits, floored_joints, open_splits
 from motionloom.datasets.motion.canonical import canonicalize, resample
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
@@ -33,6 +32,7 @@ from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tar import npy_from_bytes
 from motionloom.pipeline.contract.lookup import finished_stages, open_exported
 from motionloom.pipeline.contract.stage import ALIGNMENT, StageCache
+from motionloom.pipeline.curation.suspects import Place, Splits, floored_joints, open_splits
 from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model

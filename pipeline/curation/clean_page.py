@@ -13,7 +13,7 @@ from pathlib import Path
 
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.base.records import Decisions
-from motionloom.datasets.check.suspects import Place, Splits, Suspect, find_suspects, open_splits, ranked
+from motionloom.pipeline.curation.suspects import Place, Splits, Suspect, find_suspects, open_splits, ranked
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.results.data_page import watch
@@ -29,7 +29,7 @@ def suspects_of(root: Path, model: str | None = None, *, progress: bool = False)
     suspects = find_suspects(open_splits(root), kept, progress=progress)
     if model is None:
         return suspects
-    from motionloom.pipeline.evaluation.search import Search
+    from motionloom.pipeline.curation.search import Search
 
     search = Search.open(root, model, progress=progress)
     by_id = {suspect.id: suspect for suspect in suspects.values()}

@@ -1,0 +1,9 @@
+"""The commands of this folder: which module registers each."""
+
+from __future__ import annotations
+
+from motionloom.datasets.base.register import declare
+
+_HERE = "motionloom.pipeline.curation"
+
+declare("command", {"search": f"{_HERE}.search_command", "data clean": f"{_HERE}.clean_command"})
