@@ -201,3 +201,20 @@ def test_the_wheel_says_what_pyproject_says(wheel: Path) -> None:
     parser.read_string(points)
     groups = {"console_scripts": PROJECT["scripts"], **PROJECT["entry-points"]}
     assert {group: dict(parser[group]) for group in parser.sections()} == groups
+
+
+@pytest.mark.parametrize(
+    ("message", "fine"),
+    [
+        ("Part: why\n\nBecause.\n# a comment", 1),
+        ("x" * 73 + "\n\nBecause.", 0),
+        ("a; b\n\nBecause.", 0),
+        ("No", 0),
+    ],
+)
+def test_a_commit_has_one_subject_and_a_body(tmp_path: Path, message: str, fine: int) -> None:
+    (tmp_path / "message").write_text(message)
+    done = subprocess.run(
+        [ROOT / ".ci/commit-message", tmp_path / "message"], capture_output=True, check=False
+    )
+    assert done.returncode == 1 - fine and bool(done.stderr) != bool(fine)
