@@ -19,12 +19,14 @@ from torch import Tensor
 from motionloom.datasets.base.config import Config
 from motionloom.models.gpt.tokens import PAD, TokenNetwork
 from motionloom.models.tokenizer.base import Tokenizer
-from motionloom.models.training.distributed import masked_mean
+from motionloom.models.training.distributed import masked_mean, mean_of_rows
 
 
 class GptLossConfig(Config):
-    """Weight and temperatures of the alignment term."""
+    """The cross-entropy's mean, and weight and temperatures of the alignment term."""
 
+    per_clip: bool = False
+    """Every clip counts alike, as in T2M-GPT's public code; otherwise every token does."""
     align_weight: float = Field(default=0.1, ge=0)
     """eta [ours]; 0 turns L_align off, and the tokenizer and TMA are then not needed."""
     align_from: int = Field(default=0, ge=0)
@@ -38,6 +40,7 @@ class GptLossConfig(Config):
     gumbel_temperature: float = Field(default=1.0, gt=0)
     """Temperature of the drawn codes, for `align_on: predictions`."""
     temperature: float = Field(default=0.1, gt=0)
+    """Of L_align [ours]; the paper states none."""
     threshold: float | None = Field(default=0.85, ge=-1, le=1)
     """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
 
@@ -51,9 +54,15 @@ def predicted(tokens: Tensor, logits: Tensor, known: Tensor | None = None) -> Te
     return free if known is None else free & known
 
 
-def cross_entropy(logits: Tensor, tokens: Tensor, known: Tensor | None = None) -> Tensor:
-    """Mean over the `predicted` tokens of all ranks; logits [B, L, V], tokens int64 [B, L] padded with -1."""
-    return masked_mean(token_errors(logits, tokens), predicted(tokens, logits, known))
+def cross_entropy(
+    logits: Tensor, tokens: Tensor, known: Tensor | None = None, *, per_clip: bool = False
+) -> Tensor:
+    """Mean over the `predicted` tokens of all ranks; logits [B, L, V], tokens int64 [B, L] padded with -1.
+
+    With `per_clip` it is the mean over the clips of each clip's own mean.
+    """
+    errors, mask = token_errors(logits, tokens), predicted(tokens, logits, known)
+    return mean_of_rows(errors[..., None], mask) if per_clip else masked_mean(errors, mask)
 
 
 def token_errors(logits: Tensor, tokens: Tensor) -> Tensor:

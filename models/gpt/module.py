@@ -66,7 +66,7 @@ class GptModule(StageModule):
             if config.pkeep < 1:
                 inputs = corrupt(tokens, kinds, net.ends, config.pkeep)
         logits = net(tokens, kinds, text, inputs=inputs, drop_text=drop, known=known)
-        ce = cross_entropy(logits, tokens, known)
+        ce = cross_entropy(logits, tokens, known, per_clip=self.loss_config.per_clip)
         values = {"loss": ce, "ce": ce}
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)

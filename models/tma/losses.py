@@ -20,13 +20,14 @@ from motionloom.models.training.distributed import gather_rows, gather_rows_with
 
 
 class TmaLossConfig(Config):
-    """Weights of the loss terms and the negative filter; the defaults are the paper's."""
+    """Weights of the loss terms and the negative filter; the defaults but `temperature` are the paper's."""
 
     reconstruction: float = Field(default=1.0, ge=0)
     kl: float = Field(default=1e-5, ge=0)
     latent: float = Field(default=1e-5, ge=0)
     contrastive: float = Field(default=0.1, ge=0)
     temperature: float = Field(default=0.1, gt=0)
+    """Of the contrastive loss [ours]; the paper states none."""
     threshold: float | None = Field(default=0.85, ge=-1, le=1)
     """Captions with a higher sBERT cosine are not negatives of each other; null keeps all negatives."""
 

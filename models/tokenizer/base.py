@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from functools import cached_property
 from typing import Literal, NamedTuple, Self, TypedDict
 
 import torch
@@ -52,6 +53,8 @@ class TokenizerConfig(Config):
     recon: Recon = "l2"
     velocity_weight: float = Field(default=0.0, ge=0)
     """Weight of the same reconstruction error between frame-to-frame differences."""
+    position_weight: float = Field(default=0.0, ge=0)
+    """Weight of the same reconstruction error of the joints' positions alone, as in T2M-GPT's public code."""
     root_gain: float = Field(default=1.0, gt=0)
     """Weight of the root's columns relative to others [ours]; see `layers/basis.py`."""
     finger_gain: float = Field(default=0.0, ge=0)
@@ -174,6 +177,12 @@ class Tokenizer(nn.Module, ABC):
         """Bits that the codes of one second of motion carry, so that tokenizers compare fairly."""
         groups = self.layout.fps / GROUP_FRAMES
         return groups * sum(s.per_group * math.log2(s.num_codes) for s in self.streams)
+
+    @cached_property
+    def position_columns(self) -> list[int]:
+        """Those of its columns that are positions of joints."""
+        positions = range(self.layout.dim)[self.layout.slice("positions")]
+        return [at for at, column in enumerate(self.columns.tolist()) if column in positions]
 
     def select(self, x: Tensor) -> Tensor:
         """The columns this tokenizer models, [..., D of the layout] -> [..., dim]."""

@@ -42,8 +42,9 @@ def tokenizer_losses(net: Tokenizer, batch: Batch) -> tuple[dict[str, Tensor], T
     """Losses of {"motion" [B, W, dim], "length" [B], "present" bool [B, dim] (optional: all)}, and what they
     are of; what is weighed how is in the network's own config. A batch that is "full" needs no mask.
 
-    Entries: loss = recon + velocity_weight * velocity + commitment * commit; recon, commit, velocity if it
-    has a weight, and per stream `perplexity_<stream>`, `usage_`, `dead_`, `resets_`, `penalty_`.
+    Entries: loss = recon + commitment * commit + velocity_weight * velocity + position_weight * position;
+    each of those with a weight, and per stream `perplexity_<stream>`, `usage_`, `dead_`, `resets_`,
+    `penalty_`.
     """
     motion, length, present = batch["motion"], batch["length"], batch.get("present")
     if batch.get("full", False):
@@ -56,6 +57,11 @@ def tokenizer_losses(net: Tokenizer, batch: Batch) -> tuple[dict[str, Tensor], T
     if config.velocity_weight > 0:
         terms["velocity"] = velocity_loss(made, target, length, config.recon, present)
         loss = loss + config.velocity_weight * terms["velocity"]
+    if config.position_weight > 0:
+        at = net.position_columns
+        held = None if present is None else present[:, at]
+        terms["position"] = reconstruction_loss(made[..., at], target[..., at], length, config.recon, held)
+        loss = loss + config.position_weight * terms["position"]
     return {"loss": loss, **terms, **out.metrics}, out
 
 

@@ -71,9 +71,27 @@ def shipped_recipes() -> dict[str, Path]:
 
 
 def published_settings() -> dict[str, Tree]:
-    """Settings of the baselines' papers and code by kind: `stage`, `judged`, `text`, `ours`."""
+    """The rows of `published.yaml` by model, lengths of trainings in steps."""
     table: dict[str, Tree] = read_yaml(Path(__file__).with_name("published.yaml"))
-    return table
+    out: dict[str, Tree] = _in_steps(table)
+    return out
+
+
+def _in_steps(tree: Any) -> Any:
+    """Settings whose epochs over a number of clips became steps, at any depth."""
+    if not isinstance(tree, dict):
+        return tree
+    train, out = tree.get("train"), {key: _in_steps(value) for key, value in tree.items()}
+    if isinstance(train, dict) and "epochs" in train:
+        per_epoch = train["clips"] / train["batch_size"]
+        kept = {key: value for key, value in train.items() if key not in ("epochs", "clips")}
+        out["train"] = {**kept, "steps": round(train["epochs"] * per_epoch)}
+        for key, value in tree.items():
+            if isinstance(value, dict) and "drop_epochs" in value:
+                steps = [round(epoch * per_epoch) for epoch in value["drop_epochs"]]
+                rest = {name: one for name, one in value.items() if name != "drop_epochs"}
+                out[key] = {**rest, "drop_at": steps}
+    return out
 
 
 def find_recipe(name_or_path: str) -> Path:

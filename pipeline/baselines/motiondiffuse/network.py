@@ -120,7 +120,10 @@ class Layer(nn.Module):
         self.frames = Attend(config)
         self.caption = Attend(config, config.caption.dim)
         self.feed = nn.Sequential(
-            nn.Linear(dim, config.ff), nn.GELU(), nn.Dropout(config.dropout), nn.Linear(config.ff, dim)
+            nn.Linear(dim, config.ff),
+            nn.GELU(),
+            nn.Dropout(config.dropout),
+            zeroed(nn.Linear(config.ff, dim)),
         )
         self.styles = nn.ModuleList(Stylization(dim, 4 * dim, config.dropout) for _ in range(3))
 

@@ -84,6 +84,7 @@ class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, M
 
     name = "motiondiffuse"
     summary = "MotionDiffuse"
+    version = 2  # feed-forwards begin at zero
     trainer = "motionloom.models.diffusion.module:DenoiserModule"
     config = MotionDiffuseStageConfig
     offers = frozenset({GENERATOR})

@@ -194,3 +194,14 @@ def test_hand_over_is_checked() -> None:
     wide = {**batch, "text": torch.randn(4, 16), "tma_text": torch.randn(4, 12)}
     with pytest.raises(UserError, match="width 16"):
         module.losses(wide)
+
+
+def test_every_clip_may_count_alike() -> None:
+    """T2M-GPT's public code: the mean over clips of each clip's mean, here of three tokens and of one."""
+    logits = torch.randn(2, 3, 5)
+    tokens = torch.tensor([[1, 2, 3], [4, PAD, PAD]])
+    rows = [
+        torch.nn.functional.cross_entropy(some, known[known != PAD])
+        for some, known in ((logits[0], tokens[0]), (logits[1, :1], tokens[1]))
+    ]
+    assert torch.allclose(cross_entropy(logits, tokens, per_clip=True), torch.stack(rows).mean())

@@ -57,12 +57,16 @@ def test_total_is_the_weighted_sum() -> None:
     def losses(**config: float) -> dict[str, Tensor]:
         net = nn.Module()
         net.config = VqConfig(**config)  # type: ignore[assignment, arg-type]
+        net.position_columns = [1, 2]  # type: ignore[assignment]
         net.forward = lambda *_: TokenizerOutput(b, a, penalty, {}, {})
         return TokenizerModule(net, OptimConfig(), seed=0, max_steps=1).losses({"motion": b, "length": None})
 
     terms = losses(alpha=0.5, velocity_weight=2.0)
     assert set(terms) == {"loss", "recon", "commit", "velocity"}
     torch.testing.assert_close(terms["loss"], terms["recon"] + 2 * terms["velocity"] + 0.5 * penalty)
+    # T2M-GPT's public code: the same error of the positions' columns alone, beside that of all.
+    terms = losses(position_weight=0.5, alpha=0.0)
+    torch.testing.assert_close(terms["loss"], terms["recon"] + 0.5 * (a - b)[..., 1:].square().mean())
     plain = losses(alpha=0.02)
     assert set(plain) == {"loss", "recon", "commit"}
     torch.testing.assert_close(plain["loss"], (a - b).square().mean() + 0.08)

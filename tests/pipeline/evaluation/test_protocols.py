@@ -61,9 +61,9 @@ def test_paper_recipes_evaluate_all_clips(name: str) -> None:
 
 
 def test_settings_of_ude_that_the_documents_declare() -> None:
-    """docs/papers.md: top-p, deviations of columns, the discriminator's width and Adam."""
+    """docs/papers.md: deviations of columns, the discriminator's width and Adam."""
     configs: dict[str, Any] = {stage.name: stage.config for stage in load_recipe("ude-paper").stages}
-    assert configs["evaluate"].sampling.top_p == 0.95 and not configs["stats"].group
+    assert configs["evaluate"].sampling.top_p == 1.0 and not configs["stats"].group
     loss = configs["utt"].loss
     assert loss.discriminator.ff == 2048 and loss.discriminator_optim.betas == (0.5, 0.99)
     assert configs["utt"].optim.betas == (0.9, 0.999)
