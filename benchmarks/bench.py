@@ -29,6 +29,7 @@ from rich.console import Console
 
 from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.base.files import write_json
+from motionloom.pipeline.contract.stage import KINDS, stage_kinds
 from motionloom.pipeline.evaluation.estimate import estimate
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.runs.api import run_recipe
@@ -151,6 +152,7 @@ def report(
             "command": command or f"python benchmarks/{Path(sys.argv[0]).name} {shlex.join(sys.argv[1:])}",
             "versions": {"python": platform.python_version()} | versions,
             "cpu_seconds": round(process_seconds()),
+            "code": {kind.name: kind.version for kind in KINDS.imported()},
         }
         path.write_text(json.dumps(facts | record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         print(path)
@@ -168,7 +170,41 @@ def table_of(record: Record) -> str:
         short = f" ({count} seed{'s' * (count > 1)})" if 0 < count < len(SEEDS) else ""
         variant = f" [{', '.join(row['variant'])}]" if row.get("variant") else ""
         lines.append([row["title"] + variant + short, *cells])
-    return markdown(head, lines) + _protocol(record)
+    return markdown(head, lines) + _older(record) + _protocol(record)
+
+
+def older_rows(record: Record) -> dict[str, str]:
+    """Title of each row that was measured by code which is another today -> of which kinds of stages.
+
+    A row knows the versions of the kinds that it measured, or else the record those that its script used.
+    """
+    out = {}
+    for row in record["rows"]:
+        code = row.get("code", record.get("code"))
+        if code is None and "seeds" in row:  # of trainings, measured before records knew their code
+            out[row["title"]] = f"of commit {record.get('commit', 'unknown')}"
+        elif changed := [
+            f"{kind} {version}" for kind, version in (code or {}).items() if _version(kind) != version
+        ]:
+            out[row["title"]] = ", ".join(changed)
+    return out
+
+
+def _version(kind: str) -> int:
+    """Today's version of a kind; 0 where there is none of that name any more."""
+    return stage_kinds()[kind].version if kind in stage_kinds() else 0
+
+
+def _older(record: Record) -> str:
+    """A line below the table that names the rows of older code."""
+    groups: dict[str, list[str]] = defaultdict(list)
+    for title, why in older_rows(record).items():
+        groups[why].append(title)
+    names = [
+        why if len(titles) == len(record["rows"]) else f"{', '.join(titles)} ({why})"
+        for why, titles in groups.items()
+    ]
+    return f"\n\n*Of older code: {'; '.join(names)}.*" if names else ""
 
 
 def _title(column: Mapping[str, Any], rows: Sequence[Record]) -> str:
@@ -185,10 +221,15 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def shown(values: Any, column: Mapping[str, Any]) -> str:
-    """A cell: text as it is, a value, or the mean over seeds with its 95 % interval (Student's t)."""
+    """A cell: text as it is, a value, both of two, or the mean over seeds with its 95 % interval (Student's
+    t), which of two values would say little.
+    """
     if not isinstance(values, list):
         return str(values)
-    digits, found = column["digits"], estimate([column["scale"] * value for value in values])
+    digits, scaled = column["digits"], [column["scale"] * value for value in values]
+    if len(scaled) == 2:
+        return f"{scaled[0]:.{digits}f} and {scaled[1]:.{digits}f}"
+    found = estimate(scaled)
     half = "" if found.interval is None else f" ± {found.interval:.{digits}f}"
     return f"{found.value:.{digits}f}{half}"
 

@@ -4,9 +4,10 @@
     python benchmarks/results.py --collect RUN...    # first makes records of runs of one recipe
 
 A record is a table: its title, day, commit, command, protocol, columns, and rows whose cells are values, one
-a seed, or text (`imported`: of an earlier journal, not measured again). Several values are shown as their
-mean with a 95 % interval by Student's t over seeds. In the page, the table after the comment `<!--name-->` is
-that of the record `name`; the text around the tables is edited in the page and holds no measured figure.
+a seed, or text. A row knows the versions of the kinds of stages that it measured; where today's are others,
+the page says "of older code". Two values are both shown, several as their mean with a 95 % interval by
+Student's t over seeds. In the page, the table after the comment `<!--name-->` is that of the record `name`;
+the text around the tables is edited in the page and holds no measured figure.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from motionloom.pipeline.contract.stage import stage_kinds
 from motionloom.pipeline.evaluation.figures import (
     FILE_NAME,
     MODEL,
+    NEAREST_LABELS,
     NEAREST_MUSIC,
     NEAREST_WORDS,
     RECORDED,
@@ -32,7 +34,7 @@ from motionloom.pipeline.store.run_state import StageRecord, finished_records
 from motionloom.pipeline.store.yaml import flatten
 
 PAGE = HERE.parent / "docs" / "results.md"
-TABLE = re.compile(r"(<!--(\w+)-->\n)(?:\|.*\n)*(?:\n\*Measured .*\n)?")
+TABLE = re.compile(r"(<!--(\w+)-->\n)(?:\|.*\n)*(?:\n\*Of older code.*\n)?(?:\n\*Measured .*\n)?")
 """The name of a record, and what stands below it: the table, and the line that says how it was measured."""
 
 
@@ -50,7 +52,11 @@ TEXT = (
       for name, digits in (("FID", 1), ("Div", 2), ("MM", 2)) for kind in "km"),
 )  # fmt: skip
 MUSIC = (Column("Beat Align", "beat_align.bailando", 3), *TEXT[1:])
-ANSWERS = {"recorded": RECORDED, "nearest training caption": NEAREST_WORDS}
+ANSWERS = {
+    "recorded": RECORDED,
+    "nearest training labels": NEAREST_LABELS,
+    "nearest training caption": NEAREST_WORDS,
+}
 VARIANTS = {
     "GPT": "greedy",
     "GPT with z": "greedy_z",
@@ -153,7 +159,7 @@ def row_of(run: Path, table: Table, title: str) -> Record:
     """The cells of a row, one value for each seed that has finished, and how it was measured."""
     stage, row = table.rows[title]
     cells: dict[str, list[float]] = {}
-    seeds, protocol, candidates, variant = [], {}, {}, list[str]()
+    seeds, protocol, candidates, variant, code = [], {}, {}, list[str](), dict[str, int]()
     for seed in SEEDS if row == MODEL else SEEDS[:1]:
         folder = run / "stages" / f"{stage}_{seed}"
         if seed == SEEDS[0] and (run / "stages" / stage).is_dir():  # of a recipe that has one
@@ -174,10 +180,12 @@ def row_of(run: Path, table: Table, title: str) -> Record:
         if found and row == MODEL:
             model = finished_records(run).get(found.about.get("made_by", {}).get("generator", ""))
             protocol |= {"steps": steps_of(model)}
+            measured = [finished_records(run).get(folder.name), model]
+            code |= {one.kind: one.version for made in measured if made for one in (made, *made.upstream())}
             variant = unlike_published(model.kind, model.config) if model else []
     drawn = {k: v for k, v in protocol.items() if k in PROTOCOL or k.startswith("sampling")}
     facts = {"protocol": drawn, "candidates": candidates, "variant": variant}
-    return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], **facts}
+    return {"title": title, "cells": cells, "seeds": seeds if row == MODEL else [], "code": code, **facts}
 
 
 def steps_of(model: StageRecord | None) -> str | int:

@@ -82,6 +82,10 @@ class Table(Mapping[str, T]):
         if name not in self._things:
             raise UserError(f"{module}: registers no {self.called} '{name}', which was declared of it")
 
+    def imported(self) -> list[T]:
+        """The things whose modules are imported already."""
+        return list(self._things.values())
+
     def follow(self, do: Callable[[T], object]) -> None:
         """Call `do` with each thing that is imported and each that comes; a `UserError` of it refuses one."""
         for thing in list(self._things.values()):
