@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -36,6 +36,25 @@ class Bars:
     values: NDArray[np.float64] | NDArray[np.int64]
     x_label: str
     y_label: str
+
+
+@dataclass(frozen=True)
+class JointErrors:
+    """The error of each joint of a human figure."""
+
+    title: str
+    skeleton: str
+    errors: Mapping[str, float]
+    """mm by the joint's name; joints that no clip has are left out."""
+
+
+@dataclass(frozen=True)
+class Confusions:
+    """How often one thing was shown where another was asked for."""
+
+    title: str
+    counts: Mapping[str, Mapping[str, int]]
+    """Asked for -> shown -> clips."""
 
 
 @dataclass(frozen=True)

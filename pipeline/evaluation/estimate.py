@@ -1,9 +1,9 @@
 """Intervals: how far a figure may be off by chance, 95 % of the time.
 
 One function for all figures. Repeated measurements of a whole set, [R], vary with the draws of the model and
-of the batches: Student's t over the repeats. What is measured clip by clip, [R, n], varies with the clips as
-well, which the repeats draw again and again: a bootstrap over clips, each taken with all of its repeats, with
-the quantile of Student's t for n clips.
+of the batches: Student's t over three repeats or more, and both values of two. What is measured clip by clip,
+[R, n], varies with the clips as well, which the repeats draw again and again: a bootstrap over clips, each
+taken with all of its repeats, with the quantile of Student's t for n clips.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def estimate(values: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
     measured = np.asarray(values, dtype=np.float64)
     # Repeats of a whole set: they vary with the draws alone.
     if measured.ndim == 1:
-        return Estimate(float(measured.mean()), *_over_repeats(measured))
+        return _over_repeats(measured)
     finite = np.isfinite(measured)
     weight = np.where(finite, 1.0 if weights is None else np.asarray(weights, dtype=np.float64), 0.0)
     # A clip counts once, with the sum of its repeats: repeats of one clip are no further clips.
@@ -42,22 +42,23 @@ def estimate(values: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
     each = weight.sum(0)
     total, each = total[each > 0], each[each > 0]
     mean = float(total.sum() / each.sum())
-    if len(each) < 2:
-        return Estimate(mean, *_over_repeats(measured[:, finite.any(0)].ravel()))
-    if np.ptp(total / each) == 0.0:  # nothing varied
-        return Estimate(mean)
+    if len(each) < 2 or np.ptp(total / each) == 0.0:  # nothing varied
+        return Estimate(mean, count=len(each))
     counts = _resamples(len(each))
     spread = float(((counts @ total) / (counts @ each)).std())
     # A bootstrap's variance is (n - 1) / n of the sample's.
     spread *= np.sqrt(len(each) / (len(each) - 1))
-    return Estimate(mean, _quantile(len(each)) * spread, "clips")
+    return Estimate(mean, _quantile(len(each)) * spread, "clips", len(each))
 
 
-def _over_repeats(values: NDArray[np.float64]) -> tuple[float | None, str]:
+def _over_repeats(values: NDArray[np.float64]) -> Estimate:
+    mean = float(values.mean())
     if len(values) < 2 or np.ptp(values) == 0.0:  # nothing varied
-        return None, ""
+        return Estimate(mean)
+    if len(values) == 2:  # Student's t of one degree of freedom would multiply their difference by six
+        return Estimate(mean, over="repeats", pair=tuple(values.tolist()))
     half = _quantile(len(values)) * values.std(ddof=1) / np.sqrt(len(values))
-    return float(half), "repeats"
+    return Estimate(mean, float(half), "repeats")
 
 
 def _quantile(count: int) -> float:

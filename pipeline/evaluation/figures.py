@@ -72,6 +72,10 @@ class Estimate:
     interval: float | None = None
     over: str = ""
     """The units that the interval is over: clips or repeats."""
+    count: int = 0
+    """Clips that it is a mean over; 0 of a figure of the whole set."""
+    pair: tuple[float, ...] = ()
+    """Both values where two repeats were all: two say nothing of a spread."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,9 @@ class Metric:
     """"share" is shown in percent."""
 
 
+FEW = 10
+"""Clips below which a figure says nothing, and candidates up to which a retrieval does not **[ours]**."""
+DASH = "–"
 _NOTHING_SAID = 0.5
 """Half of an interval of a share from which it may be nearly anything."""
 
@@ -109,14 +116,32 @@ class Figure:
     """The units that the interval is over: clips or repeats."""
     note: str = ""
     """Why the figure is not to be trusted."""
+    count: int = 0
+    """Clips that it is a mean over; 0: all of the protocol."""
+    pair: tuple[float, ...] = ()
+    """Both values where two repeats were all."""
+
+    @property
+    def nothing(self) -> str:
+        """Why it is shown as a dash, where it says nothing; else empty."""
+        clips = self.count or self.protocol.get("clips")
+        if isinstance(clips, int) and clips < FEW:
+            return f"of fewer than {FEW} clips"
+        among = self.protocol.get("candidates")
+        if isinstance(among, int) and among <= FEW:
+            return f"among {among}, which tells nothing"
+        if self.unit == "share" and (self.interval or 0.0) >= _NOTHING_SAID:
+            return f"too few {self.over}"
+        return ""
 
     def text(self) -> str:
-        """The value with its interval, for people."""
+        """The value with its interval, both values of two repeats, or a dash, for people."""
+        if self.nothing:
+            return DASH
+        if self.pair:
+            return " / ".join(number(value, self.unit) for value in self.pair)
         value = number(self.value, self.unit)
-        if self.interval is None:
-            return value
-        few = f" (too few {self.over})" if self.unit == "share" and self.interval >= _NOTHING_SAID else ""
-        return f"{value} ± {number(self.interval, self.unit)}{few}"
+        return value if self.interval is None else f"{value} ± {number(self.interval, self.unit)}"
 
     @property
     def protocol_key(self) -> str:
@@ -154,7 +179,8 @@ def group_figures(
                 continue
             name, note = f"{prefix}{metric.name}", (notes or {}).get(metric.name, "")
             shown = (metric.unit, metric.better, row, protocol, group, metric.title)
-            out.append(Figure(name, found.value, found.interval, *shown, found.over, note))
+            last = (found.over, note, found.count, found.pair)
+            out.append(Figure(name, found.value, found.interval, *shown, *last))
     return out
 
 
@@ -178,6 +204,8 @@ class FigureFile:
     figures: tuple[Figure, ...]
     about: Mapping[str, Any] = field(default_factory=dict)
     """Stages evaluated and judges, by role, with their checksums, and the seed."""
+    details: Mapping[str, Any] = field(default_factory=dict)
+    """Where the model errs (`diagnosis.py`)."""
 
     def of(self, name: str, row: str = MODEL) -> Figure | None:
         """One figure; None where it was not measured."""
@@ -188,7 +216,7 @@ class FigureFile:
         data: dict[str, object] = {"version": VERSION, "kind": self.kind, "about": self.about}
         data["protocol"] = {one.group: dict(one.protocol) for one in self.figures}
         data["figures"] = [_entry(one) for one in self.figures]
-        write_json(path, data)
+        write_json(path, data | ({"details": self.details} if self.details else {}))
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -208,22 +236,26 @@ class FigureFile:
             )
         try:
             protocols = data["protocol"]
-            figures = tuple(Figure(**one, protocol=protocols[one["group"]]) for one in data["figures"])
-            file = cls(str(data["kind"]), figures, dict(data["about"]))
+            figures = tuple(
+                Figure(**one | {"protocol": protocols[one["group"]], "pair": tuple(one.get("pair", ()))})
+                for one in data["figures"]
+            )
+            file = cls(str(data["kind"]), figures, dict(data["about"]), dict(data.get("details", {})))
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path}: not as an evaluation writes it ({error}); evaluate again") from None
         for one in figures:
-            if not _is_number(one.value) or not (one.interval is None or _is_number(one.interval)):
+            if not all(map(_is_number, (one.value, one.interval or 0, one.count, *one.pair))):
                 raise UserError(f"{path}: figure '{one.name}' is no number; evaluate again")
         return file
 
 
 def _entry(figure: Figure) -> dict[str, object]:
     """A figure as the file has it: its protocol stands under its group, what is empty is left out."""
-    rounded = replace(figure, value=round(float(figure.value), DIGITS))
+    pair = tuple(round(float(value), DIGITS) for value in figure.pair)
+    rounded = replace(figure, value=round(float(figure.value), DIGITS), pair=pair)
     if figure.interval is not None:
         rounded = replace(rounded, interval=round(float(figure.interval), DIGITS))
-    out = {key: value for key, value in asdict(rounded).items() if value not in ("", None)}
+    out = {key: value for key, value in asdict(rounded).items() if value not in ("", None, ())}
     del out["protocol"]
     return out
 
@@ -244,8 +276,7 @@ def _table(group: str, figures: Sequence[Figure]) -> TableRows:
     columns: dict[str, str] = {}
     found: dict[str, dict[str, Figure]] = {}
     for one in figures:
-        unit = "" if one.unit in ("", "share") else f", {one.unit}"
-        columns.setdefault(one.name, f"{one.title}{unit}")
+        columns.setdefault(one.name, f"{one.title}{_unit(one)}")
         found.setdefault(one.row, {})[one.name] = one
     rows = [
         [row or "model", *(found[row][name].text() if name in found[row] else "" for name in columns)]
@@ -254,8 +285,33 @@ def _table(group: str, figures: Sequence[Figure]) -> TableRows:
     return "; ".join([group, *_remarks(figures)]), ["", *columns.values()], rows
 
 
+def _unit(figure: Figure) -> str:
+    """The unit behind the title of a column; shares have theirs in each value."""
+    return "" if figure.unit in ("", "share") else f", {figure.unit}"
+
+
+def print_summary(figures: Iterable[Figure], console: Console) -> None:
+    """A line for each table on a terminal: its first figure, and the first row beside it that has one."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    tables: dict[str, dict[str, Figure]] = {}
+    for one in figures:
+        first = tables.setdefault(one.group, {one.row: one})
+        if one.name == next(iter(first.values())).name:
+            first.setdefault(one.row, one)
+    lines = Table("    figure", "model", "beside it", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for found in tables.values():
+        first = next(iter(found.values()))
+        beside = next((row for row in ROWS[1:] if row in found), None)
+        model = found[MODEL].text() if MODEL in found else DASH
+        reference = "" if beside is None else f"{found[beside].text()} {beside}"
+        lines.add_row(*map(escape, (f"    {first.name}{_unit(first)}", model, reference)))
+    console.print(lines)
+
+
 def print_tables(figures: Iterable[Figure], console: Console) -> None:
-    """The same on a terminal."""
+    """All tables on a terminal."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -286,10 +342,13 @@ def _remarks(figures: Sequence[Figure]) -> list[str]:
         else []
     )
     out += [f"among {protocol['candidates']}"] if "candidates" in protocol else []
-    overs = list(dict.fromkeys(one.over for one in figures if one.over))
+    shown = [one for one in figures if not one.nothing]
+    overs = list(dict.fromkeys(one.over for one in shown if one.interval is not None))
     out += [f"± 95 % over {' or '.join(overs)}"] if overs else []
+    out += ["a / b: both repeats"] if any(one.pair for one in shown) else []
+    out += [f"{DASH}: {why}" for why in dict.fromkeys(one.nothing for one in figures if one.nothing)]
     notes: dict[str, dict[str, None]] = {}
-    for one in figures:
+    for one in shown:
         if one.note:
             notes.setdefault(one.note, {})[one.title] = None
     return out + [f"{' and '.join(titles)}: {note}" for note, titles in notes.items()]

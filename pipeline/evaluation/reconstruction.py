@@ -9,21 +9,25 @@ body's, and so must be measured from the wrist, as here.
 Our own **[ours]**, means over clips: `pose` with root and heading aligned, so that a figure that faces
 another way is no other pose, `pose_body`, `pose_hand`; and `world`, where the path counts.
 
-Of faces: errors of expressions.
+Of faces: errors of expressions, and of a head's vertices where the user has its model (v.-err. of Tables 2
+and 6, which the paper does not define: the mean distance of the vertices that expressions move **[ours]**).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import HANDS
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
+from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
 from motionloom.pipeline.contract.units import Row
@@ -65,7 +69,13 @@ OURS = (
     Metric("reconstruction.world", "in the world", "lower", "mm"),
 )
 
-FACES = (Metric("face.expression", "expression error", "lower"),)
+FACES = (
+    Metric("face.expression", "expression error", "lower"),
+    Metric("face.vertex", "vertex error", "lower", "mm"),
+)
+_SHAPES, _EXPRESSIONS = 300, 50
+"""Directions of shape, which come first in a model's file, and those of expression that layouts have."""
+_MODEL_BYTES = 2**30
 
 
 def clip_errors(
@@ -172,9 +182,34 @@ def pose_errors(pose: Tensor, real: Tensor) -> dict[str, Tensor]:
     return out
 
 
-def face_errors(tokenizer: TrainedTokenizer, truth: Truth) -> Row:
+def expression_directions(path: Path) -> NDArray[np.float64]:
+    """How far each expression value moves each vertex that they move, metres [V, 3, 50], of a body model.
+
+    `path` is an .npz with `shapedirs` [V, 3, 300 + 50 or more], as SMPL-X's of 2020 and FLAME's are. Its
+    licence lets nobody pass it on, so it is the user's.
+    """
+    with NpzFile(path) as file:
+        directions = file.numbers("shapedirs", limit=_MODEL_BYTES)
+    if directions.ndim != 3 or directions.shape[1] != 3 or directions.shape[2] < _SHAPES + _EXPRESSIONS:
+        raise UserError(
+            f"{path}: shapedirs is {list(directions.shape)}, not [V, 3, {_SHAPES} + {_EXPRESSIONS}]; take "
+            f"the model with 300 shape and 100 expression directions, such as SMPLX_NEUTRAL_2020.npz"
+        )
+    expression = directions[:, :, _SHAPES : _SHAPES + _EXPRESSIONS]
+    moved = np.abs(expression).max(axis=(1, 2)) > 1e-9
+    if not moved.any() or not np.isfinite(expression).all():
+        raise UserError(f"{path}: the expression directions of shapedirs are all 0, or NaN or infinity")
+    return np.asarray(expression[moved], dtype=np.float64)
+
+
+def face_errors(
+    tokenizer: TrainedTokenizer, truth: Truth, directions: NDArray[np.float64] | None = None
+) -> Row:
     """Errors of one clip with a face, weighted by its frames: the norm of the difference of the expressions
     (50 values) by a tokenizer of faces or of everything (`expression`), and of the mean one (`_mean`).
+
+    With `directions` [V, 3, 50] (`expression_directions`) also the mean distance of vertices in mm
+    (`vertex`): shape moves both faces alike, so it is that of the expressions' difference.
     """
     real = truth.face
     if real is None:
@@ -185,6 +220,9 @@ def face_errors(tokenizer: TrainedTokenizer, truth: Truth) -> Row:
     for suffix, expression in (("", rebuilt), ("_mean", mean)):
         error = (expression - real).astype(np.float64)
         out |= weighted(f"expression{suffix}", float(np.linalg.norm(error, axis=-1).sum()), frames)
+        if directions is not None:
+            moved = 1000 * np.linalg.norm(error @ directions.swapaxes(-1, -2), axis=-1)  # [V, T]
+            out |= weighted(f"vertex{suffix}", float(moved.mean(0).sum()), frames)
     return out
 
 

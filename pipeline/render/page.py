@@ -14,6 +14,8 @@ from pathlib import Path
 from numpy.typing import ArrayLike
 
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline.render.body_map import body_map
 from motionloom.pipeline.render.charts import Line, histogram, line_chart
 from motionloom.pipeline.render.viewer import (
     ViewerMotion,
@@ -131,6 +133,30 @@ class Page:
     ) -> Page:
         """Stacked counts per bin of a range, one colour a name; of one name the empty bins are marked."""
         return self._add_chart(histogram(counts, edges, title, x_label, y_label), title)
+
+    def add_joint_errors(self, errors: Mapping[str, float], skeleton: Skeleton, title: str) -> Page:
+        """The error of each joint on a figure and, where it has fingers, on two hands beside it."""
+        for part, drawing in body_map(errors, skeleton).items():
+            self._add_chart(drawing, f"{title}: {part}")
+        return self
+
+    def add_matrix(self, counts: Mapping[str, Mapping[str, int]], title: str) -> Page:
+        """A table of what was taken for what; the darker a cell, the larger its share of the row."""
+        names = sorted({*counts, *(name for row in counts.values() for name in row)})
+        head = "".join(f'<th scope="col">{escape(name)}</th>' for name in names)
+        body = ""
+        for name, row in counts.items():
+            cells = "".join(
+                f'<td class="{"right" if name == column else "wrong"}" style="--share:'
+                f'{100 * row.get(column, 0) / sum(row.values()):.0f}%">{row.get(column) or "·"}</td>'
+                for column in names
+            )
+            body += f'<tr><th scope="row">{escape(name)}</th>{cells}</tr>'
+        inner = f"<caption><span>{escape(title)}</span></caption><thead><tr><td></td>{head}</tr></thead>"
+        self._blocks.append(
+            f'<div class="scroll"><table class="matrix">{inner}<tbody>{body}</tbody></table></div>'
+        )
+        return self
 
     def add_viewer(self, motions: Sequence[ViewerMotion], note: str = "") -> Page:
         """Motions that play in the page, with their own controls below."""

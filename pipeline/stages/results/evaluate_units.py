@@ -4,19 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.records import HANDS
 from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
 from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
+from motionloom.pipeline.evaluation.diagnosis import joint_distances, shown_actions
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.movement import all_features
-from motionloom.pipeline.evaluation.reconstruction import clip_errors, face_errors
+from motionloom.pipeline.evaluation.reconstruction import clip_errors, expression_directions, face_errors
 from motionloom.pipeline.evaluation.reference_baselines import NearestClip
 from motionloom.pipeline.evaluation.truth import (
     Truth,
@@ -35,8 +41,10 @@ from motionloom.pipeline.store.networks import TrainedTokenizer
 
 _RECONSTRUCTED, _GENERATED = 16, 64
 """Clips at a time, at most."""
-JOINTS, FACE, CLIP, MOVEMENT = "joints/", "face/", "clip/", "movement/"
-"""Begin the names of what is measured of a clip."""
+JOINTS, FACE, CLIP, MOVEMENT, MOTION = "joints/", "face/", "clip/", "movement/", "motion/"
+"""Begin the names of what is measured of a clip, or made for it."""
+DISTANCES, ACTION = "distances", "action"
+"""Errors of joints [n, N] and names of actions [n] of n clips."""
 CAPTIONS = "texts.json"
 """The member of a clip that holds its captions."""
 LATENT = {"tma": "latent", "evaluator": "latent_evaluator", "face_evaluator": "latent_face"}
@@ -60,6 +68,8 @@ class EvaluateConfig(StageConfig):
     """How long generated motions are: as the generator decides, or as the recorded clip is (at most what the
     generator makes), which is all that VAEs and diffusion models can do."""
     sampling: SamplingConfig = SamplingConfig()
+    face_model: Path | None = None
+    """SMPL-X's or FLAME's model file of the user (.npz with `shapedirs`): with it v.-err. is measured."""
 
     @field_validator("sampling")
     @classmethod
@@ -174,6 +184,11 @@ class EvaluationUnits(Evaluation):
     def _nearest(self) -> NearestClip:
         return NearestClip(self.train)
 
+    @cached_property
+    def _directions(self) -> NDArray[np.float64] | None:
+        path = self.config.face_model
+        return None if path is None else expression_directions(path.expanduser())
+
     def reconstruct(self, truths: Sequence[Truth]) -> Arrays:
         """Errors of clips and faces through the tokenizer, and whether they still do what is said."""
         tokenizer = self.tokenizer
@@ -184,10 +199,14 @@ class EvaluationUnits(Evaluation):
         fps, layout = self.dataset.layout.fps, tokenizer.layout
         shown = [Performance(joints_of(body, layout), t.joints, fps, t.face, t.truth) for t, body in pairs]
         out |= as_table([measure_clip(metrics_of("captions"), one) for one in shown], CLIP)
+        out[DISTANCES] = np.stack([joint_distances(one.joints, one.recorded) for one in shown])
+        # Hands that were never recorded are no truth to be compared with.
+        out[DISTANCES][[not t.present & HANDS for t in truths], BODY_JOINTS:] = np.nan
+        out[ACTION] = shown_actions(shown)
         faces = self.context.given.get("face_tokenizer", tokenizer)
         models_faces = faces.layout.has("face") and faces.net.part in ("face", "all")
         if models_faces:
-            out |= as_table([face_errors(faces, truth) for truth in truths], FACE)
+            out |= as_table([face_errors(faces, t, self._directions) for t in truths], FACE)
         for role, judge in self.judges.items():
             some = judge.judged(truths)
             if not judge.of_faces:
@@ -222,6 +241,9 @@ class EvaluationUnits(Evaluation):
         out = as_table([measure_clip(metrics_of("captions"), one) for one in made_for], CLIP)
         moves = all_features((m.joints for m in motions), fps)
         out |= {MOVEMENT + kind: rows for kind, rows in moves.items()}
+        if draw == 0:
+            out |= {f"{MOTION}{number:03d}": m.joints.astype(np.float32) for number, m in enumerate(motions)}
+            out[ACTION] = shown_actions(made_for)
         for role, judge in self.performed_by.items():
             faces, pairs = judge.of_faces, zip(truths, motions, strict=True)
             shown = [

@@ -23,13 +23,14 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.contract.units import Arrays, even_slices
 from motionloom.pipeline.evaluation.clip_metrics import CLIP_METRICS
+from motionloom.pipeline.evaluation.diagnosis import showings
 from motionloom.pipeline.evaluation.figures import (
     FILE_NAME,
     Fact,
     FigureFile,
     facts,
     figure_tables,
-    print_tables,
+    print_summary,
 )
 from motionloom.pipeline.evaluation.movement import Features, all_features
 from motionloom.pipeline.inference.bundle import Bundle
@@ -56,16 +57,17 @@ class EvaluationStage(StageKind):
         self.evaluation(context).share()
 
     def run(self, context: StageContext) -> None:
-        """Write `metrics.json` and print it as tables."""
+        """Write `metrics.json` and print a line for each of its tables."""
         found = self.evaluation(context).measured()
         found.write(context.folder / FILE_NAME)
-        print_tables(found.figures, context.console)
+        print_summary(found.figures, context.console)
         context.units.clear()
 
     def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
-        """The tables."""
+        """The tables, and where the model errs."""
         found = FigureFile.read(stage.folder / FILE_NAME)
-        return [FigureTable(*table) for table in figure_tables(found.figures)]
+        tables = [FigureTable(*table) for table in figure_tables(found.figures)]
+        return [*tables, *showings(stage.folder, found.details)]
 
 
 class Evaluation:

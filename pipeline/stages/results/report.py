@@ -17,7 +17,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.showing import Bars, FigureTable
+from motionloom.pipeline.contract.showing import Bars, Confusions, FigureTable, JointErrors
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
     SHOWING,
@@ -30,6 +30,7 @@ from motionloom.pipeline.contract.stage import (
     stage_kind,
 )
 from motionloom.pipeline.evaluation.dances import dance_to, dances_of, seed_frames, with_music
+from motionloom.pipeline.evaluation.diagnosis import Clips
 from motionloom.pipeline.evaluation.truth import Truth, perform, reconstruct_all, spread_truths, truth_at
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
@@ -75,7 +76,7 @@ class ReportStage(StageKind):
         Every("generators", GENERATOR),
         Every("shown", SHOWING),
     )
-    version = 5  # feet that stand
+    version = 6  # where it errs
 
     def run(self, context: StageContext) -> None:
         """Write `report.html`; of an unfinished run, what there is of it."""
@@ -102,9 +103,10 @@ class ReportStage(StageKind):
             for stage in stages
             for thing in stage.kind.show(stage, context.stage_cache.given(stage.inputs))
         ]
-        draw_showings(page, "Figures on held-out clips", FigureTable, shown)
+        draw_showings(page, "Figures on held-out clips", shown, FigureTable)
+        draw_showings(page, "Where it errs", shown, JointErrors, Confusions, Clips)
         draw_curves(page, stages if state is None else _logged(stages, state), samples=state is not None)
-        draw_showings(page, "Codebooks", Bars, shown)
+        draw_showings(page, "Codebooks", shown, Bars)
         if state is not None:
             draw_flights(page, state)
         add_run_facts(page, context, state)

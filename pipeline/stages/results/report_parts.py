@@ -13,8 +13,9 @@ from pathlib import Path
 from motionloom.datasets.base.progress import duration
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline.contract.showing import Bars, FigureTable, Showing
+from motionloom.pipeline.contract.showing import Bars, Confusions, FigureTable, JointErrors, Showing
 from motionloom.pipeline.contract.stage import CompletedStage, StageContext, stage_kind
+from motionloom.pipeline.evaluation.diagnosis import Clips
 from motionloom.pipeline.render.charts import curve_label, log_lines
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
@@ -34,14 +35,20 @@ from motionloom.pipeline.store.yaml import flatten, setting_text
 SPLITS = ("train", "val", "test")
 
 
-def draw_showings(page: Page, heading: str, kind: type[Showing], shown: Sequence[Showing]) -> None:
-    """Return the figures of one kind under a heading; nothing where there is none."""
-    things = [thing for thing in shown if isinstance(thing, kind)]
+def draw_showings(page: Page, heading: str, shown: Sequence[Showing], *kinds: type[Showing]) -> None:
+    """Draw what is of these kinds under a heading, kind by kind; nothing where there is none."""
+    things = [thing for kind in kinds for thing in shown if isinstance(thing, kind)]
     if things:
         page.add_heading(heading)
     for thing in things:
         if isinstance(thing, FigureTable):
             page.add_table(list(thing.columns), [list(row) for row in thing.rows], thing.title, pinned=True)
+        elif isinstance(thing, JointErrors):
+            page.add_joint_errors(thing.errors, Skeleton.named(thing.skeleton), thing.title)
+        elif isinstance(thing, Confusions):
+            page.add_matrix(thing.counts, thing.title)
+        elif isinstance(thing, Clips):
+            page.add_subheading(thing.title).add_viewer(thing.motions)
         elif isinstance(thing, Bars):
             uses, ends = {thing.y_label: thing.values}, (0, len(thing.values))
             page.add_histogram(uses, ends, thing.title, thing.x_label, thing.y_label)
