@@ -80,7 +80,7 @@ def agrees(
     return out | _face(truth, face)
 
 
-def actions_of(truth: Record | None) -> tuple[str, ...]:
+def actions_of(truth: Mapping[str, Any] | None) -> tuple[str, ...]:
     """Return the actions of a truth record in their order; none where it states none."""
     if truth is None or "action" not in truth:
         return ()

@@ -9,6 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.motion.skeleton import Skeleton
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -43,7 +45,7 @@ class JointErrors:
     """The error of each joint of a human figure."""
 
     title: str
-    skeleton: str
+    skeleton: Skeleton
     errors: Mapping[str, float]
     """mm by the joint's name; joints that no clip has are left out."""
 

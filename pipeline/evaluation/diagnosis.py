@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,19 +15,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from motionloom.datasets.actions.measure import action_of, actions_of
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
+from motionloom.datasets.base.files import write_bytes
+from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.showing import Confusions, JointErrors, Showing
+from motionloom.pipeline.contract.units import Arrays
 from motionloom.pipeline.evaluation.clip_metrics import Joints, Performance
 from motionloom.pipeline.evaluation.reconstruction import FINGERS
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.render.viewer import ViewerMotion
 
 FILE_NAME = "cases.safetensors"
+_ACTION, _MOTION = "action", "motion/"
 EACH = 3
 """Clips kept as the worst, and as the best."""
 _CASES = {
@@ -45,18 +48,56 @@ class Clips:
     motions: Sequence[ViewerMotion]
 
 
-@dataclass(frozen=True)
-class Case:
-    """A clip, and what was made of it or for its caption."""
+class Diagnosis:
+    """Collects where a model errs; `write` gives what `metrics.json` says of it."""
 
-    of: str
-    """Key of `_CASES`."""
-    place: str
-    """"worst 1", "best 2", ..."""
-    truth: Truth
-    error: float
-    made: Joints
-    """Joints [T, N, 3] in metres."""
+    def __init__(self, layout: MotionLayout) -> None:
+        self.skeleton = layout.skeleton
+        self.details: dict[str, Any] = {
+            "fps": layout.fps, "skeleton": layout.skeleton.name, "actions": {}, "cases": []
+        }  # fmt: skip
+        self._arrays: dict[str, NDArray[np.float32]] = {}
+
+    def take_distances(self, clips: NDArray[np.float64], frames: Sequence[int]) -> None:
+        """Note errors of n clips [n, N], NaN where one has no such joint: a mean over frames by joint."""
+        long = np.asarray(frames, dtype=float)[:, None]
+        counts = (np.isfinite(clips) * long).sum(0).tolist()
+        sums = np.nansum(clips * long, axis=0).tolist()
+        named = zip(self.skeleton.joints, sums, counts, strict=False)
+        self.details["joints"] = {name: round(total / count, 2) for name, total, count in named if count}
+
+    def take(
+        self, of: str, truths: Sequence[Truth], tables: Sequence[Arrays], errors: Sequence[float]
+    ) -> None:
+        """Note what was made of clips or for their captions: confusions of actions, and the motions with the
+        largest and the smallest errors. Of several judges the first one's errors stay.
+
+        Args:
+            of: Key of `_CASES`.
+            truths: The n clips.
+            tables: `as_shown` of what was made, in their order.
+            errors: [n].
+        """
+        if of in self.details["actions"]:
+            return
+        actions = np.concatenate([table[_ACTION] for table in tables]).tolist()
+        self.details["actions"][of] = confusions(truths, actions)
+        made = [table[name] for table in tables for name in sorted(table) if name.startswith(_MOTION)]
+        for place, k in extremes(errors):
+            number, truth = len(self.details["cases"]), truths[k]
+            self._arrays |= {
+                f"{number}.recorded": np.ascontiguousarray(truth.joints, np.float32),
+                f"{number}.{of}": made[k],
+            }
+            case = {"of": of, "place": place, "id": truth.id, "caption": truth.caption}
+            self.details["cases"].append(case | {"error": round(errors[k], 3)})
+
+    def write(self, folder: Path) -> dict[str, Any]:
+        """Write the motions, no file where there are none; returns what describes them and the rest."""
+        (folder / FILE_NAME).unlink(missing_ok=True)
+        if self._arrays:
+            write_bytes(folder / FILE_NAME, save(self._arrays))
+        return self.details
 
 
 def joint_distances(made: Joints, real: Joints) -> NDArray[np.float64]:
@@ -72,74 +113,51 @@ def joint_distances(made: Joints, real: Joints) -> NDArray[np.float64]:
     return np.asarray(1000 * np.linalg.norm(off - off[:, origin], axis=-1).mean(0))
 
 
-def mean_distances(clips: NDArray[np.float64], frames: Sequence[int], skeleton: Skeleton) -> dict[str, float]:
-    """Errors of n clips [n, N], NaN where a clip has no such joint, as one mean over all frames by joint."""
-    there = np.isfinite(clips)
-    weights = there * np.asarray(frames, dtype=float)[:, None]
-    sums = (np.where(there, clips, 0.0) * weights).sum(0)
-    return {
-        name: round(total / weight, 2)
-        for name, total, weight in zip(skeleton.joints, sums.tolist(), weights.sum(0).tolist(), strict=False)
-        if weight
-    }
-
-
-def shown_actions(performances: Iterable[Performance]) -> NDArray[np.str_]:
-    """The action that each motion shows, by geometry; "" where its clip does not state a single one."""
-    found = [
+def as_shown(performances: Sequence[Performance]) -> Arrays:
+    """Motions, and the action that each shows by geometry; "" where its clip does not state a single one."""
+    actions = [
         action_of(one.joints, one.fps) if len(actions_of(one.truth)) == 1 else "" for one in performances
     ]
-    return np.array(found, dtype=np.str_)
+    motions = {f"{_MOTION}{k:03d}": one.joints.astype(np.float32) for k, one in enumerate(performances)}
+    return {_ACTION: np.array(actions, dtype=np.str_), **motions}
 
 
 def confusions(truths: Sequence[Truth], shown: Sequence[str]) -> dict[str, dict[str, int]]:
     """Asked for -> shown -> number of clips, of those that state a single action."""
-    pairs = Counter((actions_of(t.truth)[0], str(act)) for t, act in zip(truths, shown, strict=True) if act)
+    pairs = Counter((actions_of(t.truth)[0], act) for t, act in zip(truths, shown, strict=True) if act)
     out: dict[str, dict[str, int]] = {}
     for (asked, act), count in sorted(pairs.items()):
         out.setdefault(asked, {})[act] = count
     return out
 
 
-def extreme_cases(
-    of: str, truths: Sequence[Truth], errors: Sequence[float], made: Callable[[int], Joints]
-) -> list[Case]:
-    """The clips with the largest and the smallest errors, each once, the worst first."""
+def extremes(errors: Sequence[float]) -> list[tuple[str, int]]:
+    """(place, number) of the largest and of the smallest errors, each number once, the worst first."""
     order = np.argsort(-np.asarray(errors), kind="stable").tolist()
     # Of few clips half are the worst and half the best.
     each = min(EACH, -(-len(order) // 2))
     worst = [(f"worst {place}", number) for place, number in enumerate(order[:each], start=1)]
     rest = order[each:][::-1][:EACH]
-    best = [(f"best {place}", number) for place, number in enumerate(rest, start=1)]
-    return [Case(of, place, truths[k], errors[k], made(k)) for place, k in worst + best]
-
-
-def write_cases(folder: Path, cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Write their joints; returns what `metrics.json` says of them. Without cases there is no file."""
-    arrays = {
-        f"{number}.{label}": np.ascontiguousarray(joints, np.float32)
-        for number, case in enumerate(cases)
-        for label, joints in (("recorded", case.truth.joints), (case.of, case.made))
-    }
-    (folder / FILE_NAME).unlink(missing_ok=True)
-    if arrays:
-        save_file(arrays, folder / FILE_NAME)
-    return [
-        {
-            "of": c.of,
-            "place": c.place,
-            "id": c.truth.id,
-            "caption": c.truth.caption,
-            "error": round(c.error, 3),
-        }
-        for c in cases
-    ]
+    return worst + [(f"best {place}", number) for place, number in enumerate(rest, start=1)]
 
 
 def showings(folder: Path, details: Mapping[str, Any]) -> list[Showing]:
     """All that the `details` of a `metrics.json` in `folder` describe; `UserError` where they do not fit."""
+    if not details:
+        return []
     try:
-        return [*_joints(details), *_confusions(details), *_clips(folder, details)]
+        skeleton = Skeleton.named(details["skeleton"])
+        joints = details.get("joints")
+        title = "Reconstruction, mm at each joint, its right hand on your left"
+        return [
+            *([JointErrors(title, skeleton, joints)] if joints else []),
+            *(
+                Confusions(f"Actions asked for (rows) and shown (columns), {of}, clips", counts)
+                for of, counts in details["actions"].items()
+                if counts
+            ),
+            *_clips(folder, details, skeleton),
+        ]
     except (SafetensorError, LookupError, TypeError, ValueError, AttributeError, OSError) as error:
         why = f"{type(error).__name__}: {error}"[:200]
         raise UserError(
@@ -147,33 +165,15 @@ def showings(folder: Path, details: Mapping[str, Any]) -> list[Showing]:
         ) from None
 
 
-def _joints(details: Mapping[str, Any]) -> list[JointErrors]:
-    errors = {name: float(value) for name, value in details.get("joints", {}).items()}
-    title = "Reconstruction, error of each joint, mm"
-    return [JointErrors(title, details["skeleton"], errors)] if errors else []
-
-
-def _confusions(details: Mapping[str, Any]) -> list[Confusions]:
-    return [
-        Confusions(
-            f"The action asked for (rows), and the one that {of} motion shows (columns), clips", counts
-        )
-        for of, counts in details.get("actions", {}).items()
-        if counts
-    ]
-
-
-def _clips(folder: Path, details: Mapping[str, Any]) -> list[Clips]:
-    described = details.get("cases", [])
-    if not described:
-        return []
-    arrays, parents = load_file(folder / FILE_NAME), Skeleton.named(details["skeleton"]).parents
+def _clips(folder: Path, details: Mapping[str, Any], skeleton: Skeleton) -> list[Clips]:
+    described = details["cases"]
+    arrays = load_file(folder / FILE_NAME) if described else {}
     out: dict[str, list[ViewerMotion]] = {of: [] for of in _CASES}
     for number, case in enumerate(described):
         of = case["of"]
         group = f"{case['place']}: {_CASES[of][1].format(case['error'])} ({case['id']})"
         for label in ("recorded", of):
             joints = arrays[f"{number}.{label}"]
-            own = parents[: joints.shape[1]]
+            own = skeleton.parents[: joints.shape[1]]
             out[of].append(ViewerMotion(joints, details["fps"], own, label, case["caption"], group))
     return [Clips(_CASES[of][0], motions) for of, motions in out.items() if motions]

@@ -296,10 +296,12 @@ def print_summary(figures: Iterable[Figure], console: Console) -> None:
     from rich.table import Table
 
     tables: dict[str, dict[str, Figure]] = {}
+    reasons: dict[str, None] = {}
     for one in figures:
-        first = tables.setdefault(one.group, {one.row: one})
-        if one.name == next(iter(first.values())).name:
-            first.setdefault(one.row, one)
+        reasons |= {one.nothing: None} if one.nothing else {}
+        rows = tables.setdefault(one.group, {one.row: one})
+        if one.name == next(iter(rows.values())).name:
+            rows.setdefault(one.row, one)
     lines = Table("    figure", "model", "beside it", box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for found in tables.values():
         first = next(iter(found.values()))
@@ -308,6 +310,8 @@ def print_summary(figures: Iterable[Figure], console: Console) -> None:
         reference = "" if beside is None else f"{found[beside].text()} {beside}"
         lines.add_row(*map(escape, (f"    {first.name}{_unit(first)}", model, reference)))
     console.print(lines)
+    for reason in reasons:
+        console.print(f"    {DASH}: {reason}")
 
 
 def print_tables(figures: Iterable[Figure], console: Console) -> None:

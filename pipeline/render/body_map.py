@@ -26,12 +26,17 @@ def body_map(errors: Mapping[str, float], skeleton: Skeleton) -> dict[str, str]:
     `errors` are mm by joint of a skeleton whose first joints are those of `smplx52`. The figure is seen from
     in front, its right hand on the left; hands are seen on their backs.
     """
+    values = {j: errors[name] for j, name in enumerate(skeleton.joints) if j and name in errors}
+    body = {j: value for j, value in values.items() if j < BODY_JOINTS}
+    fingers = {j: value for j, value in values.items() if j >= BODY_JOINTS}
     places = _places(skeleton)
-    body = list(range(1, BODY_JOINTS))  # the root's error is 0 by definition
-    out = {"body, from the root": _drawing(errors, skeleton, places, body)}
-    fingers = [j for j in range(BODY_JOINTS, len(skeleton)) if skeleton.joints[j] in errors]
+    out = {"from the root": _drawing(body, skeleton, places, range(BODY_JOINTS))}
     if fingers:
-        out["hands, from the wrist"] = _drawing(errors, skeleton, places, fingers)
+        # Each hand has a place of its own beside the other.
+        for wrist, side in zip(WRISTS, (1, -1), strict=True):
+            own = [j for j in fingers if np.sign(skeleton.offsets[j, 0]) == side]
+            places[[wrist, *own]] += (0.11 * side, 0) - places[wrist]
+        out["fingers, from the wrist"] = _drawing(fingers, skeleton, places, [*WRISTS, *fingers])
     return out
 
 
@@ -49,29 +54,25 @@ def _places(skeleton: Skeleton) -> NDArray[np.float64]:
             step = (np.sign(x) * z, abs(x))
         elif parent >= _SHOULDER:
             step = (x * cosine - np.sign(x) * y * sine, abs(x) * sine + y * cosine)
-        start = out[parent]
-        if joint >= BODY_JOINTS and parent in WRISTS:
-            start = (0.11 * np.sign(x), 0.0)
-        out[joint] = start + np.array(step)
+        out[joint] = out[parent] + step
     return out
 
 
 def _drawing(
-    errors: Mapping[str, float], skeleton: Skeleton, places: NDArray[np.float64], joints: Sequence[int]
+    values: Mapping[int, float], skeleton: Skeleton, places: NDArray[np.float64], joints: Sequence[int]
 ) -> str:
-    """Limbs and circles of some joints, fitted into the picture, each circle with its error."""
-    chosen = places[joints]
+    """Limbs between some joints, fitted into the picture, and a circle with the error of each with one."""
+    chosen = places[list(joints)]
     low, high = chosen.min(0), chosen.max(0)
-    scale = float(((SIZE - 2 * MARGIN) / (high - low)).min())
-    middle = (low + high) / 2
-    at = {j: (SIZE / 2 + scale * (x - middle[0]), SIZE / 2 - scale * (y - middle[1]))
-          for j, (x, y) in zip(joints, chosen.tolist(), strict=True)}  # fmt: skip
+    scale = ((SIZE - 2 * MARGIN) / (high - low)).min()
+    wide, tall = scale * (high - low)
+    fitted = (chosen - (low[0], high[1])) * (scale, -scale) + ((SIZE - wide) / 2, MARGIN)
+    at = dict(zip(joints, fitted.tolist(), strict=True))
     limbs = "".join(
         f'<line class="limb" x1="{x:.1f}" y1="{y:.1f}" x2="{at[parent][0]:.1f}" y2="{at[parent][1]:.1f}"/>'
         for j, (x, y) in at.items()
         if (parent := skeleton.parents[j]) in at
     )
-    values = {j: errors[skeleton.joints[j]] for j in joints if skeleton.joints[j] in errors}
     most = max(values.values(), default=0.0) or 1.0
     circles = "".join(
         f'<g class="joint" style="--share:{100 * value / most:.0f}%">'
@@ -80,5 +81,5 @@ def _drawing(
         f'<text x="{at[j][0]:.1f}" y="{at[j][1] + 3.8:.1f}" text-anchor="middle">{value:.0f}</text></g>'
         for j, value in values.items()
     )
-    view = f'viewBox="0 0 {SIZE} {SIZE}" role="img" aria-label="Errors of joints in mm"'
+    view = f'viewBox="0 0 {SIZE} {tall + 2 * MARGIN:.0f}" role="img" aria-label="Errors of joints in mm"'
     return f'<svg class="chart" {view}>{limbs}{circles}</svg>'

@@ -33,6 +33,15 @@ class Line:
     dashed: bool = False
 
 
+def own_lines(rows: Sequence[Mapping[str, float]], figure: str) -> list[Line]:
+    """A figure of a flight log, one line for each optimizer that has one (`lr/pose`)."""
+    out = []
+    for key in sorted({key for row in rows for key in row if key.partition("/")[0] == figure}):
+        own = [row for row in rows if key in row]
+        out.append(Line(label(key), [row["step"] for row in own], [row[key] for row in own]))
+    return out
+
+
 def log_lines(
     rows: Sequence[Mapping[str, float]], figure: str, name: str, splits: tuple[str, str] = ("train", "val")
 ) -> list[Line]:
@@ -46,8 +55,11 @@ def log_lines(
     return out
 
 
-def line_chart(lines: Sequence[Line], title: str) -> str:
-    """SVG of curves over a training's steps, with a legend and the data for the page's hover script."""
+def line_chart(lines: Sequence[Line], title: str, marks: Sequence[float] = ()) -> str:
+    """SVG of curves over a training's steps, with a legend and the data for the page's hover script.
+
+    `marks` are steps with a line from top to bottom.
+    """
     curves = []
     for line in lines:
         x, y = np.asarray(line.x, np.float64).ravel(), np.asarray(line.y, np.float64).ravel()
@@ -62,6 +74,8 @@ def line_chart(lines: Sequence[Line], title: str) -> str:
     high_y = max(float(y.max()) for _, y in filled)
     x_axis, y_axis = _Axis(low_x, high_x, LEFT, WIDTH - RIGHT), _Axis(low_y, high_y, HEIGHT - BOTTOM, TOP)
     parts = _axes(x_axis, y_axis, "step", "")
+    for at in (x_axis(step) for step in marks if low_x <= step <= high_x):
+        parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
     hover = []
     for index, (line, (x, y)) in enumerate(zip(lines, curves, strict=True)):
         colour = index % COLOURS

@@ -119,9 +119,12 @@ class Page:
         self._blocks.append(f'<dl class="facts">{tiles}</dl>')
         return self
 
-    def add_plot(self, lines: Sequence[Line], title: str) -> Page:
-        """A chart of training curves; neighbouring charts stand side by side where there is room."""
-        return self._add_chart(line_chart(lines, title), title)
+    def add_plot(self, lines: Sequence[Line], title: str, marks: Sequence[float] = ()) -> Page:
+        """A chart of training curves with marks at some steps; nothing without curves.
+
+        Neighbouring charts stand side by side where there is room.
+        """
+        return self._add_chart(line_chart(lines, title, marks), title) if lines else self
 
     def add_histogram(
         self,

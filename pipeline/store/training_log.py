@@ -1,4 +1,4 @@
-"""Logs of a training beside its network: `metrics.jsonl`, `flight/rank_N.jsonl`.
+"""Logs of a training beside its network: `metrics.jsonl`, `flight/rank_N.jsonl`, `flight/starts.jsonl`.
 
 The flight logs hold times and are no output.
 """
@@ -14,10 +14,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.pipeline.store.files import open_own
 
 FILE_NAME = "metrics.jsonl"
-FLIGHT = "flight"
-"""Folder of the flight logs, in a stage's."""
+FLIGHT, STARTS = "flight", "starts.jsonl"
+"""Folder of the flight logs, in a stage's, and its file of when the training began."""
 SAMPLES, SAMPLE_FIGURES = "samples", "figures.jsonl"
 """Folder of the motions that are drawn meanwhile, in a stage's, and the file of their figures in it."""
 
@@ -87,6 +88,21 @@ def read_flight(folder: Path) -> dict[int, list[dict[str, float]]]:
         if rank.isdecimal() and (rows := read_rows(path)):
             ranks[int(rank)] = rows
     return ranks
+
+
+def note_start(folder: Path, step: int, reached: int) -> None:
+    """Note beside the flight logs that a training begins or goes on at `step`, having `reached` another.
+
+    No output either, so that a training that was killed leaves the same files as an undisturbed one.
+    """
+    with open_own(folder / FLIGHT / STARTS, "a") as file:
+        file.write(json.dumps({"step": step, "reached": reached}) + "\n")
+
+
+def read_starts(folder: Path) -> list[tuple[int, int]]:
+    """(step, step reached before) of each time that a training went on, the first one left out."""
+    rows = read_rows(folder / FLIGHT / STARTS)
+    return [(int(row["step"]), int(row["reached"])) for row in rows[1:] if "reached" in row]
 
 
 def seconds_trained(folder: Path) -> float:

@@ -31,7 +31,7 @@ from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModul
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.store.files import open_own
 from motionloom.pipeline.store.run_folder import owner_of
-from motionloom.pipeline.store.training_log import FLIGHT, SAMPLES, optional, read_rows
+from motionloom.pipeline.store.training_log import FLIGHT, SAMPLES, note_start, optional, read_rows
 from motionloom.pipeline.training.utilization import Utilization
 
 
@@ -122,6 +122,8 @@ class Telemetry:
         with self._optional():
             path = folder / FLIGHT / f"rank_{rank()}.jsonl"
             rows = read_rows(path)
+            if rank() == 0:
+                note_start(folder, module.step, int(rows[-1]["step"]) if rows else 0)
             # Rows of later steps, which come again, are dropped.
             write_text(path, "".join(json.dumps(row) + "\n" for row in rows if row["step"] <= module.step))
             self._log = path
@@ -185,7 +187,8 @@ class Telemetry:
         path, self._log = self._log, None
         if path is not None:
             with self._optional(), open_own(path, "a") as file:
-                file.write(json.dumps({"step": self.module.step, **row}) + "\n")
+                gauges = {name: float(value) for name, value in self.module.gauges.items()}
+                file.write(json.dumps({"step": self.module.step, **gauges, **row}) + "\n")
                 self._log = path
         return {f"flight/{name}": value for name, value in row.items()}
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.evaluation.figures import (
+    DASH,
     FILE_NAME,
     MODEL,
     RECORDED,
@@ -210,8 +211,15 @@ class _Filling:
         self.shown[of].append((column, figure))
         if figure.note:
             self.remarks[figure.note][f"{column.title} of {of.run}"] = None
+        if figure.nothing:
+            self.remarks[f"{DASH} {figure.nothing}"][f"{column.title} of {of.run}"] = None
+            return Cell(DASH)
         numbers = [figure.value] if figure.interval is None else [figure.value, figure.interval]
-        text = " ± ".join(f"{number * column.scale:.{digits}f}" for number in numbers)
+        text, *spread = [f"{number * column.scale:.{digits}f}" for number in (*numbers, *figure.pair)]
+        if figure.pair:
+            text = f"{text} ({', '.join(spread)})"
+        elif spread:
+            text = f"{text} ± {spread[0]}"
         return Cell(text, figure.protocol_key)
 
     def _references(

@@ -104,7 +104,7 @@ def mark_best(rows: Sequence[FilledRow], columns: Sequence[Column]) -> tuple[Fil
     for at, column in enumerate(columns):
         alike: dict[str, dict[int, float]] = defaultdict(dict)
         for number, row in enumerate(rows):
-            if row.source == "ours" and (cell := row.cells[at]):
+            if row.source == "ours" and (cell := row.cells[at]) and cell.alike:
                 alike[cell.alike][number] = float(cell.text.split(" ")[0])
         for values in alike.values() if column.better else ():
             wanted = min(values.values()) if column.better == "lower" else max(values.values())

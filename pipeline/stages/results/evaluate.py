@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +11,6 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.pipeline.contract.stage import (
     FACE_ALIGNMENT,
     GENERATOR,
@@ -23,13 +21,7 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.contract.units import Arrays, Row, as_rows
 from motionloom.pipeline.evaluation.clip_metrics import Performance, clip_figures, measure_clip, metrics_of
-from motionloom.pipeline.evaluation.diagnosis import (
-    Case,
-    confusions,
-    extreme_cases,
-    mean_distances,
-    write_cases,
-)
+from motionloom.pipeline.evaluation.diagnosis import Diagnosis
 from motionloom.pipeline.evaluation.figures import (
     MODEL,
     RECORDED,
@@ -49,16 +41,14 @@ from motionloom.pipeline.evaluation.latent_metrics import (
 from motionloom.pipeline.evaluation.movement import Features, all_features, movement_figures
 from motionloom.pipeline.evaluation.reconstruction import clip_error_figures, face_figures
 from motionloom.pipeline.evaluation.reference_baselines import LOOKUPS, mean_poses
-from motionloom.pipeline.evaluation.truth import Truth, digest_of, reconstruct_truth, spread_any, truth_of
+from motionloom.pipeline.evaluation.truth import Truth, digest_of, spread_any, truth_of
 from motionloom.pipeline.stages.results.evaluate_units import (
-    ACTION,
     CAPTIONS,
     CLIP,
     DISTANCES,
     FACE,
     JOINTS,
     LATENT,
-    MOTION,
     MOVEMENT,
     EvaluateConfig,
     EvaluationUnits,
@@ -98,10 +88,7 @@ class _Evaluation(EvaluationUnits):
 
     def __init__(self, context: StageContext) -> None:
         super().__init__(context)
-        self.cases: list[Case] = []
-        self.actions: dict[str, dict[str, dict[str, int]]] = {}
-        """What was made -> confusions of actions."""
-        self.details: dict[str, Any] = {}
+        self.diagnosis = Diagnosis(self.dataset.layout)
 
     def measured(self) -> FigureFile:
         """All figures, each beside its reference baselines; `cases.safetensors` is written beside them."""
@@ -124,10 +111,7 @@ class _Evaluation(EvaluationUnits):
             for role, stage in stages.items()
         }
         about = self.about(self.bundle) | {"judges": judges}
-        layout = self.dataset.layout
-        self.details |= {"fps": layout.fps, "skeleton": layout.skeleton.name, "actions": self.actions}
-        self.details["cases"] = write_cases(context.folder, self.cases)
-        return FigureFile("evaluate", tuple(figures), about, self.details)
+        return FigureFile("evaluate", tuple(figures), about, self.diagnosis.write(context.folder))
 
     def _weights(self, role: str) -> str:
         return sha256_of(self.context.input(role) / "model.safetensors")
@@ -174,23 +158,10 @@ class _Evaluation(EvaluationUnits):
                     repeats=self.config.repeats,
                     seed=self.context.seed,
                 )
-        self._diagnose(found, rows)
-        return out
-
-    def _diagnose(self, found: Sequence[Arrays], rows: Sequence[Row]) -> None:
-        """Note errors of joints, confusions of actions and the worst and best of what was reconstructed."""
-        clips, tokenizer = self.shown, self.tokenizer
-        assert tokenizer is not None
         distances = np.concatenate([table[DISTANCES] for table in found])
-        frames = [len(truth.features) for truth in clips]
-        self.details["joints"] = mean_distances(distances, frames, tokenizer.layout.skeleton)
-        actions = np.concatenate([table[ACTION] for table in found])
-        self.actions["reconstructed"] = confusions(clips, actions.tolist())
-
-        def joints(number: int) -> NDArray[np.float64]:
-            return joints_of(reconstruct_truth(tokenizer, clips[number]), tokenizer.layout)
-
-        self.cases += extreme_cases("reconstruction", clips, [row["mpjpe"] for row in rows], joints)
+        self.diagnosis.take_distances(distances, [len(truth.features) for truth in self.shown])
+        self.diagnosis.take("reconstruction", self.shown, found, [row["mpjpe"] for row in rows])
+        return out
 
     def by_judges(self, made: Sequence[Arrays]) -> list[Figure]:
         """Figures by the latents of each judge."""
@@ -200,15 +171,10 @@ class _Evaluation(EvaluationUnits):
             others = judge.judged(self.others)
             nearest = {} if judge.of_faces else self._nearest_captions
             latents = judge.latents(truths, self._latents(made, role), others, nearest)
-            if not judge.of_faces and not any(case.of == "generated" for case in self.cases):
-                first = [table for table in made if ACTION in table]
-                actions = np.concatenate([table[ACTION] for table in first])
-                self.actions["generated"] = confusions(truths, actions.tolist())
-                motions = [t[name] for t in first for name in sorted(t) if name.startswith(MOTION)]
+            if not judge.of_faces:
                 apart = unit_length(latents.text) - unit_length(latents.made[0])
-                self.cases += extreme_cases(
-                    "generated", truths, apart.norm(dim=-1).tolist(), motions.__getitem__
-                )
+                first = self._repeats(made)[0]
+                self.diagnosis.take("generated", truths, first, apart.norm(dim=-1).tolist())
             out += judged_figures(
                 role,
                 _NAMES[role],

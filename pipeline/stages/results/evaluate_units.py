@@ -19,7 +19,7 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.contract.units import Arrays, as_table, even_slices
 from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
-from motionloom.pipeline.evaluation.diagnosis import joint_distances, shown_actions
+from motionloom.pipeline.evaluation.diagnosis import as_shown, joint_distances
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.movement import all_features
 from motionloom.pipeline.evaluation.reconstruction import clip_errors, expression_directions, face_errors
@@ -41,10 +41,10 @@ from motionloom.pipeline.store.networks import TrainedTokenizer
 
 _RECONSTRUCTED, _GENERATED = 16, 64
 """Clips at a time, at most."""
-JOINTS, FACE, CLIP, MOVEMENT, MOTION = "joints/", "face/", "clip/", "movement/", "motion/"
-"""Begin the names of what is measured of a clip, or made for it."""
-DISTANCES, ACTION = "distances", "action"
-"""Errors of joints [n, N] and names of actions [n] of n clips."""
+JOINTS, FACE, CLIP, MOVEMENT = "joints/", "face/", "clip/", "movement/"
+"""Begin the names of what is measured of a clip."""
+DISTANCES = "distances"
+"""Errors of joints [n, N] of n clips."""
 CAPTIONS = "texts.json"
 """The member of a clip that holds its captions."""
 LATENT = {"tma": "latent", "evaluator": "latent_evaluator", "face_evaluator": "latent_face"}
@@ -202,7 +202,7 @@ class EvaluationUnits(Evaluation):
         out[DISTANCES] = np.stack([joint_distances(one.joints, one.recorded) for one in shown])
         # Hands that were never recorded are no truth to be compared with.
         out[DISTANCES][[not t.present & HANDS for t in truths], BODY_JOINTS:] = np.nan
-        out[ACTION] = shown_actions(shown)
+        out |= as_shown(shown)
         faces = self.context.given.get("face_tokenizer", tokenizer)
         models_faces = faces.layout.has("face") and faces.net.part in ("face", "all")
         if models_faces:
@@ -242,8 +242,7 @@ class EvaluationUnits(Evaluation):
         moves = all_features((m.joints for m in motions), fps)
         out |= {MOVEMENT + kind: rows for kind, rows in moves.items()}
         if draw == 0:
-            out |= {f"{MOTION}{number:03d}": m.joints.astype(np.float32) for number, m in enumerate(motions)}
-            out[ACTION] = shown_actions(made_for)
+            out |= as_shown(made_for)
         for role, judge in self.performed_by.items():
             faces, pairs = judge.of_faces, zip(truths, motions, strict=True)
             shown = [

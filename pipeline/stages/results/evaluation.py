@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,10 @@ from motionloom.pipeline.evaluation.figures import (
 )
 from motionloom.pipeline.evaluation.movement import Features, all_features
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.render.page import Page
+from motionloom.pipeline.stages.results.report_parts import draw_evaluations
 
+PAGE = "figures.html"
 _REFERENCE = 64
 """Motions at a time whose features are taken."""
 
@@ -57,17 +61,25 @@ class EvaluationStage(StageKind):
         self.evaluation(context).share()
 
     def run(self, context: StageContext) -> None:
-        """Write `metrics.json` and print a line for each of its tables."""
+        """Write `metrics.json` and a page of its tables, of which a line each is printed."""
         found = self.evaluation(context).measured()
         found.write(context.folder / FILE_NAME)
+        page = Page(f"Figures of {context.recipe}", context.name)
+        draw_evaluations(page, _showings(context.folder, found))
+        page.write(context.folder / PAGE)
         print_summary(found.figures, context.console)
+        text = f"    all {len(found.figures)} figures: {context.folder / PAGE}"
+        context.console.print(text, markup=False, soft_wrap=True)
         context.units.clear()
 
     def show(self, stage: CompletedStage, given: Inputs) -> list[Showing]:
         """The tables, and where the model errs."""
-        found = FigureFile.read(stage.folder / FILE_NAME)
-        tables = [FigureTable(*table) for table in figure_tables(found.figures)]
-        return [*tables, *showings(stage.folder, found.details)]
+        return _showings(stage.folder, FigureFile.read(stage.folder / FILE_NAME))
+
+
+def _showings(folder: Path, found: FigureFile) -> list[Showing]:
+    tables = [FigureTable(*table) for table in figure_tables(found.figures)]
+    return [*tables, *showings(folder, found.details)]
 
 
 class Evaluation:

@@ -17,7 +17,7 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import GROUP_FRAMES
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.showing import Bars, Confusions, FigureTable, JointErrors
+from motionloom.pipeline.contract.showing import Bars
 from motionloom.pipeline.contract.stage import (
     GENERATOR,
     SHOWING,
@@ -30,7 +30,6 @@ from motionloom.pipeline.contract.stage import (
     stage_kind,
 )
 from motionloom.pipeline.evaluation.dances import dance_to, dances_of, seed_frames, with_music
-from motionloom.pipeline.evaluation.diagnosis import Clips
 from motionloom.pipeline.evaluation.truth import Truth, perform, reconstruct_all, spread_truths, truth_at
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.motion import GeneratedMotion
@@ -43,6 +42,7 @@ from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
 from motionloom.pipeline.stages.results.report_parts import (
     add_run_facts,
     draw_curves,
+    draw_evaluations,
     draw_flights,
     draw_showings,
     say_missing,
@@ -103,9 +103,8 @@ class ReportStage(StageKind):
             for stage in stages
             for thing in stage.kind.show(stage, context.stage_cache.given(stage.inputs))
         ]
-        draw_showings(page, "Figures on held-out clips", shown, FigureTable)
-        draw_showings(page, "Where it errs", shown, JointErrors, Confusions, Clips)
-        draw_curves(page, stages if state is None else _logged(stages, state), samples=state is not None)
+        draw_evaluations(page, shown)
+        draw_curves(page, stages if state is None else _logged(stages, state), flights=state is not None)
         draw_showings(page, "Codebooks", shown, Bars)
         if state is not None:
             draw_flights(page, state)

@@ -16,7 +16,7 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.showing import Bars, Confusions, FigureTable, JointErrors, Showing
 from motionloom.pipeline.contract.stage import CompletedStage, StageContext, stage_kind
 from motionloom.pipeline.evaluation.diagnosis import Clips
-from motionloom.pipeline.render.charts import curve_label, log_lines
+from motionloom.pipeline.render.charts import curve_label, log_lines, own_lines
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import ViewerMotion
 from motionloom.pipeline.store.artifact import Terms
@@ -27,12 +27,19 @@ from motionloom.pipeline.store.training_log import (
     SAMPLES,
     read_flight,
     read_rows,
+    read_starts,
     read_training_log,
     rise_of_loss,
 )
 from motionloom.pipeline.store.yaml import flatten, setting_text
 
 SPLITS = ("train", "val", "test")
+
+
+def draw_evaluations(page: Page, shown: Sequence[Showing]) -> None:
+    """What evaluations have to show: tables, then where the model errs."""
+    draw_showings(page, "Figures on held-out clips", shown, FigureTable)
+    draw_showings(page, "Where it errs", shown, JointErrors, Confusions, Clips)
 
 
 def draw_showings(page: Page, heading: str, shown: Sequence[Showing], *kinds: type[Showing]) -> None:
@@ -44,7 +51,7 @@ def draw_showings(page: Page, heading: str, shown: Sequence[Showing], *kinds: ty
         if isinstance(thing, FigureTable):
             page.add_table(list(thing.columns), [list(row) for row in thing.rows], thing.title, pinned=True)
         elif isinstance(thing, JointErrors):
-            page.add_joint_errors(thing.errors, Skeleton.named(thing.skeleton), thing.title)
+            page.add_joint_errors(thing.errors, thing.skeleton, thing.title)
         elif isinstance(thing, Confusions):
             page.add_matrix(thing.counts, thing.title)
         elif isinstance(thing, Clips):
@@ -54,24 +61,38 @@ def draw_showings(page: Page, heading: str, shown: Sequence[Showing], *kinds: ty
             page.add_histogram(uses, ends, thing.title, thing.x_label, thing.y_label)
 
 
-def draw_curves(page: Page, stages: Sequence[CompletedStage], *, samples: bool = False) -> None:
-    """Curves of trainings, finished or running; with `samples` also what was drawn meanwhile."""
+_FLOWN = {
+    "lr": "learning rate",
+    "grad_norm": "norm of the gradients",
+    "frames_per_second": "frames a second",
+    "tokens_per_second": "tokens a second",
+}
+
+
+def draw_curves(page: Page, stages: Sequence[CompletedStage], *, flights: bool = False) -> None:
+    """Curves of trainings, finished or running; with `flights` also what equal runs do not share: rate, norms
+    of gradients and speed, where the training went on after a kill, and what was drawn meanwhile.
+    """
     page.add_heading("Training")
     for stage in stages:
         rows = read_training_log(stage.folder)
-        keys = sorted({k.partition("/")[2] for row in rows for k in row if "/" in k})
+        starts = read_starts(stage.folder) if flights else []
+        marks = [step for step, _ in starts]
+        page.add_plot(log_lines(rows, "loss", "loss"), f"{stage.name}: loss", marks)
+        keys = sorted({k.partition("/")[2] for row in rows for k in row if "/" in k} - {"loss"})
         for curve in stage.kind.curves:
-            lines = [
-                line
-                for key in keys
-                if key.startswith(curve.prefix)
-                for line in log_lines(rows, key, curve_label(key))
-            ]
-            if lines:
-                page.add_plot(lines, f"{stage.name}: {curve.title or curve_label(curve.prefix)}")
+            named = [key for key in keys if key.startswith(curve.prefix)]
+            lines = [line for key in named for line in log_lines(rows, key, curve_label(key))]
+            page.add_plot(lines, f"{stage.name}: {curve.title or curve_label(curve.prefix)}", marks)
+        if flights:
+            flown = read_flight(stage.folder).get(0, [])
+            for figure, title in _FLOWN.items():
+                page.add_plot(own_lines(flown, figure), f"{stage.name}: {title}", marks)
+            for step, reached in starts:
+                page.add_text(f"{stage.name} was ended at step {reached} or later, and went on from {step}.")
         if risen := rise_of_loss(rows):
             page.add_text(f"{stage.name}: {risen}.")
-        if samples:
+        if flights:
             _draw_samples(page, stage)
 
 

@@ -211,12 +211,15 @@ def test_retrieval_by_another_alignment_stage(
 
 def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..., Any]) -> None:
     done = call("evaluate", copy, "--clips", 4, "--repeats", 2)
-    assert done.code == 0 and "nearest training clip" in done.out and "chance" in done.out
+    assert done.code == 0 and "nearest training clip" in done.out and len(done.out.splitlines()) < 20
+    assert done.out.strip().endswith(str(copy / "evaluate/figures.html"))
     file = FigureFile.read(copy / "evaluate/metrics.json")
     mpjpe, face, top = (file.of(name) for name in ("reconstruction.mpjpe", "face.expression", "tma.top-1"))
     assert mpjpe is not None and face is not None and top is not None
     assert mpjpe.value > 0 and (mpjpe.protocol["clips"], mpjpe.protocol["split"]) == (4, "test")
-    assert face.value > 0 and "expression error" in done.out
+    assert face.value > 0 and "of fewer than 10 clips" in done.out
+    for wanted in ("expression error", "Where it errs", "worst 1", "punch"):
+        assert wanted in (copy / "evaluate/figures.html").read_text()
     assert top.protocol["candidates"] in (2, 3, 4), "61 wrong captions, or as many as there are"
     for row in (MODEL, RECORDED):
         first, fifth = file.of("tma.top-1", row), file.of("tma.top-5", row)
@@ -227,4 +230,5 @@ def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..
     page = tmp_path / "new/folder/page.html"
     done = call("report", copy, "-o", page)
     assert done.code == 0 and done.out.strip() == str(page)
-    assert "Figures on held-out clips" in page.read_text()
+    for wanted in ("Figures on held-out clips", "gpt: loss", "gpt: learning rate", "gpt: tokens a second"):
+        assert wanted in page.read_text()

@@ -24,7 +24,7 @@ from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.figures import CHANCE, MODEL, RECORDED, STILL, TRAINING, FigureFile
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.latent_metrics import Latents, judged_figures
-from motionloom.pipeline.evaluation.reconstruction import FINGERS, published_errors
+from motionloom.pipeline.evaluation.reconstruction import FINGERS, expression_directions, published_errors
 from motionloom.pipeline.evaluation.retrieval import retrieve
 from motionloom.pipeline.evaluation.truth import drawn, reconstruct_all, spread_any, truth_of
 from motionloom.pipeline.results.paper.compare import compare_with_paper
@@ -282,7 +282,7 @@ stages:
   face_evaluator:
     {kind: tma, part: face, net: {latent: 8, ff: 16, layers: 1, frame_stride: 1}, loss: {contrastive: 0.1},
      train: {steps: 4, batch_size: 8, checkpoint_every: 4, validate_every: 4}}
-  evaluate: {clips: 9, repeats: 2, size: 4}
+  evaluate: {clips: 9, repeats: 2, size: 4, face_model: HEAD}
   # As in the recipes of the baselines.
   evaluate_face_vae:
     {kind: evaluate, clips: 9, repeats: 1, size: 4,
@@ -298,7 +298,11 @@ def judged(small_run: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with an evaluator of faces, evaluated by it."""
     root = tmp_path_factory.mktemp("faces")
     shutil.copy(small_run.recipe, root / small_run.recipe.name)
-    (root / "faces.yaml").write_text(FACES)
+    # As SMPL-X's file: 300 directions of shape, 100 of expression; two of six vertices are of a face.
+    shapes = np.random.default_rng(0).normal(size=(6, 3, 400)) * 0.01
+    shapes[:4, :, 300:] = 0.0
+    np.savez(root / "SMPLX.npz", shapedirs=shapes)
+    (root / "faces.yaml").write_text(FACES.replace("HEAD", str(root / "SMPLX.npz")))
     shutil.copytree(small_run.folder, root / "run")
     wanted = "evaluate,evaluate_face_vae,evaluate_face_diffusion"
     run_recipe(root / "faces.yaml", root / "run", select=Selection(until=wanted), console=Console(quiet=True))
@@ -317,16 +321,41 @@ def test_faces_have_a_judge(judged: Path) -> None:
     assert 0 <= made["reconstruction.face_evaluator.top-3"] <= 1
     top = file.of("face_evaluator.top-1")
     assert top is not None and (top.protocol["clips"], top.protocol["candidates"]) == (7, 4)
-    # By hand: one clip's expressions.
+    # By hand: expressions, and the vertices that they move.
+    with np.load(judged / "SMPLX.npz") as model:
+        moves = model["shapedirs"][4:, :, 300:350]
     stages, stage_cache = finished_stages(judged / "run"), StageCache()
     data, tokenizer = stage_cache.get(stages["data"]).split("test"), stage_cache.get(stages["face_tokenizer"])
-    errors, frames = 0.0, 0
+    errors, frames, vertices = 0.0, 0, 0.0
     for truth in (truth_of(data, index) for index in spread_any(data, 9)):
         if truth.face is not None:
             rebuilt = reconstruct_all(tokenizer, truth)[:, data.layout.slice("face")].astype(np.float64)
             errors += np.sqrt(np.square(rebuilt - truth.face).sum(-1)).sum()
             frames += len(rebuilt)
+            for before, after in zip(truth.face, rebuilt, strict=True):
+                places = [
+                    [float(axis @ values) for axis in moves.reshape(6, 50)] for values in (before, after)
+                ]
+                off = np.reshape(np.subtract(*places), (2, 3))
+                vertices += 1000 * np.linalg.norm(off, axis=1).mean()
     assert made["face.expression"] == pytest.approx(errors / frames, abs=2e-5)
+    assert made["face.vertex"] == pytest.approx(vertices / frames, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "says"),
+    [
+        (np.ones((5, 3, 20)), "300 shape and 100 expression directions"),
+        (np.zeros((5, 3, 400)), "all 0"),
+        (np.full((5, 3, 400), np.nan), "NaN"),
+        (np.ones((5, 400)), r"\[5, 400\]"),
+        (np.array([{}]), "pickle"),
+    ],
+)
+def test_another_model_is_refused(shapes: np.ndarray, says: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "model.npz", shapedirs=shapes)
+    with pytest.raises(UserError, match=rf"model\.npz.*{says}"):
+        expression_directions(tmp_path / "model.npz")
 
 
 @pytest.mark.slow

@@ -34,6 +34,7 @@ from motionloom.datasets.shards.sample import captions_from_json
 from motionloom.datasets.text.cache import CacheInfo, TextCache
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.contract.lookup import open_exported
+from motionloom.pipeline.evaluation.diagnosis import showings
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.tokens import TokenStore
 from motionloom.pipeline.store.weights import load_weights
@@ -115,6 +116,9 @@ def test_checkpoints_with_code_are_passed_over(make: Callable[[], bytes], name: 
 # --- weights, statistics, tokens -------------------------------------------------------------------------
 
 SAFETENSORS: dict[str, Callable[[Path], object]] = {
+    "cases.safetensors": lambda path: showings(
+        path.parent, {"skeleton": "smplx52", "fps": 20, "actions": {}, "cases": [{"of": "generated"}]}
+    ),
     "model.safetensors": lambda path: load_weights(path.parent, torch.nn.Linear(2, 2)),
     "stats.safetensors": FeatureStats.load,
     "audio.safetensors": FrameStats.load,

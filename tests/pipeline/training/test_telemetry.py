@@ -17,7 +17,7 @@ from motionloom.datasets.base.files import write_text
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.stages.results.report_parts import draw_flights
 from motionloom.pipeline.store.run_state import RunState, StageState
-from motionloom.pipeline.store.training_log import read_flight, read_rows, read_training_log
+from motionloom.pipeline.store.training_log import read_flight, read_rows, read_starts, read_training_log
 from motionloom.pipeline.training.telemetry import WaitTimes, waited_in_steps
 from motionloom.pipeline.training.utilization import Utilization, pass_flops
 
@@ -86,6 +86,8 @@ def test_steps_that_come_again_are_there_once(tmp_path: Path) -> None:
         file.write('{"step": 40, "t')  # killed here
     train(tmp_path, steps=40)
     assert [row["step"] for row in read_rows(path)] == [10, 20, 30, 40]
+    ((step, reached),) = read_starts(tmp_path)
+    assert step <= reached == 30
     (tmp_path / "flight/rank_x.jsonl").write_text(json.dumps({"step": 1}))
     assert list(read_flight(tmp_path)) == [0]
 
