@@ -32,6 +32,8 @@ Part = Literal["all", "bodyhand", "body", "hand", "face"]
 
 BODY_JOINTS = 22
 WRISTS = (20, 21)
+FINGERS = (range(22, 37), range(37, 52))
+"""Joints of `smplx52`, left and right."""
 FACE_DIMS = 50
 ROOT = ("root_yaw_velocity", "root_xz_velocity", "root_height")
 """Fields of the way that the root goes."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,13 @@ from safetensors.numpy import load_file, save
 from motionloom.datasets.actions.measure import action_of, actions_of
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_bytes
-from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
+from motionloom.datasets.motion.layout import BODY_JOINTS, FINGERS, WRISTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.showing import Confusions, JointErrors, Showing
 from motionloom.pipeline.contract.units import Arrays
 from motionloom.pipeline.evaluation.clip_metrics import Joints, Performance
-from motionloom.pipeline.evaluation.reconstruction import FINGERS
 from motionloom.pipeline.evaluation.truth import Truth
-from motionloom.pipeline.render.viewer import ViewerMotion
+from motionloom.pipeline.render.viewer import Clips, ViewerMotion
 
 FILE_NAME = "cases.safetensors"
 _ACTION, _MOTION = "action", "motion/"
@@ -38,14 +36,6 @@ _CASES = {
     "generated": ("Generated worst and best, by the judge's latents", "{:.2f} from its words"),
 }
 """What was made -> title of its clips, and what is said of each."""
-
-
-@dataclass(frozen=True)
-class Clips:
-    """Motions to watch."""
-
-    title: str
-    motions: Sequence[ViewerMotion]
 
 
 class Diagnosis:

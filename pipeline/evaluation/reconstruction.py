@@ -26,7 +26,7 @@ from torch import Tensor
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import HANDS
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
+from motionloom.datasets.motion.layout import BODY_JOINTS, FINGERS, WRISTS
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.metrics.reconstruction import JointErrors, joint_errors, mpjpe
@@ -46,9 +46,6 @@ from motionloom.pipeline.evaluation.figures import (
 from motionloom.pipeline.evaluation.reference_baselines import NearestClip, local_joints
 from motionloom.pipeline.evaluation.truth import Truth, reconstruct_all, reconstruct_truth
 from motionloom.pipeline.store.networks import TrainedTokenizer
-
-FINGERS = (range(22, 37), range(37, 52))
-"""Joints of `smplx52`, left and right."""
 
 _CLIP_ROWS = {"": MODEL, "_nearest_train_clip": NEAREST, "_mean_pose": STILL}
 _FACE_ROWS = {"": MODEL, "_mean": MEAN_FACE}

@@ -78,6 +78,14 @@ class ViewerMotion:
     note: str = ""
 
 
+@dataclass(frozen=True)
+class Clips:
+    """Motions to watch under a title of their own: a `Showing` of a stage."""
+
+    title: str
+    motions: Sequence[ViewerMotion]
+
+
 def write_viewer(path: Path, motions: Sequence[ViewerMotion], title: str, note: str = "") -> None:
     """Write the viewer page; `UserError` for motions that cannot be drawn."""
     write_text(path, viewer_page(motions, title, note))

@@ -15,10 +15,9 @@ from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.showing import Bars, Confusions, FigureTable, JointErrors, Showing
 from motionloom.pipeline.contract.stage import CompletedStage, StageContext, stage_kind
-from motionloom.pipeline.evaluation.diagnosis import Clips
 from motionloom.pipeline.render.charts import curve_label, log_lines, own_lines
 from motionloom.pipeline.render.page import Page
-from motionloom.pipeline.render.viewer import ViewerMotion
+from motionloom.pipeline.render.viewer import Clips, ViewerMotion
 from motionloom.pipeline.store.artifact import Terms
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.run_state import RunState

@@ -11,12 +11,11 @@ import pytest
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.motion.layout import WRISTS
+from motionloom.datasets.motion.layout import FINGERS, WRISTS
 from motionloom.datasets.synth.generate import SynthConfig, make_sample
 from motionloom.pipeline.contract.showing import Confusions, JointErrors
 from motionloom.pipeline.evaluation.clip_metrics import Performance
 from motionloom.pipeline.evaluation.diagnosis import (
-    Clips,
     Diagnosis,
     as_shown,
     confusions,
@@ -24,9 +23,9 @@ from motionloom.pipeline.evaluation.diagnosis import (
     joint_distances,
     showings,
 )
-from motionloom.pipeline.evaluation.reconstruction import FINGERS
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.render.page import Page
+from motionloom.pipeline.render.viewer import Clips
 from motionloom.pipeline.stages.results.report_parts import draw_evaluations
 
 CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=5.0, actions=("walk", "squat"))

@@ -218,7 +218,7 @@ def test_evaluate_and_report_again(copy: Path, tmp_path: Path, call: Callable[..
     assert mpjpe is not None and face is not None and top is not None
     assert mpjpe.value > 0 and (mpjpe.protocol["clips"], mpjpe.protocol["split"]) == (4, "test")
     assert face.value > 0 and "of fewer than 10 clips" in done.out
-    for wanted in ("expression error", "Where it errs", "worst 1", "punch"):
+    for wanted in ("expression error", "Where it errs", "worst 1", "mm at each joint"):
         assert wanted in (copy / "evaluate/figures.html").read_text()
     assert top.protocol["candidates"] in (2, 3, 4), "61 wrong captions, or as many as there are"
     for row in (MODEL, RECORDED):

@@ -17,14 +17,14 @@ from text_samples import tiny_clip, tiny_distilbert
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
-from motionloom.datasets.motion.layout import WRISTS, MotionLayout
+from motionloom.datasets.motion.layout import FINGERS, WRISTS, MotionLayout
 from motionloom.models.metrics import retrieval
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.figures import CHANCE, MODEL, RECORDED, STILL, TRAINING, FigureFile
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.latent_metrics import Latents, judged_figures
-from motionloom.pipeline.evaluation.reconstruction import FINGERS, expression_directions, published_errors
+from motionloom.pipeline.evaluation.reconstruction import expression_directions, published_errors
 from motionloom.pipeline.evaluation.retrieval import retrieve
 from motionloom.pipeline.evaluation.truth import drawn, reconstruct_all, spread_any, truth_of
 from motionloom.pipeline.results.paper.compare import compare_with_paper
@@ -365,4 +365,9 @@ def test_each_facial_generator_has_a_row(judged: Path) -> None:
     assert set(ours) == {"cVAE", "Diffusion", "Ours"}
     for row in ours.values():
         assert all(cell is not None for cell in row.cells[:6]), row
-    assert len({ours[method].cells[0].text for method in ours}) == 3  # type: ignore[union-attr]
+    assert "– of fewer than 10 clips" in found.markdown()
+    files = [
+        FigureFile.read(judged / f"run/stages/evaluate{of}/metrics.json")
+        for of in ("", "_face_vae", "_face_diffusion")
+    ]
+    assert len({fid.value for file in files if (fid := file.of("face_evaluator.fid"))}) == 3

@@ -184,7 +184,7 @@ def test_figures_of_dances(ude_run: Any, tmp_path: Path, call: Call) -> None:
     (row,) = [row for row in table.rows if row.source == "ours"]
     figure = evaluation.file.of("beat_align.bailando")
     assert row.method == "Ours" and row.cells[0] is not None and figure is not None
-    assert row.cells[0].text.startswith(f"{figure.value:.4f}")
+    assert row.cells[0].text == "–" and figure.value > 0, "of fewer than ten dances"
 
 
 # The files of the tables: they parse, they are all there, and their numbers are the papers'.
