@@ -32,7 +32,7 @@ def evaluate(
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Markdown file for a table.")] = None,
 ) -> None:
-    """Figures on the test split, each beside its trivial answer; with --table, beside a paper's.
+    """Figures on the test split, each beside its trivial answer, and a page; with --table, beside a paper's.
 
     Example: `motionloom evaluate runs/humantomato-tiny --repeats 5`
 

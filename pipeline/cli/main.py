@@ -275,7 +275,7 @@ def report(
     ] = None,
     at: At = None,
 ) -> None:
-    """One self-contained page: motions to watch, figures, where they err, curves, codebooks, what was run.
+    """One page: motions to watch, figures, where the model errs, training curves, codebooks, what was run.
 
     Of an unfinished run it shows what there is and says what is missing.
 

@@ -183,7 +183,7 @@ def _stages_of_recipe(page: Page, context: StageContext) -> None:
         steps = getattr(train, "steps", None)
         rows.append([stage.name, stage.kind.summary, f"{steps:,}" if steps else None])
     page.add_table(["stage", "what it makes", "steps"], rows, f"The stages of this page, seed {context.seed}")
-    page.add_text("How long each stage took, and on what, is on the page that motionloom report makes.")
+    page.add_text("Times, speed, learning rates and resumes are on the page that motionloom report makes.")
 
 
 def _stages_of_run(page: Page, state: RunState) -> None:
