@@ -221,15 +221,12 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def shown(values: Any, column: Mapping[str, Any]) -> str:
-    """A cell: text as it is, a value, both of two, or the mean over seeds with its 95 % interval (Student's
-    t), which of two values would say little.
-    """
+    """A cell: text as it is, a value, both of two seeds, or the mean over seeds with its 95 % interval."""
     if not isinstance(values, list):
         return str(values)
-    digits, scaled = column["digits"], [column["scale"] * value for value in values]
-    if len(scaled) == 2:
-        return f"{scaled[0]:.{digits}f} and {scaled[1]:.{digits}f}"
-    found = estimate(scaled)
+    digits, found = column["digits"], estimate([column["scale"] * value for value in values])
+    if found.pair:
+        return " / ".join(f"{value:.{digits}f}" for value in found.pair)
     half = "" if found.interval is None else f" ± {found.interval:.{digits}f}"
     return f"{found.value:.{digits}f}{half}"
 

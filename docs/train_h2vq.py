@@ -65,13 +65,15 @@ def main() -> None:
     optimizer = torch.optim.AdamW(net.parameters(), lr=given.lr, betas=(0.9, 0.99))
 
     # 3. What an earlier process has left.
-    checkpoint, log = given.out / "last.pt", given.out / "log.jsonl"
-    step, rows = 0, []
+    checkpoint = given.out / "last.pt"
+    step = 0
+    rows = []
     if checkpoint.exists():
         state = torch.load(checkpoint, map_location=given.device, weights_only=True)
         net.load_state_dict(state["net"])
         optimizer.load_state_dict(state["optimizer"])
-        step, rows = state["step"], state["rows"]
+        step = state["step"]
+        rows = state["rows"]
         print(f"goes on from step {step} of {given.steps}")
 
     # 4. Batches by number: batch k is a function of (seed, k), so the step is all that a resume has to know.
@@ -80,7 +82,8 @@ def main() -> None:
         return WindowBatches(train, stats, window=WINDOW, batch_size=size, seed=given.seed, columns=columns)
 
     loader = DataLoader(Steps(batches, given.steps, step), batch_size=None, num_workers=given.workers)
-    first, begin = step, time.perf_counter()
+    first = step
+    begin = time.perf_counter()
     for batch in loader:
         # 5. One step: loss, gradients, rate, weights.
         for group in optimizer.param_groups:
@@ -110,7 +113,7 @@ def main() -> None:
             partial.replace(checkpoint)  # whole or not at all
 
     save_file({k: v.cpu().contiguous() for k, v in net.state_dict().items()}, given.out / "model.safetensors")
-    log.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    (given.out / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
 def rate(step: int, steps: int) -> float:
@@ -125,16 +128,19 @@ def rate(step: int, steps: int) -> float:
 def validate(net: H2VQ, clips: ShardDataset, stats: FeatureStats) -> float:
     """MPJPE in mm of whole clips through tokens and back, each frame's root at the origin."""
     net.eval()
-    device, layout = next(net.parameters()).device, clips.layout
-    columns, errors = net.columns.cpu().numpy(), []
+    device = next(net.parameters()).device
+    columns = net.columns.cpu().numpy()
+    errors = []
     for number in range(len(clips)):
         motion = np.asarray(clips.motion(number))[:, columns]
         motion = motion[: len(motion) // 4 * 4]  # tokens are of groups of four frames
         x = torch.from_numpy(stats.normalize(motion, columns))[None].to(device)
-        present = torch.from_numpy(layout.present_columns[clips.present[number], columns])[None].to(device)
+        present = torch.from_numpy(clips.layout.present_columns[clips.present[number], columns])[None].to(
+            device
+        )
         codes = net.encode(x, present=present)  # {"body": [1, T / 2], "hand": [1, T / 4]}
         made = stats.denormalize(net.decode(codes, present=present)[0].cpu().numpy(), columns)
-        pair = [torch.from_numpy(joints_of(features, layout)) for features in (made, motion)]
+        pair = [torch.from_numpy(joints_of(features, clips.layout)) for features in (made, motion)]
         errors.append(mpjpe(*pair))  # [T]
     net.train()
     return float(torch.cat(errors).mean())

@@ -28,7 +28,8 @@ from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.render.viewer import Clips, ViewerMotion
 
 FILE_NAME = "cases.safetensors"
-_ACTION, _MOTION = "action", "motion/"
+_ACTION = "action"
+_MOTION = "motion/"
 EACH = 3
 """Clips kept as the worst, and as the best."""
 _CASES = {
@@ -137,17 +138,14 @@ def showings(folder: Path, details: Mapping[str, Any]) -> list[Showing]:
         return []
     try:
         skeleton = Skeleton.named(details["skeleton"])
-        joints = details.get("joints")
-        title = "Reconstruction, mm at each joint, its right hand on your left"
-        return [
-            *([JointErrors(title, skeleton, joints)] if joints else []),
-            *(
-                Confusions(f"Actions asked for (rows) and shown (columns), {of}, clips", counts)
-                for of, counts in details["actions"].items()
-                if counts
-            ),
-            *_clips(folder, details, skeleton),
-        ]
+        out: list[Showing] = []
+        if joints := details.get("joints"):
+            title = "Reconstruction, mm at each joint, its right hand on your left"
+            out.append(JointErrors(title, skeleton, joints))
+        for of, counts in details["actions"].items():
+            if counts:
+                out.append(Confusions(f"Actions asked for (rows) and shown (columns), {of}, clips", counts))
+        return out + _clips(folder, details, skeleton)
     except (SafetensorError, LookupError, TypeError, ValueError, AttributeError, OSError) as error:
         why = f"{type(error).__name__}: {error}"[:200]
         raise UserError(

@@ -124,11 +124,9 @@ class Figure:
     @property
     def nothing(self) -> str:
         """Why it is shown as a dash, where it says nothing; else empty."""
-        clips = self.count or self.protocol.get("clips")
-        if isinstance(clips, int) and clips < FEW:
+        if int(self.count or self.protocol.get("clips") or FEW) < FEW:
             return f"of fewer than {FEW} clips"
-        among = self.protocol.get("candidates")
-        if isinstance(among, int) and among <= FEW:
+        if int(among := self.protocol.get("candidates") or FEW + 1) <= FEW:
             return f"among {among}, which tells nothing"
         if self.unit == "share" and (self.interval or 0.0) >= _NOTHING_SAID:
             return f"too few {self.over}"
@@ -290,15 +288,13 @@ def _unit(figure: Figure) -> str:
     return "" if figure.unit in ("", "share") else f", {figure.unit}"
 
 
-def print_summary(figures: Iterable[Figure], console: Console) -> None:
+def print_summary(figures: Sequence[Figure], console: Console) -> None:
     """A line for each table on a terminal: its first figure, and the first row beside it that has one."""
     from rich.markup import escape
     from rich.table import Table
 
     tables: dict[str, dict[str, Figure]] = {}
-    reasons: dict[str, None] = {}
     for one in figures:
-        reasons |= {one.nothing: None} if one.nothing else {}
         rows = tables.setdefault(one.group, {one.row: one})
         if one.name == next(iter(rows.values())).name:
             rows.setdefault(one.row, one)
@@ -310,7 +306,7 @@ def print_summary(figures: Iterable[Figure], console: Console) -> None:
         reference = "" if beside is None else f"{found[beside].text()} {beside}"
         lines.add_row(*map(escape, (f"    {first.name}{_unit(first)}", model, reference)))
     console.print(lines)
-    for reason in reasons:
+    for reason in dict.fromkeys(one.nothing for one in figures if one.nothing):
         console.print(f"    {DASH}: {reason}")
 
 

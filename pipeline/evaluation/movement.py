@@ -113,12 +113,10 @@ def movement_figures(
     facts = {**protocol, "motions": count, "reference": size}
     title = "Kinetic (k) and geometric (m) features: distance to all motions, training and test, and variety"
     notes = _few(count, size)
-    if MODEL in rows and count and size:
-        made = np.concatenate([_rows(one, kept)["m"] for one in rows[MODEL]])
-        for suffix, true in (("", reference["m"]), ("_test", real["m"])):
-            if rare := _rare(true, made):
-                name = f"movement.fid_m{suffix}"
-                notes[name] = "; ".join(filter(None, (notes.get(name), rare)))
+    made = [_rows(one, kept)["m"] for one in rows.get(MODEL, ())]
+    for name, true in (("movement.fid_m", reference["m"]), ("movement.fid_m_test", real["m"])):
+        if made and count and (rare := _rare(true, np.concatenate(made))):
+            notes[name] = "; ".join(filter(None, (notes.get(name), rare)))
     return group_figures(title, METRICS, found, facts, notes)
 
 
@@ -138,7 +136,8 @@ def _rare(true: NDArray[np.float64], made: NDArray[np.float64]) -> str:
     Features are divided by the deviation of the true motions. A statement that one of 500 makes deviates by
     so little that the few made motions that make it, or none of them, decide the distance.
     """
-    moved, own = normalized_by(true, made), normalized_by(true, true)
+    moved = normalized_by(true, made)
+    own = normalized_by(true, true)
     # The distance of each column alone, as if the columns were independent.
     parts = np.square(moved.mean(0)) + np.square(moved.std(0) - own.std(0))
     most = int(parts.argmax())

@@ -70,7 +70,8 @@ FACES = (
     Metric("face.expression", "expression error", "lower"),
     Metric("face.vertex", "vertex error", "lower", "mm"),
 )
-_SHAPES, _EXPRESSIONS = 300, 50
+_SHAPES = 300
+_EXPRESSIONS = 50
 """Directions of shape, which come first in a model's file, and those of expression that layouts have."""
 _MODEL_BYTES = 2**30
 

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS
 from motionloom.datasets.motion.skeleton import Skeleton
 
-SIZE, MARGIN, RADIUS = 420, 26, 11.5
+SIZE = 420
+MARGIN = 26
+RADIUS = 11.5
 _SHOULDER = 16
 """The first joint of the arms in `smplx52`: what follows it hangs from a shoulder."""
 _HANGING = (0.5, -0.87)
@@ -75,7 +77,7 @@ def _drawing(
     )
     most = max(values.values(), default=0.0) or 1.0
     circles = "".join(
-        f'<g class="joint" style="--share:{100 * value / most:.0f}%">'
+        f'<g class="joint" style="--p:{100 * value / most:.0f}%">'
         f"<title>{escape(skeleton.joints[j].replace('_', ' '))}: {value:.1f} mm</title>"
         f'<circle cx="{at[j][0]:.1f}" cy="{at[j][1]:.1f}" r="{RADIUS}"/>'
         f'<text x="{at[j][0]:.1f}" y="{at[j][1] + 3.8:.1f}" text-anchor="middle">{value:.0f}</text></g>'

@@ -150,7 +150,7 @@ class Page:
         body = ""
         for name, row in counts.items():
             cells = "".join(
-                f'<td class="{"right" if name == column else "wrong"}" style="--share:'
+                f'<td class="{"right" if name == column else "wrong"}" style="--p:'
                 f'{100 * row.get(column, 0) / sum(row.values()):.0f}%">{row.get(column) or "·"}</td>'
                 for column in names
             )

@@ -17,8 +17,10 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.store.files import open_own
 
 FILE_NAME = "metrics.jsonl"
-FLIGHT, STARTS = "flight", "starts.jsonl"
-"""Folder of the flight logs, in a stage's, and its file of when the training began."""
+FLIGHT = "flight"
+"""Folder of the flight logs, in a stage's."""
+STARTS = "starts.jsonl"
+"""File in that folder, of the steps at which the training began and went on."""
 SAMPLES, SAMPLE_FIGURES = "samples", "figures.jsonl"
 """Folder of the motions that are drawn meanwhile, in a stage's, and the file of their figures in it."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 
 from motionloom.datasets.base.progress import duration
 from motionloom.datasets.motion.npz import NpzFile
@@ -132,15 +133,13 @@ def draw_flights(page: Page, state: RunState) -> None:
 
 def _waits(ranks: Mapping[int, Rows]) -> list[float | str | None]:
     rows = [row for own in ranks.values() for row in own]
-    shares = [[row.get(f"waited/{cause}", 0.0) for row in rows] for cause in ("data", "checkpoints", "ranks")]
-    speeds = [
-        _mean([row[name] for row in rows if name in row]) for name in ("samples_per_second", "step_seconds")
-    ]
-    return [*speeds, *(100 * _mean(share) for share in shares)]
+    waits = (100 * _mean(rows, f"waited/{cause}") for cause in ("data", "checkpoints", "ranks"))
+    return [_mean(rows, "samples_per_second"), _mean(rows, "step_seconds"), *waits]
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else 0.0
+def _mean(rows: Rows, name: str) -> float:
+    values = [row[name] for row in rows if name in row]
+    return fmean(values) if values else 0.0
 
 
 # What was run.

@@ -10,33 +10,15 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.motion.layout import FINGERS, WRISTS
-from motionloom.datasets.synth.generate import SynthConfig, make_sample
+from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.contract.showing import Confusions, JointErrors
 from motionloom.pipeline.evaluation.clip_metrics import Performance
-from motionloom.pipeline.evaluation.diagnosis import (
-    Diagnosis,
-    as_shown,
-    confusions,
-    extremes,
-    joint_distances,
-    showings,
-)
-from motionloom.pipeline.evaluation.truth import Truth
+from motionloom.pipeline.evaluation.diagnosis import Diagnosis, as_shown, confusions, extremes, showings
+from motionloom.pipeline.evaluation.truth import truth_of
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.viewer import Clips
 from motionloom.pipeline.stages.results.report_parts import draw_evaluations
-
-CONFIG = SynthConfig(clips=40, min_seconds=2.0, max_seconds=5.0, actions=("walk", "squat"))
-LAYOUT = CONFIG.motion_layout
-
-
-def truth(number: int) -> Truth:
-    sample = make_sample(number, CONFIG)
-    body = np.asarray(sample.motion)[:, LAYOUT.part("bodyhand")].astype(np.float32)
-    words = sample.texts[0].text
-    return Truth(f"clip{number}", body, joints_of(body, LAYOUT), None, words, words, sample.meta.truth)
 
 
 def test_extremes_take_each_clip_once() -> None:
@@ -47,46 +29,28 @@ def test_extremes_take_each_clip_once() -> None:
     assert extremes([1.0]) == [("worst 1", 0)] and extremes([]) == []
 
 
-@pytest.mark.parametrize("joints", [22, 52])
-def test_errors_of_joints_by_hand(joints: int) -> None:
-    """From the root, fingers from their wrist; a mean over all frames of the clips that have the joint."""
-    rng = np.random.default_rng(0)
-    clips = [rng.normal(size=(2, frames, joints, 3)) for frames in (3, 8)]
-    found = Diagnosis(LAYOUT)
-    rows = np.full((2, joints), np.nan)
-    for row, (made, real) in zip(rows, clips, strict=True):
-        row[:] = joint_distances(made, real)
-    rows[1, 22:] = np.nan  # a clip without hands
-    found.take_distances(rows, [3, 8])
-    wanted = []
-    for j in range(joints):
-        from_ = next((w for w, hand in zip(WRISTS, FINGERS, strict=True) if j in hand), 0)
-        apart = [
-            np.linalg.norm((made[t, j] - made[t, from_]) - (real[t, j] - real[t, from_]))
-            for made, real in clips[: 2 if j < 22 else 1]
-            for t in range(len(made))
-        ]
-        wanted.append(1000 * float(np.mean(apart)))
-    assert list(found.details["joints"].values()) == pytest.approx(wanted, abs=6e-3)
-    assert list(found.details["joints"]) == list(LAYOUT.skeleton.joints[:joints])
-
-
 def test_what_was_noted_is_drawn(tmp_path: Path) -> None:
     """Who walks is shown to somebody who asked for a squat: the page says so, and plays both."""
-    by_action = {t.truth["action"]: t for t in map(truth, range(12)) if t.truth}
+    synthesize(SynthConfig(clips=40, actions=["walk", "squat"]), tmp_path / "shards", progress=False)
+    data = ShardDataset.open(tmp_path / "shards", "train")
+    layout, found = data.layout, Diagnosis(data.layout)
+    by_action = {t.truth["action"]: t for k in range(12) if (t := truth_of(data, k)).truth}
     truths = [by_action["walk"], by_action["squat"]]
-    made = as_shown([Performance(truths[0].joints, t.joints, LAYOUT.fps, truth=t.truth) for t in truths])
+    made = as_shown([Performance(truths[0].joints, t.joints, layout.fps, truth=t.truth) for t in truths])
     two = confusions([*truths, truths[0]], ["walk", "walk", ""])
     assert two == {"squat": {"walk": 1}, "walk": {"walk": 1}}, "a clip of no single action is left out"
-    found = Diagnosis(LAYOUT)
     found.take("generated", truths, [made], [0.25, 1.5])
     found.take("generated", truths, [made], [9.0, 9.0])  # by a second judge
-    found.take_distances(np.ones((1, 52)), [4])
+    errors = np.ones((2, 52)) * [[1.0], [3.0]]
+    errors[1, 22:] = np.nan  # a clip without hands
+    found.take_distances(errors, [10, 30])
     details = json.loads(json.dumps(found.write(tmp_path)))
     assert [(c["place"], c["id"], c["error"]) for c in details["cases"]] == [
         ("worst 1", truths[1].id, 1.5),
         ("best 1", truths[0].id, 0.25),
     ]
+    assert list(details["joints"]) == list(layout.skeleton.joints)
+    assert [details["joints"][name] for name in ("left_knee", "left_thumb3")] == [2.5, 1.0], "by frames"
     shown = showings(tmp_path, details)
     assert [type(one) for one in shown] == [JointErrors, Confusions, Clips]
     assert isinstance(shown[1], Confusions) and shown[1].counts == two
@@ -98,7 +62,7 @@ def test_what_was_noted_is_drawn(tmp_path: Path) -> None:
     html = page.html()
     assert html.count('<g class="joint"') == 51 and "worst 1: 1.50 from its words" in html
     squat = re.search(r'<th scope="row">squat</th>(.*?)</tr>', html)
-    assert squat is not None and re.findall(r'class="(\w+)" style="--share:(\d+)%', squat[1]) == [
+    assert squat is not None and re.findall(r'class="(\w+)" style="--p:(\d+)%', squat[1]) == [
         ("right", "0"),
         ("wrong", "100"),
     ]

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.linalg
 import torch
 from rich.console import Console
 from text_samples import tiny_clip, tiny_distilbert
@@ -19,8 +18,10 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.motion.layout import FINGERS, WRISTS, MotionLayout
 from motionloom.models.metrics import retrieval
+from motionloom.models.metrics.distributions import fid
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.diagnosis import joint_distances
 from motionloom.pipeline.evaluation.figures import CHANCE, MODEL, RECORDED, STILL, TRAINING, FigureFile
 from motionloom.pipeline.evaluation.judges import Judge
 from motionloom.pipeline.evaluation.latent_metrics import Latents, judged_figures
@@ -103,6 +104,7 @@ def test_errors_of_body_and_hands_by_hand() -> None:
     generator = np.random.default_rng(0)
     real, made = generator.normal(size=(2, 7, 52, 3))
     found = published_errors(torch.from_numpy(made), torch.from_numpy(real))
+    each = []
     want: dict[str, list[float]] = {"": [], "_body": [], "_hand": []}
     for a, b in zip(made, real, strict=True):
         distance = [float(np.linalg.norm((a[j] - a[0]) - (b[j] - b[0]))) for j in range(52)]
@@ -114,6 +116,10 @@ def test_errors_of_body_and_hands_by_hand() -> None:
             for j in hand
         ]
         want["_hand"].append(1000 * sum(fingers) / 30)
+        each.append([*distance[:22], *fingers])
+    assert joint_distances(made, real).tolist() == pytest.approx((1000 * np.mean(each, axis=0)).tolist())
+    body_alone = joint_distances(made[:, :22], real[:, :22])
+    assert body_alone.tolist() == pytest.approx((1000 * np.mean(each, axis=0)[:22]).tolist())
     for part, values in want.items():
         assert found[part].means()["mpjpe"] == pytest.approx(np.mean(values), rel=1e-12)
     second = made - real
@@ -124,8 +130,8 @@ def test_errors_of_body_and_hands_by_hand() -> None:
     assert set(body) == {"", "_body"}
 
 
-def test_distribution_by_hand() -> None:
-    """FID by scipy's matrix root, Diversity and MModality pair by pair."""
+def test_distributions_over_repeats() -> None:
+    """FID (which has goldens of its own) is a mean over repeats; Diversity and MModality pair by pair."""
     generator = torch.Generator().manual_seed(0)
     real, others = torch.randn(2, 400, 6, generator=generator)
     shift = torch.linspace(0.5, 2, 6)
@@ -133,32 +139,16 @@ def test_distribution_by_hand() -> None:
     latents = Latents(text=real, real=real, made=made, others=others, still=torch.ones(400, 6))
     words = [str(row) for row in range(400)]
     figures = judged_figures("evaluator", "it", latents, words, {}, size=32, among=2, seed=0)
-    rows = {
-        row: {one.name.removeprefix("evaluator."): one for one in figures if one.row == row}
-        for row in (MODEL, TRAINING)
-    }
-
-    def by_scipy(a: torch.Tensor, b: torch.Tensor) -> float:
-        x, y = a.double().numpy(), b.double().numpy()
-        root = scipy.linalg.sqrtm(np.cov(x.T) @ np.cov(y.T)).real
-        trace = np.trace(np.cov(x.T) + np.cov(y.T) - 2 * root)
-        return float(((x.mean(0) - y.mean(0)) ** 2).sum() + trace)
-
-    def unit(x: torch.Tensor) -> torch.Tensor:
-        return x.double() / x.double().norm(dim=-1, keepdim=True)
-
-    found = rows[MODEL]
-    assert found["fid"].value == pytest.approx(np.mean([by_scipy(real, m) for m in made]), rel=1e-8)
-    assert found["fid_unit"].value == pytest.approx(
-        np.mean([by_scipy(unit(real), unit(m)) for m in made]), rel=1e-8
-    )
-    assert rows[TRAINING]["fid"].value == pytest.approx(by_scipy(real, others), rel=1e-8)
-    assert rows[TRAINING]["fid"].value < 0.1 < 5 < found["fid"].value
+    found = {one.name.removeprefix("evaluator."): one.value for one in figures if one.row == MODEL}
+    assert found["fid"] == pytest.approx(np.mean([float(fid(real, m)) for m in made]))
+    pairs = [[x.double() / x.double().norm(dim=-1, keepdim=True) for x in (real, m)] for m in made]
+    assert found["fid_unit"] == pytest.approx(np.mean([float(fid(*pair)) for pair in pairs]))
+    (other,) = (one.value for one in figures if (one.name, one.row) == ("evaluator.fid", TRAINING))
+    assert other == pytest.approx(float(fid(real, others))) and other < 0.1 < 5 < found["fid"]
     # Two draws of one Gaussian are sqrt(2) as far apart as it is wide: 300 pairs, five deviations.
-    wide = float((2 * shift.square().sum()).sqrt())
-    assert found["diversity"].value == pytest.approx(wide, rel=0.15)
+    assert found["diversity"] == pytest.approx(float((2 * shift.square().sum()).sqrt()), rel=0.15)
     apart = [float((made[a] - made[b]).norm(dim=-1).mean()) for a, b in ((0, 1), (0, 2), (1, 2))]
-    assert 0 < found["multimodality"].value <= max(apart)
+    assert 0 < found["multimodality"] <= max(apart)
 
 
 @pytest.mark.parametrize("size", [32, 256])
@@ -342,20 +332,13 @@ def test_faces_have_a_judge(judged: Path) -> None:
     assert made["face.vertex"] == pytest.approx(vertices / frames, rel=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("shapes", "says"),
-    [
-        (np.ones((5, 3, 20)), "300 shape and 100 expression directions"),
-        (np.zeros((5, 3, 400)), "all 0"),
-        (np.full((5, 3, 400), np.nan), "NaN"),
-        (np.ones((5, 400)), r"\[5, 400\]"),
-        (np.array([{}]), "pickle"),
-    ],
-)
-def test_another_model_is_refused(shapes: np.ndarray, says: str, tmp_path: Path) -> None:
-    np.savez(tmp_path / "model.npz", shapedirs=shapes)
-    with pytest.raises(UserError, match=rf"model\.npz.*{says}"):
-        expression_directions(tmp_path / "model.npz")
+def test_another_model_is_refused(tmp_path: Path) -> None:
+    ones, path = np.ones((5, 3, 400)), tmp_path / "model.npz"
+    wrong = {"300 shape": ones[..., :20], "all 0": 0 * ones, "NaN": np.nan * ones, r"\[5, 400\]": ones[:, 0]}
+    for says, shapes in {**wrong, "pickle": np.array([{}])}.items():
+        np.savez(path, shapedirs=shapes)
+        with pytest.raises(UserError, match=rf"model\.npz.*{says}"):
+            expression_directions(path)
 
 
 @pytest.mark.slow
@@ -366,8 +349,8 @@ def test_each_facial_generator_has_a_row(judged: Path) -> None:
     for row in ours.values():
         assert all(cell is not None for cell in row.cells[:6]), row
     assert "– of fewer than 10 clips" in found.markdown()
+    stages = judged / "run/stages"
     files = [
-        FigureFile.read(judged / f"run/stages/evaluate{of}/metrics.json")
-        for of in ("", "_face_vae", "_face_diffusion")
+        FigureFile.read(stages / f"evaluate{of}/metrics.json") for of in ("", "_face_vae", "_face_diffusion")
     ]
     assert len({fid.value for file in files if (fid := file.of("face_evaluator.fid"))}) == 3

@@ -9,23 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rich.console import Console
-from safetensors.torch import load_file
 
+from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.models import H2VQConfig
-from motionloom.pipeline.runs.api import run_recipe
-from motionloom.pipeline.runs.plan import Selection
 
 SCRIPT = Path(__file__).parents[3] / "docs" / "train_h2vq.py"
 
 
 def test_the_loop_of_the_documents(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    until, few = Selection(until="data"), ["data.clips=40"]
-    quiet = Console(quiet=True)
-    run = run_recipe("humantomato-tiny", tmp_path / "run", overrides=few, select=until, console=quiet)
+    synthesize(SynthConfig(clips=40), tmp_path / "shards", progress=False)
 
     def train(out: str, **changes: Any) -> None:
-        words = [run / "stages/data/shards", tmp_path / out, "--steps", 60, "--batch", 8, "--device", "cpu"]
+        words = [tmp_path / "shards", tmp_path / out, "--steps", 60, "--batch", 8, "--device", "cpu"]
         monkeypatch.setattr(sys, "argv", [str(SCRIPT), *map(str, words)])
         main = runpy.run_path(str(SCRIPT))["main"]
         net = H2VQConfig(width=24, depth=1, code_dim=24, num_codes=32)
@@ -44,4 +39,3 @@ def test_the_loop_of_the_documents(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes()
     rows = [json.loads(line) for line in (tmp_path / "whole/log.jsonl").read_text().splitlines()]
     assert rows[-2]["loss"] < rows[0]["loss"] and 0 < rows[-1]["val_mpjpe_mm"] < 1000
-    assert load_file(tmp_path / "whole/model.safetensors")
