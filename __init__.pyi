@@ -9,6 +9,7 @@ from .pipeline.runs.api import evaluate_run as evaluate_run
 from .pipeline.runs.api import export_run as export_run
 from .pipeline.runs.api import report_run as report_run
 from .pipeline.runs.api import run_recipe as run_recipe
+from .pipeline.runs.training import finish as finish
 from .pipeline.runs.training import training as training
 
 __version__: str

@@ -23,6 +23,7 @@ from __future__ import annotations
 import copy
 import json
 import statistics
+import tempfile
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
@@ -30,6 +31,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import lightning as L
 import torch
 from bench import Column, arguments, command_line, report
 from rich.console import Console
@@ -48,8 +50,9 @@ from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.training_log import read_flight
 from motionloom.pipeline.store.yaml import dump_yaml
+from motionloom.pipeline.training.checkpointing import BackgroundWriter
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import LAUNCHES, Execution, deterministic, launch
+from motionloom.pipeline.training.execution import LAUNCHES, deterministic, make_trainer
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 PRECISIONS = {"fp32": "32-true", "bf16": "bf16-mixed"}
@@ -104,6 +107,36 @@ class Step(NamedTuple):
     flops: int
     estimated: int
     """Bytes, as a dry run says."""
+
+
+class Clock(L.Callback):
+    """Times the steps behind four that choose kernels or compile, for about two seconds."""
+
+    first = mean = 0.0
+    """Seconds of the first step, and of one of those that count."""
+
+    def __init__(self, synchronize: Callable[[], object]) -> None:
+        self.synchronize, self.begin, self.last = synchronize, 0.0, 0
+
+    def on_train_start(self, *_: Any) -> None:
+        self.begin = self.now()
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        step = trainer.global_step
+        if step not in (1, 4, self.last):
+            return
+        seconds, self.begin = self.now() - self.begin, self.now()
+        if step == 1:
+            self.first = seconds
+        elif step == 4:
+            self.last = 4 + max(3, min(100, int(2 / (seconds / 3))))
+        else:
+            self.mean = seconds / (step - 4)
+            trainer.should_stop = True
+
+    def now(self) -> float:
+        self.synchronize()
+        return time.perf_counter()
 
 
 class Benchmark:
@@ -172,23 +205,25 @@ class Benchmark:
             torch.cuda.empty_cache()
             torch.cuda.reset_peak_memory_stats()
         hardware = self.recipes["humantomato"].hardware.model_copy(update={"deterministic": how != "free"})
-        fabric = launch(hardware, train)
-        execution = Execution(fabric, module, train)
-        batch = fabric.to_device(made.batch)
-
-        def timed(count: int) -> float:
-            begin = time.perf_counter()
-            for _ in range(count):
-                execution.take_step([batch])
-            self.synchronize()
-            return (time.perf_counter() - begin) / count
-
+        module.logs_rows = True
+        clock, folder = Clock(self.synchronize), Path(tempfile.mkdtemp())
+        trainer = make_trainer(
+            hardware,
+            train.model_copy(update={"steps": 104}),
+            module,
+            [clock],
+            BackgroundWriter(keep=2),
+            folder,
+        )
         with deterministic(hardware):
-            first, second = timed(1), timed(3)
-            seconds = timed(max(3, min(100, int(2 / second))))
-        cells = {"ms a step": f"{1000 * seconds:.1f}", "first, s": f"{first:.1f}"}
+            trainer.fit(module, [tree_map(self.moved, made.batch)] * 104)
+        cells = {"ms a step": f"{1000 * clock.mean:.1f}", "first, s": f"{clock.first:.1f}"}
         cells |= {"batch": str(train.batch_size), "TFLOP a step": f"{made.flops / 1e12:.3g}"}
-        return cells | self.share(made.flops / seconds, train) | self.memory(made.estimated)
+        return cells | self.share(made.flops / clock.mean, train) | self.memory(made.estimated)
+
+    def moved(self, value: object) -> object:
+        """A tensor on the device."""
+        return value.to(self.device) if isinstance(value, Tensor) else value
 
     def share(self, reached: float, train: TrainConfig) -> Cells:
         """TFLOP/s and the share of the peak, where it is known."""

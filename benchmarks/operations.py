@@ -13,6 +13,7 @@ from collections import Counter
 from typing import Any, cast
 
 from bench import Column, Record, arguments, command_line, report
+from lightning.fabric import Fabric
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -20,9 +21,8 @@ from torch.utils._pytree import tree_leaves
 
 from motionloom.models.layers.attention import SelfAttention
 from motionloom.pipeline.contract.lookup import previews
-from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.training.execution import launch, prepare_module
+from motionloom.pipeline.training.execution import prepare_module
 
 STAGES = {
     "tokenizer (H2VQ)": ("humantomato-paper", "tokenizer"),
@@ -69,7 +69,8 @@ def counted(recipe: str, name: str) -> tuple[Counted, int]:
     config, dry = stage.config, cast(Any, stage.kind)
     if name == "gpt":
         config = config.model_copy(update={"loss": config.loss.model_copy(update={"align_from": 0})})
-    fabric, size = launch(Hardware(accelerator="cpu"), config.train), config.train.local_batch(1)
+    fabric = Fabric(accelerator="cpu", precision=config.train.precision)
+    size = config.train.local_batch(1)
     with FakeTensorMode(allow_non_fake_inputs=True):
         inputs = dry.inputs.of(previews(stage, stages))
         net = dry.network(dry.facts(config, inputs), inputs)
@@ -81,7 +82,7 @@ def counted(recipe: str, name: str) -> tuple[Counted, int]:
         module.fabric = fabric  # with which modules of several optimizers go backwards
         optimizer = module.configure_optimizers()[0]["optimizer"]
         for counts in (Counted(), Counted()):  # the first step makes codebooks and moments
-            with counts:  # what `Execution.take_step` does, which moves modules between devices first
+            with counts:  # what a Trainer does, which moves modules between devices first
                 with fabric.autocast():
                     loss = module.training_step(batch, 0)
                 if module.automatic_optimization:

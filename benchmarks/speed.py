@@ -39,7 +39,7 @@ from motionloom.datasets.text.encoder import EncodedText
 from motionloom.models.training.stage_module import Batch
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.tokens import TokenBatches, TokenCaptions, TokenStore
-from motionloom.pipeline.training.loaders import ROOMS, loader
+from motionloom.pipeline.training.loaders import ROOMS, Loader
 
 COLUMNS = (Column("ours", "ours"), Column("the usual way", "usual"), Column("times faster", "ratio", 1))
 CAPTIONS = ("a person walks forward", "a person waves with the left hand", "a person squats")
@@ -166,8 +166,10 @@ def workers(args: Namespace) -> Record:
     with tempfile.TemporaryDirectory() as folder:
         for own in paper_batches(folder).values():
             steps = Steps(lambda rank, world, own=own: own, begins + count)
-            packed = loader(steps, Hardware(accelerator="cpu", workers=1))
-            packed.dataset.rooms = ROOMS
+            one = Hardware(accelerator="cpu", workers=1)
+            packed = Loader(steps, one, torch.device("cpu"), once=True)
+            packed._opened = packed._open()
+            packed._opened.dataset.rooms = ROOMS  # type: ignore[attr-defined]
             plain = DataLoader(steps, batch_size=None, num_workers=1, multiprocessing_context="spawn")
             for load, times in ((packed, ours), (plain, usual)):
                 coming = iter(load)

@@ -30,6 +30,7 @@ from .tokenizer.single import MqConfig as MqConfig
 from .tokenizer.single import RvqConfig as RvqConfig
 from .training.alternating import AlternatingModule as AlternatingModule
 from .training.alternating import OptimizerGroup as OptimizerGroup
+from .training.averaging import AveragedWeights as AveragedWeights
 from .training.optim import OptimConfig as OptimConfig
 from .training.stage_module import StageModule as StageModule
 from .utt.module import UttModule as UttModule

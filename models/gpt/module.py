@@ -22,6 +22,7 @@ class GptModule(StageModule):
     """Trains an `InterleavedGPT`; the tokenizer and TMA are only looked through, never trained or saved."""
 
     net: InterleavedGPT
+    shardable = True
 
     def __init__(
         self,

@@ -116,9 +116,10 @@ class AlternatingModule(StageModule):
         if len(every) != len(set(every)):
             raise ValueError("a parameter belongs to two groups")
         self._turns = []
+        steps = self.length_of_training()
         for group, params in zip(groups, trained, strict=True):
             optimizer = group.optim.build(params)
-            schedule = StepSchedule(optimizer, partial(group.factor, max_steps=self.max_steps))
+            schedule = StepSchedule(optimizer, partial(group.factor, max_steps=steps))
             self._turns.append(_Turn(group, params, optimizer, schedule))
         return [
             {"optimizer": turn.optimizer, "lr_scheduler": {"scheduler": turn.schedule, "interval": "step"}}
@@ -165,7 +166,8 @@ class AlternatingModule(StageModule):
         self, group: OptimizerGroup, part: Batch, shared: dict[str, Tensor], *, first: bool
     ) -> Tensor:
         """Add the gradients of a group's loss on a part; returns the loss."""
-        values = self.losses_of(group.name, part, shared)
+        with self.reading(part):
+            values = self.losses_of(group.name, part, shared)
         shared.update({name: value.detach() for name, value in shared.items()})
         named = _named(group, values)
         self.record({"loss": values["loss"], **named} if first else named, part)

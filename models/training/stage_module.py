@@ -1,7 +1,7 @@
 """Base of the stages' LightningModules: a network, its losses, and one training step.
 
-`lightning.Trainer` and the pipeline's own loop (`pipeline/training/execution.py`) call the same methods and
-train to the same weights.
+`motionloom run` trains them by a `lightning.Trainer` with callbacks of its own (`pipeline/training`); any
+other Trainer, and a loop by hand, comes to the same weights.
 
 Every random draw of a training step (dropout, latents, Gumbel noise) comes from a generator state that is a
 pure function of (seed, step, rank), so a resumed run repeats the undisturbed run bit for bit.
@@ -10,8 +10,12 @@ Codebooks draw by themselves, the same on every rank (`quantize/base.py`).
 
 from __future__ import annotations
 
+import copy
+import math
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -19,6 +23,7 @@ from typing import IO, Any, NamedTuple, Self, TypedDict
 
 import lightning as L
 import torch
+from lightning.pytorch.strategies import ModelParallelStrategy
 from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
@@ -27,12 +32,14 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.layers.frozen import Frozen
+from motionloom.models.layers.transformer import Block
+from motionloom.models.training.any_trainer import require_batch, require_trainer
+from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.compiled import Compiled
 from motionloom.models.training.distributed import alone, rank
+from motionloom.models.training.finite import LOG_EVERY as LOG_EVERY
+from motionloom.models.training.finite import StopNotFinite
 from motionloom.models.training.optim import OptimConfig as OptimConfig
-
-LOG_EVERY = 10
-"""Steps that a row of the log averages."""
 
 Batch = dict[str, Any]
 """Tensors, and conditions of tensors, by name (`datasets/loading`)."""
@@ -67,12 +74,25 @@ class StepSchedule(LambdaLR):
         self._last_lr = [group["lr"] for group in self.optimizer.param_groups]
         return float(self._last_lr[0])
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the step, which is all that a rate depends on."""
+        return {"last_epoch": self.last_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Nothing: a training sets the step that it goes on from."""
+
+
+class OtherNetworkError(UserError):
+    """A checkpoint is of another network."""
+
 
 class StageModule(L.LightningModule, ABC):
     """A network, its losses and its optimizer. Subclasses implement `losses(batch)`."""
 
     compilable = True
     """Whether `compile_losses` is known to work; torch cannot compile recurrent networks as one graph."""
+    shardable = False
+    """Whether FSDP can cut the network: it is used through `forward` alone, and has no codebook."""
 
     def __init__(self, net: nn.Module, optim: OptimConfig, *, seed: int, max_steps: int) -> None:
         super().__init__()
@@ -83,6 +103,10 @@ class StageModule(L.LightningModule, ABC):
         self._step = 0
         self.accumulate = 1
         """Parts that the batch of a step is cut into."""
+        self.ema: float | None = None
+        """Decay of the average of the weights that a Trainer keeps; None for none."""
+        self.logs_rows = False
+        """Whether a callback logs the means of ten steps, so that no step is logged by itself."""
         self.gauges: dict[str, float | Tensor] = {}
         """Learning rate and gradient norm of the step that the newest row of the log ends with."""
         self.figures: list[StepFigures] = []
@@ -90,6 +114,10 @@ class StageModule(L.LightningModule, ABC):
         self.norms: list[tuple[int, Tensor]] = []
         """(step, norm of the gradients) likewise, where a norm was computed."""
         self._sums: dict[tuple[str, ...], tuple[Tensor, int]] = {}
+        self._seen: set[bool] = set()
+        """Modes, training or not, whose first batch has been looked at."""
+        self._whole: list[nn.Module] = []
+        """The network of which a cut copy is trained, out of reach of `parameters`."""
 
     @property
     def step(self) -> int:
@@ -100,18 +128,82 @@ class StageModule(L.LightningModule, ABC):
     def step(self, step: int) -> None:
         self._step = step
 
+    @property
+    def lr(self) -> float:
+        """The highest learning rate, by the name that Lightning's `Tuner.lr_find` looks for."""
+        return self.optim_config.lr
+
+    @lr.setter
+    def lr(self, lr: float) -> None:
+        self.optim_config = self.optim_config.model_copy(update={"lr": lr})
+
     def setup(self, stage: str) -> None:
-        """Take `accumulate_grad_batches` over from a Trainer."""
-        if self.trainer.precision == "16-mixed":
-            raise UserError("precision 16-mixed: losses are not scaled for float16; take bf16-mixed")
+        """Take `accumulate_grad_batches` over from a Trainer; `UserError` where it would train wrongly."""
+        require_trainer(self, self.trainer, stage)
+        self._seen = set()
         if self.automatic_optimization:
             self.accumulate = self.trainer.accumulate_grad_batches
+
+    def configure_callbacks(self) -> Sequence[L.Callback]:
+        """Return what every Trainer needs: an end where a loss is not finite, and the average of `ema`."""
+        if self.logs_rows:  # the pipeline's own callbacks do both
+            return []
+        return [*([AveragedWeights(self.ema)] if self.ema else []), StopNotFinite()]
+
+    def configure_model(self) -> None:
+        """Under FSDP, replace the network by a copy that is cut over the ranks.
+
+        Every transformer block is one unit, gathered when it runs and resharded after it; the rest
+        (embeddings, heads) is the last unit. Gradients are averaged over ranks as in DDP, and nothing is
+        gathered in a lower precision than it is kept in, so training equals DDP up to the order of sums.
+        """
+        if self._trainer is None or not isinstance(self.trainer.strategy, ModelParallelStrategy):
+            return
+        from torch.distributed.fsdp import fully_shard  # imported where it is used: it takes a second
+
+        assert self.device_mesh is not None
+        self._whole.append(self.net)
+        self.net = copy.deepcopy(self.net)
+        for part in [*(part for part in self.net.modules() if isinstance(part, Block)), self.net]:
+            fully_shard(part, mesh=self.device_mesh["data_parallel"])
 
     def on_fit_start(self) -> None:
         """Move frozen networks to the device of `net`."""
         for value in vars(self).values():
             if isinstance(value, Frozen):
                 value.module.to(self.device)
+
+    def on_train_start(self) -> None:
+        """Go on with the settings and the schedule of now, whatever a checkpoint was written with."""
+        for optimizer in self.trainer.optimizers:
+            for group in optimizer.param_groups:
+                group |= {key: optimizer.defaults[key] for key in ("betas", "weight_decay")}
+        for config in self.trainer.lr_scheduler_configs:
+            if isinstance(config.scheduler, StepSchedule) and self.automatic_optimization:
+                config.scheduler.set_step(self.step)  # others set theirs as they step
+
+    def on_fit_end(self) -> None:
+        """Give the whole network back its weights, where a cut copy was trained; a collective."""
+        if not self._whole:
+            return
+        from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
+
+        state = get_model_state_dict(
+            self.net, options=StateDictOptions(full_state_dict=True, cpu_offload=True)
+        )
+        self.net = self._whole.pop()
+        if rank() == 0:
+            self.net.load_state_dict(state)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Raise `OtherNetworkError` where the checkpoint's weights do not fit."""
+        there = {name: tuple(value.shape) for name, value in checkpoint["state_dict"].items()}
+        here = {name: tuple(value.shape) for name, value in self.state_dict().items()}
+        differs = [name for name in {**here, **there} if there.get(name) != here.get(name)]
+        if differs:
+            name = differs[0]
+            sizes = f"{there.get(name, 'nothing')} there and {here.get(name, 'nothing')} here"
+            raise OtherNetworkError(f"the checkpoint does not fit: {name} is {sizes}")
 
     @classmethod
     def load_from_checkpoint(
@@ -143,6 +235,8 @@ class StageModule(L.LightningModule, ABC):
         if not isinstance(module, cls):
             raise TypeError(f"{checkpoint_path} is of a {type(module).__name__}, no {cls.__name__}")
         module.load_state_dict(content["state_dict"], strict=strict is not False)
+        if content.get("average") is not None:
+            AveragedWeights(0.0).fill(module.net, content["average"])
         return module
 
     @abstractmethod
@@ -164,8 +258,54 @@ class StageModule(L.LightningModule, ABC):
         """Return the optimizer of the trainable parameters with its schedule, as Lightning takes them."""
         trained = [param for param in self.net.parameters() if param.requires_grad]
         optimizer = self.optim_config.build(trained)
-        self.schedule = StepSchedule(optimizer, partial(self.optim_config.factor, max_steps=self.max_steps))
+        factor = partial(self.optim_config.factor, max_steps=self.length_of_training())
+        self.schedule = StepSchedule(optimizer, factor)
         return [{"optimizer": optimizer, "lr_scheduler": {"scheduler": self.schedule, "interval": "step"}}]
+
+    def length_of_training(self) -> int:
+        """Return the steps of the training: the Trainer's where it has an end, else `max_steps`."""
+        trainer = self._trainer
+        if trainer is None:
+            return self.max_steps
+        steps = trainer.estimated_stepping_batches
+        if not self.automatic_optimization and steps != trainer.max_steps:  # it has counted parts
+            steps = math.ceil(steps / self.accumulate) if math.isfinite(steps) else steps
+        if not 0 < steps < math.inf or steps == self.max_steps:
+            return self.max_steps
+        warnings.warn(
+            f"this Trainer takes {steps:,} steps and the module was made for {self.max_steps:,}: the "
+            f"learning-rate schedule goes by the Trainer's",
+            stacklevel=2,
+        )
+        return int(steps)
+
+    def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
+        """Set the rate of the next step, which depends on its number alone."""
+        if isinstance(scheduler, StepSchedule):
+            scheduler.set_step(self.step)
+        else:
+            super().lr_scheduler_step(scheduler, metric)
+
+    def optimizer_step(
+        self, epoch: int, batch_idx: int, optimizer: Any, optimizer_closure: Callable[[], Any] | None = None
+    ) -> None:
+        """Step; where a CUDA graph fails the gradients are computed again without graphs."""
+        assert optimizer_closure is not None
+        gradients = partial(self.without_failed_graph, optimizer_closure)
+        super().optimizer_step(epoch, batch_idx, optimizer, gradients)
+
+    def without_failed_graph(self, gradients: Callable[[], Any]) -> Any:
+        """Return what `gradients` returns; once a CUDA graph has failed in it, it is called again without."""
+        losses = self.losses
+        if not (isinstance(losses, Compiled) and losses.graphs):
+            return gradients()
+        restore = self.saved_state()
+        try:
+            return gradients()
+        except RuntimeError as error:
+            losses.leave(error)
+            restore()
+            return gradients()
 
     def configure_gradient_clipping(
         self,
@@ -187,9 +327,26 @@ class StageModule(L.LightningModule, ABC):
         the loop takes; `AlternatingModule` takes its whole step itself.
         """
         self.seed_draws(batch_idx % self.accumulate)
-        values = self.losses(batch)
+        with self.reading(batch):
+            values = self.losses(batch)
         self.record(values, batch)
         return values["loss"]
+
+    @contextmanager
+    def reading(self, batch: Batch) -> Iterator[None]:
+        """Context in which losses read a batch: `UserError` where it lacks a key, or the first is wrong."""
+        if self._trainer is not None and self.training not in self._seen:
+            self._seen.add(self.training)
+            require_batch(batch, self)
+        try:
+            yield
+        except KeyError as error:
+            key = error.args[0] if error.args else None
+            if not isinstance(key, str) or key in batch:
+                raise
+            raise UserError(
+                f"batch: {type(self).__name__} reads '{key}', which is not there; it has {', '.join(batch)}"
+            ) from error
 
     def seed_draws(self, part: int, turn: int = 0) -> None:
         """Seed torch for one part of a step, and one of several losses that are computed on it in turn."""
@@ -202,10 +359,9 @@ class StageModule(L.LightningModule, ABC):
         return (self.step + 1) % LOG_EVERY == 0
 
     def record(self, values: dict[str, Tensor], batch: Batch) -> None:
-        """Log figures of a part of a step: to the Trainer, or to the means of the next row."""
-        if self._trainer is None:
-            self.average(values)
-        else:
+        """Add figures of a part of a step to the means of the next row, and log them to a Trainer."""
+        self.average(values)
+        if self._trainer is not None and not self.logs_rows:
             self.log_dict({f"train/{k}": v for k, v in values.items()}, batch_size=_rows(batch))
 
     def average(self, values: dict[str, Tensor]) -> None:
@@ -253,12 +409,18 @@ class StageModule(L.LightningModule, ABC):
         What a loss draws here depends on (seed, batch) alone, so two validations differ by the weights only.
         """
         torch.manual_seed((self.seed * 1_000_003 + batch_idx) % 2**63)
-        with alone():
+        with alone(), self.reading(batch):
             values = self.losses(batch)
-        if self._trainer is not None:
+        if self._trainer is not None and not self.logs_rows:
             figures = {f"val/{k}": v for k, v in values.items()}
             self.log_dict(figures, batch_size=_rows(batch), sync_dist=True)
         return values
+
+    def test_step(self, *_: object) -> None:
+        """Not reached: `setup` refuses `trainer.test`."""
+
+    def predict_step(self, *_: object) -> None:
+        """Not reached: `setup` refuses `trainer.predict`."""
 
     def clip(self, params: list[nn.Parameter], largest: float) -> Tensor | None:
         """Clip by the norm of all gradients (0 = not at all); the norm before, if a row of the log ends."""
@@ -266,8 +428,7 @@ class StageModule(L.LightningModule, ABC):
             return None
         norm = torch.nn.utils.get_total_norm([p.grad for p in params if p.grad is not None])
         whole = norm.full_tensor() if isinstance(norm, DTensor) else norm
-        if self._trainer is None:
-            self.norms.append((self.step + 1, whole))
+        self.norms.append((self.step + 1, whole))
         if largest:
             torch.nn.utils.clip_grads_with_norm_(params, largest, norm)
         return whole if self.ends_row else None

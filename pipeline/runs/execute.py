@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -86,6 +86,24 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
         if leads:
             (run / REQUEST_FILE).unlink(missing_ok=True)
     return [row.stage.name for row in todo]
+
+
+def finish_stage(
+    recipe: Recipe,
+    run: Path,
+    plan: Sequence[PlannedStage],
+    row: PlannedStage,
+    save: Callable[[Path], object],
+    trained_by: str,
+) -> None:
+    """Have `save` write the files of a stage into its folder, and finish it as if it had run."""
+    with _locks(run, recipe, [row]):
+        _begin(recipe, run, plan)
+        folder = stage_folder(run, row.stage.name)
+        _prepare(folder, row)
+        save(folder)
+        artifact = _artifact(recipe, run, row, plan)
+        artifact.model_copy(update={"trained_by": trained_by}).finish(folder)
 
 
 def _execute_part(

@@ -239,9 +239,7 @@ def _take(
     except RuntimeError as error:
         raise UserError(f"{path}: of another version; {' '.join(str(error).split())[:200]}") from None
     if content["average"] is not None:
-        average = AveragedWeights(net, config.train.ema)
-        average.load_state_dict(content["average"])
-        average.fill(net)
+        AveragedWeights(config.train.ema).fill(net, content["average"])
     home.mkdir(parents=True)
     save_model(home, net, facts)
     rows = json.loads(content["log"]["rows"])

@@ -119,6 +119,8 @@ class Artifact(Config):
     """Settings of a training that were others until a step; `config` holds the last ones."""
     step: int | None = Field(None, exclude_if=lambda step: step is None)
     """Step of weights that were taken from a training before its end."""
+    trained_by: str | None = Field(None, exclude_if=lambda name: name is None)
+    """What trained it where that was not motionloom, with its steps."""
     inputs: dict[str, InputStage]
     terms: Terms | None = Field(None, exclude_if=lambda terms: terms is None)
     """Licences and credits of its own data and of all stages above it."""

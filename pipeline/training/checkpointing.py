@@ -18,22 +18,14 @@ import hashlib
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TypedDict, cast
 
 import torch
 import torch.distributed as dist
-from torch import Tensor, nn
-from torch.distributed.checkpoint.state_dict import (
-    StateDictOptions,
-    get_model_state_dict,
-    get_optimizer_state_dict,
-    set_model_state_dict,
-    set_optimizer_state_dict,
-)
-from torch.distributed.tensor import DTensor
-from torch.optim import Optimizer
+from lightning.pytorch.plugins.io import CheckpointIO
+from torch import Tensor
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import HashingFile, atomic_file, sync_folder
@@ -42,22 +34,17 @@ from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Means, StageModule
 from motionloom.pipeline.training.metric_log import LogState
 
-OptimizerState = dict[str, Any]
-"""As `Optimizer.state_dict` gives it."""
-
-
 _Lightning = TypedDict("_Lightning", {"pytorch-lightning_version": str, "epoch": int})
-"""Keys by which Lightning takes the file for one of its own."""
+"""Keys of Lightning's that are no names."""
 
 
 class Checkpoint(_Lightning):
-    """Everything a training needs to continue after a step."""
+    """Everything that continues a training after a step: what a Trainer saves, and our callbacks add."""
 
     global_step: int
+    state_dict: dict[str, Tensor]
     steps: int
     """Steps of the training that wrote it."""
-    state_dict: dict[str, Tensor]
-    optimizer_states: list[OptimizerState]
     average: dict[str, Tensor] | None
     log: LogState
     row: list[list[Means]]
@@ -66,53 +53,6 @@ class Checkpoint(_Lightning):
     """Plain values that rebuild the module: `trained_stage.hyper_parameters`."""
     validate: bool
     """Whether a signal cut the validation of this step short: the resumed training begins with it."""
-
-
-def weights_of(module: nn.Module) -> dict[str, Tensor]:
-    """Return weights and buffers; under FSDP a collective, and whole on rank 0 alone."""
-    if _is_sharded(module):
-        return cast(dict[str, Tensor], get_model_state_dict(module, options=_WHOLE))
-    return dict(module.state_dict())
-
-
-def load_weights(module: StageModule, state: dict[str, Tensor]) -> None:
-    """Load weights as `weights_of` returns them."""
-    if _is_sharded(module):
-        set_model_state_dict(
-            module, cast(dict[str, Any], state), options=StateDictOptions(full_state_dict=True)
-        )
-    else:
-        module.load_state_dict(state)
-
-
-def optimizer_state(module: StageModule, optimizer: Optimizer) -> OptimizerState:
-    """Return the state with parameters by number; under FSDP a collective, and whole on rank 0 alone."""
-    if not _is_sharded(module):
-        return optimizer.state_dict()
-    whole = cast(OptimizerState, get_optimizer_state_dict(module, optimizer, options=_WHOLE))
-    if not whole:  # ranks other than 0
-        return {}
-    # torch names parameters here and numbers them in one process: numbers fit any strategy.
-    return _renamed(whole, {name: number for number, name in enumerate(_names(module, optimizer))})
-
-
-def load_optimizer(module: StageModule, optimizer: Optimizer, state: OptimizerState) -> None:
-    """Load a state as `optimizer_state` returns it, under the settings that the optimizer has now."""
-    groups = zip(state["param_groups"], optimizer.state_dict()["param_groups"], strict=True)
-    kept = ("params", "lr")  # the rate is that of a step, which sets it
-    own_settings = [{**own, **{key: saved[key] for key in kept}} for saved, own in groups]
-    state = {**state, "param_groups": own_settings}
-    if not _is_sharded(module):
-        optimizer.load_state_dict(state)
-        return
-    named = _renamed(state, dict(enumerate(_names(module, optimizer))))
-    set_optimizer_state_dict(module, optimizer, named, options=StateDictOptions(full_state_dict=True))
-
-
-def _renamed(state: OptimizerState, names: Mapping[str, int] | Mapping[int, str]) -> OptimizerState:
-    """Return the state with its parameters' keys replaced."""
-    groups = [{**one, "params": [names[key] for key in one["params"]]} for one in state["param_groups"]]
-    return {"state": {names[key]: values for key, values in state["state"].items()}, "param_groups": groups}
 
 
 def rows_of_ranks(module: StageModule) -> list[list[Means]]:
@@ -134,19 +74,6 @@ def load_row(module: StageModule, rows: Sequence[list[Means]]) -> None:
             for place, means in enumerate(rows[0])
         ]
     )
-
-
-_WHOLE = StateDictOptions(full_state_dict=True, cpu_offload=True)
-
-
-def _is_sharded(module: nn.Module) -> bool:
-    return any(isinstance(param, DTensor) for param in module.parameters())
-
-
-def _names(module: nn.Module, optimizer: Optimizer) -> list[str]:
-    """Names of an optimizer's parameters, in its order."""
-    names = {id(param): name for name, param in module.named_parameters()}
-    return [names[id(param)] for group in optimizer.param_groups for param in group["params"]]
 
 
 # Files.
@@ -172,8 +99,10 @@ def step_of(path: Path) -> int | None:
     return int(match[1]) if match else None
 
 
-class BackgroundWriter:
+class BackgroundWriter(CheckpointIO):
     """Writes the checkpoints of one training in a thread, one at a time, and deletes those not kept any more.
+
+    A Trainer that has it as a plugin saves and reads by it.
 
     The state is copied when `write` is called. An older file is deleted only once the newer one is on disk.
     An error of the thread is raised by the next call of any method.
@@ -190,6 +119,19 @@ class BackgroundWriter:
         # No daemon: a process that ends by itself finishes the file.
         self._thread = threading.Thread(target=self._run, args=(snapshot(state), path), name="checkpoint")
         self._thread.start()
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: object = None
+    ) -> None:
+        self.write(checkpoint, Path(path))
+
+    def load_checkpoint(
+        self, path: str | Path, map_location: object = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        return cast(dict[str, Any], read_checkpoint(Path(path)))
+
+    def remove_checkpoint(self, path: str | Path) -> None:
+        Path(path).unlink(missing_ok=True)
 
     @property
     def busy(self) -> bool:

@@ -6,18 +6,23 @@ It is apart from `trainer.py` because a recipe is read and planned without Light
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sized
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 from pydantic import BaseModel, Field, field_validator
 
 from motionloom.datasets.base.config import Config
-from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.errors import UserError, nearest
+from motionloom.datasets.base.register import Table, discover
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Numbered
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.contract.stage import RUNTIME, StageConfig
+from motionloom.pipeline.contract.stage import RUNTIME, StageConfig, StageContext
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers
+
+if TYPE_CHECKING:
+    import lightning as L
 
 BatchSource = Callable[[int, Share], Numbered[Any]]
 """(items of a step on all processes, share of this one) -> batches; item n is its rows of part `n % parts` of
@@ -30,6 +35,21 @@ class SizedBatches(Numbered[Any], Sized, Protocol):
 
 EvalSource = Callable[[], SizedBatches]
 """All validation batches: every process reads the same, so the figures depend on no rank."""
+
+
+@dataclass(frozen=True)
+class TrainingCallback:
+    """A callback of Lightning's by its name in recipes; `make` is called when the training of a stage begins.
+
+    `train/...` and `val/...` are in `trainer.callback_metrics` after each row of the log, and
+    `on_validation_end` is called after each validation. Its `state_dict` is in the checkpoints.
+    """
+
+    name: str
+    make: Callable[[StageContext], L.Callback]
+
+
+CALLBACKS: Table[TrainingCallback] = Table(TrainingCallback, "callback of trainings")
 
 
 class TrainConfig(Config):
@@ -75,11 +95,27 @@ class TrainConfig(Config):
     figures of them, drawn on the CPU by a process beside the training; 0 turns them off."""
     validate_every: int = Field(200, ge=0, json_schema_extra=RUNTIME)
     """Steps between validations, rounded up to checkpoints; 0 turns them off."""
+    callbacks: tuple[str, ...] = Field((), json_schema_extra=RUNTIME)
+    """Registered callbacks that the Trainer calls as well, by name. One from another package counts by its
+    code, so a change of it trains again."""
+    profiler: Literal["simple", "advanced", "pytorch"] | None = Field(None, json_schema_extra=RUNTIME)
+    """Lightning's profiler, whose report lies in the stage's `logs/`."""
 
     @field_validator("ema")
     @classmethod
     def _off(cls, value: float | None) -> float | None:
         return value or None  # one way to say it, so that the other is no change
+
+    @field_validator("callbacks")
+    @classmethod
+    def _known(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        if names:
+            discover()
+        for name in names:
+            if name not in CALLBACKS:
+                hint = nearest(name, [*CALLBACKS], what="callbacks")
+                raise ValueError(f"no callback '{name}' is registered{hint}")
+        return names
 
     def seed_of(self, recipe: int) -> int:
         """Return the seed of the training in a recipe of seed `recipe`."""

@@ -1,28 +1,25 @@
-"""Devices, processes and precision of a training, and its optimizer steps on them."""
+"""Devices, processes and precision of a training: the `lightning.Trainer` of a recipe."""
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from typing import Any, cast
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 
+import lightning as L
 import torch
-from lightning.fabric import Fabric
-from lightning.fabric.plugins.precision import MixedPrecision as FabricMixedPrecision
-from lightning.fabric.plugins.precision import Precision
-from lightning.fabric.strategies.ddp import DDPStrategy
-from lightning.fabric.strategies.model_parallel import ModelParallelStrategy
-from lightning.fabric.strategies.strategy import Strategy
-from torch import Tensor, nn
-from torch.distributed.device_mesh import DeviceMesh
+from lightning.pytorch.plugins.io import CheckpointIO
+from lightning.pytorch.profilers import AdvancedProfiler, PyTorchProfiler, SimpleProfiler
+from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy, Strategy
+from torch import nn
 
-from motionloom.models.layers.transformer import Block, Transformer
-from motionloom.models.training.compiled import Compiled
-from motionloom.models.training.stage_module import Batch, StageModule
+from motionloom.models.layers.transformer import Transformer
+from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.team import environment
 from motionloom.pipeline.training.config import TrainConfig
+
+PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": PyTorchProfiler}
 
 
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
@@ -41,6 +38,15 @@ SMALL = 10_000_000
 LAUNCHES = 50_000_000
 """Parameters below which a GPU computes its kernels faster than Python starts them: they are replayed as CUDA
 graphs [on an H100 the tokenizer and TMA wait for Python, the GPT of 228 million does not]."""
+
+
+def compile_module(module: StageModule, config: TrainConfig, hardware: Hardware) -> None:
+    """Compile the losses as `train.compile` says, or where it is known to be worth it."""
+    on_gpu, world = hardware.resolved_accelerator() == "gpu", hardware.world()
+    cut = config.strategy == "fsdp" and world > 1
+    if config.compile or (config.compile is None and on_gpu and module.compilable and not cut):
+        size = sum(param.numel() for param in module.parameters())
+        module.compile_losses(graphs=on_gpu and size < LAUNCHES and config.accumulate == world == 1)
 
 
 def set_threads(module: nn.Module, hardware: Hardware) -> None:
@@ -67,51 +73,55 @@ def deterministic(hardware: Hardware) -> Iterator[None]:
         torch.use_deterministic_algorithms(False)
 
 
-class MixedPrecision(FabricMixedPrecision):
-    """Autocast as `lightning.Trainer` has it: batches are not cast, and each use of a weight is cast anew, so
-    that gradients add up in float32.
-    """
-
-    def forward_context(self) -> AbstractContextManager[object]:
-        return torch.autocast(self.device, dtype=self._desired_input_dtype, cache_enabled=False)
-
-    def convert_input(self, data: object) -> object:
-        return data
-
-    def convert_output(self, data: object) -> object:
-        return data
-
-
-def launch(hardware: Hardware, config: TrainConfig) -> Fabric:
-    """Devices, processes and precision."""
+def make_trainer(
+    hardware: Hardware,
+    config: TrainConfig,
+    module: StageModule,
+    callbacks: Sequence[L.Callback],
+    checkpoints: CheckpointIO,
+    logs: Path,
+) -> L.Trainer:
+    """Return the Trainer of a recipe's training; validations, checkpoints and logs are its callbacks'."""
     launcher = environment()
-    fabric = Fabric(
+    profiler = PROFILERS[config.profiler](dirpath=logs, filename="profile") if config.profiler else None
+    trainer = L.Trainer(
         accelerator=hardware.lightning_accelerator(),
         devices=hardware.resolved_devices(),
         num_nodes=hardware.nodes,
-        strategy=_strategy(hardware, config),
-        plugins=[*([launcher] if launcher else []), precision_of(config.precision, hardware)],
+        strategy=strategy_of(hardware, config),
+        precision=config.precision,
+        max_steps=config.steps,
+        accumulate_grad_batches=config.accumulate if module.automatic_optimization else 1,
+        plugins=[*([launcher] if launcher else []), checkpoints],
+        callbacks=list(callbacks),
+        profiler=profiler,
+        limit_val_batches=0,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        default_root_dir=logs,  # where Lightning looks for checkpoints of its own: there are none
     )
-    fabric.launch()
-    return fabric
+    # It would tell all ranks of rank 0's SIGTERM before every step, and wait for the GPU each time; they
+    # agree on signals of any rank twice a second (`Agreement`).
+    trainer.fit_loop.epoch_loop._broadcast_sigterm_tensor = _nothing  # type: ignore[method-assign]
+    return trainer
 
 
-def precision_of(precision: str, hardware: Hardware) -> Precision:
-    """The arithmetic of a training."""
-    if precision == "32-true":
-        return Precision()
-    device = "cuda" if hardware.resolved_accelerator() == "gpu" else "cpu"
-    return MixedPrecision(cast(Any, precision), device)
+def _nothing() -> None:
+    pass
 
 
-def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
+def strategy_of(hardware: Hardware, config: TrainConfig) -> str | Strategy:
+    """Return the distribution over processes that a recipe asks for."""
     if hardware.world() == 1:
         return "auto"
     if config.strategy == "fsdp":
         return ModelParallelStrategy(
-            parallelize_fn=_shard,
             data_parallel_size=hardware.world(),
             tensor_parallel_size=1,
+            save_distributed_checkpoint=False,
             process_group_backend=hardware.backend(),
         )
     return DDPStrategy(
@@ -119,80 +129,3 @@ def _strategy(hardware: Hardware, config: TrainConfig) -> str | Strategy:
         # The quantizers keep codebooks equal themselves; rank 0's copy must not overwrite them mid-step.
         forward_sync_buffers=False,
     )
-
-
-def _shard(module: nn.Module, mesh: DeviceMesh) -> nn.Module:
-    """Replace the module's network by a copy that is sharded over the ranks (FSDP2).
-
-    Every transformer block is one unit, gathered when it runs and resharded after it; the rest (embeddings,
-    heads) is the last unit. Gradients are averaged over ranks as in DDP, and nothing is gathered in a lower
-    precision than it is kept in, so training equals DDP up to the order of sums.
-    """
-    from torch.distributed.fsdp import fully_shard  # imported where it is used: it takes a second
-
-    assert isinstance(module, StageModule)
-    cut = copy.deepcopy(module.net)
-    for part in [*(part for part in cut.modules() if isinstance(part, Block)), cut]:
-        fully_shard(part, mesh=mesh["data_parallel"])
-    module.net = cut
-    return module
-
-
-class Execution:
-    """A module on this process's device, wrapped for DDP or FSDP, with its optimizers.
-
-    `take_step` calls the methods of the module that `lightning.Trainer` calls, in its order.
-    """
-
-    def __init__(self, fabric: Fabric, module: StageModule, config: TrainConfig) -> None:
-        prepare_module(module, config)
-        self.fabric, self.module = fabric, module
-        cut, on_gpu = isinstance(fabric.strategy, ModelParallelStrategy), fabric.device.type == "cuda"
-        if config.compile or (config.compile is None and on_gpu and module.compilable and not cut):
-            size = sum(param.numel() for param in module.parameters())
-            graphs = on_gpu and size < LAUNCHES and config.accumulate == fabric.world_size == 1
-            module.compile_losses(graphs=graphs)
-        self.model = fabric.setup_module(module, move_to_device=not cut)  # whole, it may not fit there
-        module.to(fabric.device)
-        module.on_fit_start()  # frozen networks follow
-        self.optimizers = [one["optimizer"] for one in module.configure_optimizers()]
-
-    def take_step(self, parts: Iterable[Batch]) -> Tensor:
-        """One training step on the parts of its batch; the loss of the last part."""
-        module, fabric = self.module, self.fabric
-        automatic, parted = module.automatic_optimization, isinstance(fabric.strategy, DDPStrategy)
-        if automatic:
-            module.schedule.set_step(module.step)
-            self.optimizers[0].zero_grad()
-        loss: Tensor | None = None
-        for number, batch in enumerate(parts):
-            # DDP averages gradients with the last part; groups that take turns average them themselves.
-            more = number < module.accumulate - 1 or not automatic
-            with fabric.no_backward_sync(self.model, enabled=parted and more):
-                loss = self._take_part(batch, number)
-        if automatic:
-            module.configure_gradient_clipping(self.optimizers[0])
-            self.optimizers[0].step()
-        module.step += 1
-        return torch.zeros(()) if loss is None else loss.detach()
-
-    def _take_part(self, batch: Batch, number: int) -> Tensor | None:
-        """Add a part's gradients and return its loss; without CUDA graphs once one has failed."""
-        losses = self.module.losses
-        if not (isinstance(losses, Compiled) and losses.graphs):
-            return self._add_gradients(batch, number)
-        restore = self.module.saved_state()
-        try:
-            return self._add_gradients(batch, number)
-        except RuntimeError as error:
-            losses.leave(error)
-            restore()
-            self.optimizers[0].zero_grad()  # graphs are for steps of one part
-            return self._add_gradients(batch, number)
-
-    def _add_gradients(self, batch: Batch, number: int) -> Tensor | None:
-        with self.fabric.autocast():
-            loss: Tensor | None = self.model.training_step(batch, number)
-        if self.module.automatic_optimization and loss is not None:
-            self.fabric.backward(loss / self.module.accumulate)
-        return loss

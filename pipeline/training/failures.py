@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
@@ -22,7 +21,8 @@ from rich.console import Console
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.shards.checksums import state_of
 from motionloom.models.training.distributed import rank, world_size
-from motionloom.models.training.stage_module import LOG_EVERY, StageModule
+from motionloom.models.training.finite import first_failure
+from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.launch.process import JointError, TeamError
 from motionloom.pipeline.store.data import Data
@@ -33,55 +33,6 @@ from motionloom.pipeline.training.telemetry import all_ranks
 
 class NotFiniteError(JointError):
     """A loss or a gradient is not finite."""
-
-
-@dataclass(frozen=True)
-class Failure:
-    """The first step whose loss or gradient was not finite."""
-
-    step: int
-    """Counted from 1, as in the log."""
-    terms: dict[str, float] = field(default_factory=dict)
-    """Figures that were not finite; empty if only the gradient was not."""
-
-    @property
-    def order(self) -> float:
-        """Sort key: by step, then ranks whose own loss failed before those that got their gradients."""
-        return 2.0 * self.step + (not self.terms)
-
-    def describe(self) -> str:
-        if not self.terms:
-            return f"in step {self.step} the gradient is not finite"
-        terms = ", ".join(f"{name} = {value}" for name, value in self.terms.items())
-        return f"in step {self.step} the loss is not finite ({terms})"
-
-
-def first_failure(module: StageModule) -> Failure | None:
-    """Return the first failure among the figures of the latest steps, which are cleared."""
-    figures, norms = module.figures[:], module.norms[:]
-    module.figures.clear()
-    module.norms.clear()
-    failures: list[Failure] = []
-    if figures:
-        values = torch.cat([part.values for part in figures]).tolist()
-        for part in figures:
-            own, values = dict(zip(part.names, values, strict=False)), values[len(part.names) :]
-            terms = {name: value for name, value in own.items() if not math.isfinite(value)}
-            if any(_is_loss(name) for name in terms):
-                failures.append(
-                    Failure(part.step, dict(sorted(terms.items(), key=lambda item: _is_loss(item[0]))))
-                )
-    if norms:
-        values = torch.stack([norm.float() for _, norm in norms]).tolist()
-        failures += [
-            Failure(step) for (step, _), value in zip(norms, values, strict=True) if not math.isfinite(value)
-        ]
-    return min(failures, key=lambda failure: failure.order, default=None)
-
-
-def _is_loss(name: str) -> bool:
-    """Whether a figure is minimised: a stage's own loss, or an optimizer group's."""
-    return name == "loss" or name.endswith("_loss")
 
 
 class FailureGuard:
@@ -110,11 +61,6 @@ class FailureGuard:
         if world_size() > 1:
             dist.broadcast_object_list(text, src=first)
         raise NotFiniteError(text[0])
-
-    def due(self, step: int) -> bool:
-        """Whether to check after a step: reading a figure waits for a GPU, and ranks for each other."""
-        alone = world_size() == 1 and self.module.device.type == "cpu"
-        return alone or step % LOG_EVERY == 0
 
 
 class ShardWatch:

@@ -1,16 +1,17 @@
-"""A stage's module and batches for `lightning.Trainer`, and modules from the checkpoints of either loop."""
+"""A stage's module and batches for a `lightning.Trainer`, and modules from checkpoints."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
-from torch.utils.data import DataLoader
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Numbered, Steps
 from motionloom.models.training.stage_module import Batch, StageModule
@@ -18,27 +19,28 @@ from motionloom.pipeline.contract.stage import CompletedStage, Inputs, StageCach
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training.config import TrainConfig
 from motionloom.pipeline.training.execution import prepare_module, set_threads
-from motionloom.pipeline.training.loaders import every_batch, loader
+from motionloom.pipeline.training.loaders import Loader, every_batch
 from motionloom.pipeline.training.trained_stage import Batches, TrainedStage, describe, hyper_parameters
 
 
 class StageData(L.LightningDataModule):
     """The batches of a stage's training, each rank's own, and those of its validation.
 
-    Step k reads the same global batch as in the pipeline's own loop, on any number of processes and in any
-    epoch; a Trainer that resumes goes on behind the last step. `train.batch_size` is the global batch.
-    Batches are loaded in workers where `hardware.workers` says how many.
+    Step k reads the same global batch on any number of processes and in any epoch; a Trainer that resumes
+    goes on behind the last step. `train.batch_size` is the global batch. Batches are loaded in workers where
+    `hardware.workers` says how many.
     """
 
     def __init__(self, batches: Batches, train: TrainConfig, hardware: Hardware | None = None) -> None:
         super().__init__()
-        hardware = hardware or Hardware()
-        if hardware.workers == "auto":  # each would run a script anew that has no `if __name__ == "__main__"`
-            hardware = hardware.model_copy(update={"workers": 0})
-        self.batches, self.config, self.hardware = batches, train, hardware
+        self.batches, self.config, self.hardware = batches, train, hardware or Hardware()
+        self.waiting: Callable[[], AbstractContextManager[object]] = nullcontext
+        """Gives a context around each wait for a training batch."""
+        self._held_out: Loader | None = None
+        self._training: Loader | None = None
 
     def setup(self, stage: str) -> None:
-        """Use as many CPU threads as the pipeline's own loop: the number of threads changes rounding."""
+        """Use as many CPU threads as `motionloom run`: the number of threads changes rounding."""
         if self.trainer is None:
             return
         set_threads(self.trainer.lightning_module, self.hardware)
@@ -49,7 +51,7 @@ class StageData(L.LightningDataModule):
             if stage == "fit" and (own := getattr(self.config, key)) != value:
                 warnings.warn(f"train.{key} is {own}; what counts is this Trainer's, {value}", stacklevel=2)
 
-    def train_dataloader(self) -> DataLoader[Batch]:
+    def train_dataloader(self) -> Loader:
         trainer = self.trainer
         module = None if trainer is None else trainer.lightning_module
         parts = module.accumulate if isinstance(module, StageModule) else self.config.accumulate
@@ -64,12 +66,34 @@ class StageData(L.LightningDataModule):
                 return 0
             return trainer.global_step * parts
 
-        # A worker that is kept would begin its next epoch where it began this one.
-        return loader(Steps(make, steps * parts, done), self.hardware, once=True)
+        self._training = Loader(Steps(make, steps * parts, done), self.hardware, self._device(), once=True)
+        self._training.waiting = lambda: self.waiting()
+        return self._training
 
-    def val_dataloader(self) -> DataLoader[Batch] | list[DataLoader[Batch]]:
+    def val_dataloader(self) -> Loader | list[Loader]:
+        """Return all validation batches; workers stay from one validation to the next."""
         validation = self.batches.validation
-        return [] if validation is None else loader(every_batch(validation), self.hardware)
+        if validation is None:
+            return []
+        if self._held_out is None:
+            self._held_out = Loader(every_batch(validation), self.hardware, self._device(), once=False)
+        return self._held_out
+
+    def teardown(self, stage: str | None = None) -> None:
+        """Stop all workers, which ignore signals; the process would wait for them."""
+        for one in (self._training, self._held_out):
+            if one is not None:
+                one.close()
+        self._training = self._held_out = None
+
+    def on_exception(self, exception: BaseException) -> None:
+        self.teardown()
+
+    def __getstate__(self) -> dict[str, object]:
+        raise UserError("strategy ddp_spawn: the batches of a stage cannot be sent; take strategy ddp")
+
+    def _device(self) -> torch.device:
+        return torch.device("cpu") if self.trainer is None else self.trainer.strategy.root_device
 
 
 def open_training(
@@ -82,6 +106,10 @@ def open_training(
     """Return the module and the batches of a stage's training, untrained; `given` are its inputs by role."""
     module, inputs = _open_module(kind, config, given, seed)
     batches = kind.batches(config, module.net, inputs, seed, lambda _: None)
+    module.ema = config.train.ema
+    hardware = hardware or Hardware()
+    if hardware.workers == "auto":  # each would run a script anew that has no `if __name__ == "__main__"`
+        hardware = hardware.model_copy(update={"workers": 0})
     return module, StageData(batches, config.train, hardware)
 
 

@@ -1,4 +1,4 @@
-"""Data loaders of a training, and their batches on its device.
+"""Data loaders of a training under any Trainer, and their batches on its device.
 
 A worker sends a batch as one piece of shared memory: torch opens a file, a socket and a mapping for every
 tensor, .7 ms each. On a GPU it writes into the same pieces over and over, since the first writing to new
@@ -10,63 +10,28 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
 
 import torch
-from lightning.fabric import Fabric
+from lightning.pytorch.utilities import move_data_to_device
 from torch import Tensor
 from torch.utils._pytree import tree_leaves, tree_map
 from torch.utils.data import DataLoader, IterableDataset
 
-from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Steps
-from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Batch
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import end_with_parent
-from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
+from motionloom.pipeline.training.config import EvalSource
 from motionloom.pipeline.training.preemption import signals_blocked
 
 ROOMS = 3
 """Pieces of memory of a worker. A loader that pins asks it for the second batch behind one, torch's
 `prefetch_factor`, when that one is pinned; until then it may be read."""
-
-
-class TrainingData:
-    """The loaders of one training."""
-
-    def __init__(
-        self, train: BatchSource, validation: EvalSource | None, config: TrainConfig, hardware: Hardware
-    ) -> None:
-        self.config, self.hardware = config, hardware
-        self.train = train(config.batch_size, Share(rank(), world_size(), config.accumulate))
-        self.validation = validation
-        self._training: _Loader | None = None
-        self._held_out: _Loader | None = None
-
-    def batches(self, step: int) -> DataLoader[Batch]:
-        """All micro-batches from those of step `step` (from 0) to the end of the training."""
-        parts = self.config.accumulate
-        steps = Steps(lambda _, __: self.train, self.config.steps * parts, step * parts)
-        self._training = loader(steps, self.hardware)
-        return self._training
-
-    def held_out(self) -> DataLoader[Batch]:
-        """All validation batches; workers stay from one validation to the next."""
-        if self._held_out is None:
-            assert self.validation is not None
-            self._held_out = loader(every_batch(self.validation), self.hardware)
-        return self._held_out
-
-    def close(self) -> None:
-        """Stop all workers, which ignore signals; the process would wait for them."""
-        for one in (self._training, self._held_out):
-            if one is not None:
-                one.close()
-        self._training = self._held_out = None
 
 
 def every_batch(validation: EvalSource) -> Steps[Batch]:
@@ -143,60 +108,92 @@ class SharedBatches(IterableDataset[Packed]):
             yield Packed(rooms[at][:end], places)
 
 
-class _Loader(DataLoader[Batch]):
-    def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
-        if not self.num_workers:
-            return super().__iter__()
+class Loader:
+    """The batches of `steps`, ready and on the device: an iterable with a length, as any Trainer takes it.
+
+    Its whole state is the step that the Trainer counts, so there is nothing to save or to restore.
+    """
+
+    def __init__(self, steps: Steps[Batch], hardware: Hardware, device: torch.device, *, once: bool) -> None:
+        """With `once` no worker is kept for the next epoch, which would begin where this one did."""
+        self.steps, self.hardware, self.device, self.once = steps, hardware, device, once
+        self.waiting: Callable[[], AbstractContextManager[object]] = nullcontext
+        """Gives a context around each wait for a batch."""
+        self._opened: DataLoader[Batch] | None = None
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield the batches; nothing is read and no worker started before the first is asked for."""
+        batches = on_device(self._ready(), self.device)
+        while True:
+            with self.waiting():
+                batch = next(batches, None)
+            if batch is None:
+                return
+            yield batch
+
+    def state_dict(self) -> dict[str, object]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, object]) -> None:
+        """There is nothing to restore."""
+
+    def close(self) -> None:
+        """End the workers now, which ignore signals; without this they end with the last reference to their
+        iterator. An error that came from a worker holds its own traceback, and so the iterator, in a circle.
+        """
+        if self._opened is not None and self._opened._iterator is not None:
+            self._opened._iterator._shutdown_workers()  # type: ignore[attr-defined]
+            self._opened._iterator = None
+
+    def _ready(self) -> Iterator[Batch]:
+        if self._opened is None:
+            self._opened = self._open()
+        if not self._opened.num_workers:
+            yield from self._opened
+            return
         # Started with the first process of all, it would let SIGTERM through to that one.
         resource_tracker.ensure_running()
         with signals_blocked():
-            return map(Packed.unpacked, super().__iter__())
+            packed = iter(self._opened)
+        yield from map(Packed.unpacked, packed)  # type: ignore[arg-type]
 
-    def close(self) -> None:
-        """End the workers now; without this they end with the last reference to their iterator.
-
-        An error that came from a worker holds its own traceback, and so the iterator, in a circle.
-        """
-        if self._iterator is not None:
-            self._iterator._shutdown_workers()  # type: ignore[attr-defined]
-            self._iterator = None
-
-
-def loader(steps: Steps[Batch], hardware: Hardware, *, once: bool = False) -> _Loader:
-    """Return a loader of ready batches; with `once` no worker is kept for the next epoch."""
-    first, last = steps.span()
-    workers = hardware.workers_for(last - first)
-    kept = workers > 0 and not once  # from validation to validation; their start takes seconds
-    # torch pins nothing where it finds no GPU, whatever was asked for.
-    pinned = hardware.resolved_accelerator() == "gpu" and torch.accelerator.is_available()
-    return _Loader(
-        SharedBatches(steps, ROOMS if pinned else 0) if workers else steps,  # type: ignore[arg-type]
-        batch_size=None,
-        num_workers=workers,
-        pin_memory=pinned,
-        persistent_workers=kept,
-        multiprocessing_context="spawn" if workers else None,
-        worker_init_fn=partial(end_with_parent, os.getpid()) if workers else None,
-    )
+    def _open(self) -> DataLoader[Batch]:
+        first, last = self.steps.span()
+        workers = self.hardware.workers_for(last - first)
+        kept = workers > 0 and not self.once  # from validation to validation; their start takes seconds
+        # torch pins nothing where it finds no GPU, whatever was asked for.
+        pinned = self.hardware.resolved_accelerator() == "gpu" and torch.accelerator.is_available()
+        return DataLoader(
+            SharedBatches(self.steps, ROOMS if pinned else 0) if workers else self.steps,  # type: ignore[arg-type]
+            batch_size=None,
+            num_workers=workers,
+            pin_memory=pinned,
+            persistent_workers=kept,
+            multiprocessing_context="spawn" if workers else None,
+            worker_init_fn=partial(end_with_parent, os.getpid()) if workers else None,
+        )
 
 
-def on_device(batches: Iterable[Batch], fabric: Fabric) -> Iterator[Batch]:
-    """Yield the batches on the device of `fabric`; on a GPU the next one is copied by a stream of its own."""
-    if fabric.device.type != "cuda":
-        yield from map(fabric.to_device, batches)
+def on_device(batches: Iterable[Batch], device: torch.device) -> Iterator[Batch]:
+    """Yield the batches on the device; on a GPU the next one is copied by a stream of its own."""
+    if device.type != "cuda":
+        yield from batches  # a CPU has them, and the Trainer copies them to other devices
         return
-    copies = torch.cuda.Stream(fabric.device)  # type: ignore[no-untyped-call]
+    copies = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
     def copied(batch: Batch) -> tuple[Batch, torch.cuda.Event]:
         with torch.cuda.stream(copies):
-            return fabric.to_device(batch), copies.record_event()
+            return move_data_to_device(batch, device), copies.record_event()
 
     coming = map(copied, batches)
     ahead = next(coming, None)
     while ahead is not None:
         batch, done = ahead
         ahead = next(coming, None)  # on its way before this one's work is queued
-        computing = torch.cuda.current_stream(fabric.device)
+        computing = torch.cuda.current_stream(device)
         computing.wait_event(done)
         for value in tree_leaves(batch):
             if isinstance(value, Tensor):  # the copying stream must not have its memory back while it is read

@@ -55,11 +55,31 @@ class Signals:
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+            # Lightning turns Ctrl-C off for good when it has come.
+            self._before = {number: signal.getsignal(number) for number in (*SIGNALS, signal.SIGINT)}
+            self.note()
         return self
+
+    def note(self) -> None:
+        """Note signals from here on, whoever else has taken them meanwhile, and let those that wait come."""
+        if self._before:
+            for number in SIGNALS:
+                signal.signal(number, self._note)
+            self._hold(signal.SIG_UNBLOCK)
+
+    def hold(self) -> None:
+        """Have signals wait for `note`: a Trainer puts handlers of its own, which talk to other ranks."""
+        if self._before:
+            self._hold(signal.SIG_BLOCK)
+
+    def _hold(self, how: int) -> None:
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(how, SIGNALS)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Restore the handlers; a signal that the training has not answered is raised again."""
+        if self._before:
+            self.note()
         for number, handler in self._before.items():
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
         self._before = {}

@@ -45,7 +45,7 @@ from motionloom.pipeline.store.weights import (
     load_weights,
     save_model,
 )
-from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainedStageConfig
+from motionloom.pipeline.training.config import CALLBACKS, BatchSource, EvalSource, TrainedStageConfig
 
 if TYPE_CHECKING:
     from motionloom.models.training.stage_module import Batch, StageModule
@@ -86,8 +86,9 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     trains = True
 
     def modules(self, config: C) -> Iterable[str]:
-        """Modules of its classes, and its trainer's, which nothing here imports."""
-        return [*super().modules(config), self.trainer.partition(":")[0]]
+        """Modules of its classes, and those that nothing here imports: its trainer's and its callbacks'."""
+        called = [CALLBACKS[name].make.__module__ for name in config.train.callbacks]
+        return [*super().modules(config), self.trainer.partition(":")[0], *called]
 
     def roles(self) -> tuple[Role | Every, ...]:
         return self.inputs.roles() or super().roles()

@@ -1,4 +1,4 @@
-"""The training loop of a stage, on Lightning Fabric: steps, validation, checkpoints, logs, exact resume.
+"""The training of a stage by a `lightning.Trainer`: validation, checkpoints, logs, exact resume.
 
 The batch of step k is a pure function of (seed, k) and every step seeds its own random draws, so a resumed
 training repeats the undisturbed one bit for bit, and the loader's whole state is the step number. Checkpoints
@@ -9,48 +9,51 @@ training.
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
-from contextlib import nullcontext, suppress
+from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext, suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import torch
 import torch.distributed as dist
-from lightning.fabric import Fabric
 from torch import Tensor
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import remove_temporaries
 from motionloom.datasets.base.os_errors import full_place
+from motionloom.datasets.loading.plan import Share
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.distributed import rank, world_size
-from motionloom.models.training.stage_module import LOG_EVERY, Batch, StageModule
+from motionloom.models.training.finite import check_is_due
+from motionloom.models.training.stage_module import LOG_EVERY, OtherNetworkError, StageModule
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.process import Interrupted, TeamError
 from motionloom.pipeline.launch.team import lead_finds
 from motionloom.pipeline.store.training_log import optional, rise_of_loss
 from motionloom.pipeline.training.checkpointing import (
     BackgroundWriter,
-    Checkpoint,
-    load_optimizer,
     load_row,
-    load_weights,
     name_of,
-    optimizer_state,
-    read_checkpoint,
     readable,
     rows_of_ranks,
     step_of,
-    weights_of,
 )
-from motionloom.pipeline.training.config import BatchSource, EvalSource, TrainConfig
-from motionloom.pipeline.training.execution import Execution, deterministic, launch, set_threads
+from motionloom.pipeline.training.config import CALLBACKS, BatchSource, EvalSource, TrainConfig
+from motionloom.pipeline.training.execution import (
+    compile_module,
+    deterministic,
+    make_trainer,
+    prepare_module,
+    set_threads,
+)
 from motionloom.pipeline.training.failures import FailureGuard, ShardWatch, StallTimer
-from motionloom.pipeline.training.loaders import TrainingData, on_device
+from motionloom.pipeline.training.lightning_data import StageData
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
 from motionloom.pipeline.training.telemetry import SampleProcess, StepProgress, Telemetry
+from motionloom.pipeline.training.trained_stage import Batches
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 
@@ -66,157 +69,231 @@ def fit(
     set_threads(module, hardware)
     if hardware.resolved_accelerator() == "gpu":
         hardware.device()  # refuses in one sentence where there is no GPU
-    fabric = launch(hardware, config)
-    resume = lead_finds(partial(_find_resume_point, context))
-    net = module.net
-    training = Training(
-        context, module, config, fabric, TrainingData(train, validation, config, hardware), resume
-    )
-    try:
-        with deterministic(hardware):
-            training.run()
-    except OSError as error:
-        if error.errno is not None and error.filename is None:
-            error.filename = full_place(error, training.folder)
-        raise
-    except RuntimeError as error:
-        if isinstance(error, dist.DistBackendError) or "by peer" in str(error) or "imed out" in str(error):
-            raise TeamError.lost(training.log.folder) from None
-        if "killed by signal: Killed" in str(error):
-            raise UserError(
-                f"stage {context.name}: a loader worker was killed, as systems do that are short of memory; "
-                f"lower hardware.workers and run the same command, which goes on from the last checkpoint"
-            ) from error
-        if "does not have a deterministic implementation" in str(error):
-            what = str(error).partition(",")[0]
-            raise UserError(f"stage {context.name}: {what}; set hardware.deterministic: false") from error
-        raise
-    if module.net is not net:  # a sharded copy was trained
-        whole = weights_of(module.net)
-        if rank() == 0:
-            net.load_state_dict(whole)
-        module.net = net
-    if training.average is not None:
-        training.average.fill(net)
+    prepare_module(module, config)
+    at_peak = _seconds_at_peak(context, module, config, train)
+    compile_module(module, config, hardware)
+    module.logs_rows = True
+    writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)
+    data = StageData(Batches(train, validation), config, hardware)
+    average = AveragedWeights(config.ema) if config.ema else None
+    extra = [CALLBACKS[name].make(context) for name in config.callbacks]
+    with Signals() as signals:
+        training = Training(context, config, data, writer, average, extra, signals, at_peak)
+        callbacks = [*([] if average is None else [average]), *extra, training]
+        trainer = make_trainer(hardware, config, module, callbacks, writer, training.metrics.folder)
+        resume = lead_finds(partial(_find_resume_point, context))
+        try:
+            with deterministic(hardware):
+                trainer.fit(module, data, ckpt_path=resume, weights_only=True)
+        except SystemExit:
+            if training.ended_by_user:  # Lightning makes an exit of it
+                raise KeyboardInterrupt from None
+            raise
+        except Exception as error:
+            told = training.explain(error)
+            if told is error:
+                raise
+            raise told from (None if isinstance(told, TeamError) else error)
+        finally:
+            training.close()
     module.to("cpu")
+    training.sum_up(module)
 
 
-class Training:
-    """One training of a stage, in this process."""
+def _seconds_at_peak(
+    context: StageContext, module: StageModule, config: TrainConfig, train: BatchSource
+) -> float:
+    """Return the seconds that a step would take at the device's peak; 0 where that is not known."""
+    peak = peak_flops(context.hardware.device(), config.precision)
+    if peak is not None:
+        with optional(f"MFU of {context.name}", context.console):
+            module.on_fit_start()  # frozen networks were loaded to the GPU, and the rest is not there yet
+            batch = train(config.batch_size, Share(0, context.hardware.world(), config.accumulate))[0]
+            return config.accumulate * pass_flops(module, batch) / peak
+    return 0.0
+
+
+class Training(L.Callback):
+    """What surrounds the steps of one training in this process: rows, validations, checkpoints, signals."""
+
+    telemetry: Telemetry
+    progress: StepProgress
+    failures: FailureGuard
+    agreement: Agreement
+    stall: StallTimer
+    _step: int
+    """Steps that are done and seen to."""
 
     def __init__(
         self,
         context: StageContext,
-        module: StageModule,
         config: TrainConfig,
-        fabric: Fabric,
-        data: TrainingData,
-        resume: Path | None,
+        data: StageData,
+        writer: BackgroundWriter,
+        average: AveragedWeights | None,
+        extra: Sequence[L.Callback],
+        signals: Signals,
+        at_peak: float,
     ) -> None:
-        """`resume` is the checkpoint to go on from; None for the beginning."""
-        self.context, self.module, self.config, self.fabric, self.data = context, module, config, fabric, data
+        self.context, self.config, self.data, self.writer = context, config, data, writer
+        self.average, self.extra, self.signals, self.at_peak = average, extra, signals, at_peak
         self.folder = context.folder / "checkpoints"
         console, name, hardware = context.console, context.name, context.hardware
         self.every = min(config.checkpoint_every, config.steps)
         # Validations fall on checkpoints, so that a resumed training makes the same ones.
         checkpoints = -(-config.validate_every // self.every)
-        self.validate_every = checkpoints * self.every if data.validation is not None else 0
-        peak, at_peak = peak_flops(fabric.device, config.precision), 0.0
-        if peak is not None:
-            with optional(f"MFU of {name}", console):
-                module.on_fit_start()  # frozen networks were loaded to the GPU, and the rest is not there yet
-                at_peak = config.accumulate * pass_flops(module, data.train[0]) / peak
-        self.execution = Execution(fabric, module, config)
-        self.average = AveragedWeights(module.net, config.ema) if config.ema else None
+        self.validate_every = checkpoints * self.every if data.batches.validation is not None else 0
         title = f"{context.recipe}/{name}"
-        self.log = MetricLog(context.folder, hardware.loggers, context.recipe, title, console)
-        self.validation_is_due = False
-        # Loaded before telemetry and writer begin: both go on from the module's step.
-        if resume is not None:
-            self._load(read_checkpoint(resume))
-        context.begun()
-        self.writer = BackgroundWriter(keep=config.keep_checkpoints, keep_every=config.keep_every)
-        sample_every = -(-config.sample_every // self.every) * self.every
-        self.samples = SampleProcess(context, sample_every)
-        self._saved, self._writing = module.step if resume else -1, False
-        self.telemetry = Telemetry(context.folder, module, config.batch_size, console, at_peak)
-        self.failures = FailureGuard(name, module)
+        self.metrics = MetricLog(context.folder, hardware.loggers, context.recipe, title, console)
         self.shards = ShardWatch(context.inputs.values())
-        stalled = self.log.folder / f"stalled_rank_{rank()}.txt"
-        self.stall = StallTimer(stalled, hardware.stall_seconds, console)
+        self.ended_by_user = False
+        self._open: ExitStack | None = None
+        self._restored: dict[str, Any] | None = None
+        self._saved, self._writing, self._validation_is_due = -1, False, False
 
-    def run(self) -> None:
-        self.log.open()
-        self.progress = StepProgress(
-            self.context.name, self.module.step, self.config.steps, self.context.console
-        )
-        with Signals() as self.signals, self.stall.running():
-            self.agreement = Agreement(self.signals, world_size())
-            self.signals.ends_compiling = self._end_compiling
-            try:
-                self._run()
-            except BaseException as error:
-                with suppress(UserError, OSError):  # the error says more than one of the writing
-                    self._finish_writing()
-                self.log.fail()
-                if isinstance(error, Exception):
-                    raise self.shards.explain(error) from error
-                raise
-            finally:
-                self.progress.close()
-                self.data.close()
-        summary = self.telemetry.summary()
-        if summary:
-            self.context.console.print(f"    {self.context.name}: {summary}")
-        if rank() == 0 and (risen := rise_of_loss(self.log.rows)):
-            self.context.console.print(f"[yellow]    {self.context.name}: {risen}[/]", soft_wrap=True)
+    # Lightning's hooks, in the order of their calls.
 
-    def _run(self) -> None:
-        module, steps = self.module, self.config.steps
-        # A signal cut the validation of this step short: its row comes before those of later steps.
-        if self.validation_is_due:
-            self._validate()
-            if not self.validation_is_due:
-                self._save(again=True)  # else a second kill would validate this step twice
-            self._answer(self.agreement.now())
-        left = self.data.batches(module.step) if module.step < steps else ()
-        batches = on_device(left, self.fabric)
-        while module.step < steps:
-            self._step(batches)
-            border = module.step % self.every == 0 or module.step == steps
-            if self.validate_every and module.step % self.validate_every == 0:
-                self._validate()
-            if border:  # after the validation, so that the checkpoint holds its row
-                self._save()
-            self._answer(self.agreement.now() if border else self.agreement.after_step())
-        self._finish_writing()
-        # A signal during the last write: the run must not go on to the next stage.
-        self._answer(self.agreement.now())
-        self.log.finish()
+    def on_fit_start(self, trainer: L.Trainer, module: Any) -> None:
+        self.signals.hold()
 
-    def _step(self, batches: Iterator[Batch]) -> None:
-        self.telemetry.begin_step()
-        loss = self.execution.take_step(self._parts(batches))
-        step = self.module.step
-        if self.average is not None:
-            self.average.update(self.module.net)
+    def on_load_checkpoint(self, trainer: L.Trainer, module: Any, checkpoint: dict[str, Any]) -> None:
+        self._restored = {key: checkpoint[key] for key in ("row", "steps", "validate")}
+        self.metrics.load_state_dict(checkpoint["log"])
+
+    def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
+        self._begin(trainer, module)
+
+    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any, batch_idx: int) -> None:
+        self.telemetry.batch(batch)
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """After the last part of a step: its row, validation and checkpoint, and what signals ask for."""
+        step = module.step
+        if step == self._step:
+            return
+        self._step = step
         self.telemetry.end_step()
-        if self.failures.due(step):
+        if check_is_due(module):
             self.failures.check()
         if step % LOG_EVERY == 0:
             self._log_row()
+        loss = outputs["loss"] * trainer.accumulate_grad_batches if "loss" in outputs else torch.zeros(())
         self.progress.show(step, loss, self.telemetry.note)
         if self._writing and not self.writer.busy:
             self._finish_writing()
         self.stall.progress()
+        border = step % self.every == 0 or step == self.config.steps
+        if self.validate_every and step % self.validate_every == 0:
+            self._validate()
+        if border:  # after the validation, so that the checkpoint holds its row
+            self._save()
+        self._answer(self.agreement.now() if border else self.agreement.after_step())
+        self.telemetry.begin_step()
 
-    def _parts(self, batches: Iterator[Batch]) -> Iterator[Batch]:
-        """Yield the parts of one step's batch, each read when it is needed."""
-        for _ in range(self.config.accumulate):
-            with self.telemetry.waits.waiting_for("data"):
-                batch = next(batches)
-            self.telemetry.batch(batch)
-            yield batch
+    def on_save_checkpoint(self, trainer: L.Trainer, module: Any, checkpoint: dict[str, Any]) -> None:
+        checkpoint |= {
+            "steps": self.config.steps,
+            "log": self.metrics.state_dict(),
+            "row": rows_of_ranks(module),
+            "validate": self._validation_is_due,
+            "average": checkpoint.get("average"),
+        }
+
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+        self._finish_writing()
+        # A signal during the last write: the run must not go on to the next stage.
+        self._answer(self.agreement.now())
+        self.metrics.finish()
+
+    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Finish a training that was killed behind its last step, for which a Trainer has nothing to do."""
+        if self._open is None:
+            module.to(trainer.strategy.root_device)
+            self._begin(trainer, module)
+            self.on_train_end(trainer, module)
+
+    def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
+        self.ended_by_user = isinstance(exception, KeyboardInterrupt)
+        with suppress(UserError, OSError):  # the error says more than one of the writing
+            self._finish_writing()
+        self.metrics.fail()
+
+    def explain(self, error: Exception) -> Exception:
+        """Return the error that says what happened in the user's words; `error` itself where it does."""
+        name, error = self.context.name, self.shards.explain(error)
+        text = str(error)
+        if isinstance(error, OtherNetworkError):
+            return UserError(
+                f"{self.folder}: {text}, another network than {name} has now; give the settings that it "
+                f"began with, or begin anew with --from {name}"
+            )
+        if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+            error.filename = full_place(error, self.folder)
+        if not isinstance(error, RuntimeError):
+            return error
+        if isinstance(error, dist.DistBackendError) or "by peer" in text or "imed out" in text:
+            return TeamError.lost(self.metrics.folder)
+        if "killed by signal: Killed" in text:
+            return UserError(
+                f"stage {name}: a loader worker was killed, as systems do that are short of memory; "
+                f"lower hardware.workers and run the same command, which goes on from the last checkpoint"
+            )
+        if "does not have a deterministic implementation" in text:
+            what = text.partition(",")[0]
+            return UserError(f"stage {name}: {what}; set hardware.deterministic: false")
+        return error
+
+    def close(self) -> None:
+        """End what shows and watches the steps."""
+        if self._open is not None:
+            self._open.close()
+
+    def sum_up(self, module: StageModule) -> None:
+        """Print speed and waits, and that the loss has risen."""
+        console, name = self.context.console, self.context.name
+        if summary := self.telemetry.summary():
+            console.print(f"    {name}: {summary}")
+        if rank() == 0 and (risen := rise_of_loss(self.metrics.rows)):
+            console.print(f"[yellow]    {name}: {risen}[/]", soft_wrap=True)
+
+    def _begin(self, trainer: L.Trainer, module: StageModule) -> None:
+        """Open logs and watches at the step that the training goes on from."""
+        context, config, console = self.context, self.config, self.context.console
+        self.trainer, self.module, self._step = trainer, module, module.step
+        self.signals.note()
+        if self.average is not None and self.average.average is None:
+            self.average.begin(module.net)
+        if self._restored is not None:
+            load_row(module, self._restored["row"])
+            self._saved, self._validation_is_due = module.step, self._restored["validate"]
+            longer = self._restored["steps"] < config.steps
+            begins = f"{context.name} continues from" if longer else f"resuming {context.name} at"
+            if rank() == 0:
+                console.print(f"    {begins} step {module.step} of {config.steps}")
+        context.begun()
+        sample_every = -(-config.sample_every // self.every) * self.every
+        self.samples = SampleProcess(context, sample_every)
+        self.telemetry = Telemetry(context.folder, module, config.batch_size, console, self.at_peak)
+        self.failures = FailureGuard(context.name, module)
+        self.metrics.open()
+        self.progress = StepProgress(context.name, module.step, config.steps, console)
+        self.agreement = Agreement(self.signals, world_size())
+        self.signals.ends_compiling = self._end_compiling
+        stalled = self.metrics.folder / f"stalled_rank_{rank()}.txt"
+        self.stall = StallTimer(stalled, context.hardware.stall_seconds, console)
+        self._open = ExitStack()
+        self._open.callback(self.progress.close)
+        self._open.enter_context(self.stall.running())
+        self.data.waiting = partial(self.telemetry.waits.waiting_for, "data")
+        # A signal cut the validation of this step short: its row comes before those of later steps.
+        if self._validation_is_due:
+            self._validate()
+            if not self._validation_is_due:
+                self._save(again=True)  # else a second kill would validate this step twice
+            self._answer(self.agreement.now())
+        self.telemetry.begin_step()
 
     def _log_row(self) -> None:
         """Log the means of the last ten steps over all ranks."""
@@ -226,11 +303,17 @@ class Training:
             dist.all_reduce(values)
             means = dict(zip(means, (values / world_size()).unbind(), strict=True))
         gauges = _numbers(self.module.gauges) | self.telemetry.end_row()
-        self.log.append(self.module.step, _numbers(means), gauges)
+        self._append(_numbers(means), gauges)
+
+    def _append(self, figures: dict[str, float], gauges: dict[str, float]) -> None:
+        self.metrics.append(self.module.step, figures, gauges)
+        if self.extra:  # they look for figures where a Trainer has them
+            self.module.log_dict(figures)
 
     def _validate(self) -> None:
         """Log the mean losses on all held-out batches, weighted by rows; a signal ends it after a batch."""
-        module, loader = self.module, self.data.held_out()
+        module, trainer, loader = self.module, self.trainer, self.data.val_dataloader()
+        assert not isinstance(loader, list)
         # Weights that are not finite would make the validation a figure that nobody can read.
         self.failures.check()
         # Frozen parts stay in evaluation: modes are restored part by part.
@@ -241,8 +324,9 @@ class Training:
         self.agreement.restart_pace()  # batches of a validation take another time than steps
         averaged = self.average.swapped(module.net) if self.average else nullcontext()
         with self.telemetry.waits.waiting_for("validation"), averaged, torch.no_grad():
-            for number, batch in enumerate(on_device(loader, self.fabric)):
-                with self.fabric.autocast():
+            for number, batch in enumerate(loader):
+                batch = trainer.strategy.batch_to_device(batch, module.device)
+                with trainer.precision_plugin.val_step_context():
                     values = module.validation_step(batch, number)
                 size = len(batch["length"])
                 rows += size
@@ -254,9 +338,11 @@ class Training:
         self.agreement.restart_pace()
         for part, mode in modes:
             part.training = mode
-        self.validation_is_due = cut
+        self._validation_is_due = cut
         if not cut:
-            self.log.append(module.step, _numbers({f"val/{k}": v / rows for k, v in sums.items()}), {})
+            self._append(_numbers({f"val/{k}": v / rows for k, v in sums.items()}), {})
+            for callback in self.extra:
+                callback.on_validation_end(trainer, module)
 
     def _answer(self, number: int) -> None:
         """Save this step and raise `Interrupted` if any rank has got a signal."""
@@ -287,10 +373,8 @@ class Training:
         self.shards.check(self.module.device)
         with self.telemetry.waits.waiting_for("checkpoints"):
             self._finish_writing()  # at most one copy of the state is in memory
-            state = self._state()
-            if rank() == 0:
-                self.writer.write(state, self.folder / name_of(step))
-                self._writing = True
+            self.trainer.save_checkpoint(self.folder / name_of(step), weights_only=False)
+            self._writing = rank() == 0
         self._saved = step
         self.stall.progress()
 
@@ -299,53 +383,8 @@ class Training:
         self.writer.finish()
         if self._writing:
             self._writing = False
-            self.log.saved(self._saved)
+            self.metrics.saved(self._saved)
             self.samples.saved(self._saved)
-
-    def _state(self) -> Checkpoint:
-        module = self.module
-        return {
-            "global_step": module.step,
-            "steps": self.config.steps,
-            "state_dict": weights_of(module),
-            "optimizer_states": [
-                optimizer_state(module, optimizer) for optimizer in self.execution.optimizers
-            ],
-            "average": None if self.average is None else self.average.state_dict(),
-            "log": self.log.state_dict(),
-            "row": rows_of_ranks(module),
-            "hyper_parameters": dict(module.hparams),
-            "validate": self.validation_is_due,
-            "pytorch-lightning_version": L.__version__,
-            "epoch": 0,
-        }
-
-    def _load(self, state: Checkpoint) -> None:
-        module, name = self.module, self.context.name
-        # Data and random draws need no state: both are functions of the seed and the step.
-        module.step = state["global_step"]
-        try:
-            load_weights(module, state["state_dict"])
-            for optimizer, one in zip(self.execution.optimizers, state["optimizer_states"], strict=True):
-                load_optimizer(module, optimizer, one)
-        except (RuntimeError, ValueError) as error:  # torch names every tensor that does not fit
-            raise UserError(
-                f"{self.folder / name_of(module.step)}: holds another network than {name} has now "
-                f"({str(error).splitlines()[-1].strip()[:200]}); give the settings that it began with, or "
-                f"begin anew with --from {name}"
-            ) from None
-        average = state["average"]
-        if self.config.ema and average is None:  # it begins now, with these weights
-            self.average = AveragedWeights(module.net, self.config.ema)
-        elif self.average is not None and average is not None:
-            self.average.load_state_dict(average)
-        self.log.load_state_dict(state["log"])
-        load_row(module, state["row"])
-        self.validation_is_due = state["validate"]
-        if rank() == 0:
-            longer = state["steps"] < self.config.steps
-            begins = f"{name} continues from" if longer else f"resuming {name} at"
-            self.context.console.print(f"    {begins} step {module.step} of {self.config.steps}")
 
 
 def _numbers(values: dict[str, Tensor] | dict[str, float | Tensor]) -> dict[str, float]:

@@ -1,21 +1,43 @@
-"""A few training steps of a module without a stage around them."""
+"""A training loop by hand: what any Trainer must come to."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Literal
 
+import torch
+from lightning.fabric import Fabric
+from torch import Tensor
+
 from motionloom.models.training.stage_module import Batch, StageModule
-from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import Execution, launch
 
 Precision = Literal["32-true", "bf16-mixed"]
 
 
-def take_steps(module: StageModule, batches: Sequence[Batch], precision: Precision = "32-true") -> None:
-    """One step for every `module.accumulate` batches."""
-    config = TrainConfig(accumulate=module.accumulate, precision=precision)
-    execution = Execution(launch(Hardware(accelerator="cpu"), config), module, config)
-    for first in range(0, len(batches), module.accumulate):
-        execution.take_step(batches[first : first + module.accumulate])
+def take_steps(
+    module: StageModule, batches: Sequence[Batch], precision: Precision = "32-true"
+) -> list[Tensor]:
+    """One step for every `module.accumulate` batches; the losses of all."""
+    module.fabric = Fabric(accelerator="cpu")  # with which modules of several optimizers go backwards
+    optimizer, losses = module.configure_optimizers()[0]["optimizer"], []
+    for number, batch in enumerate(batches):
+        part = number % module.accumulate
+        if part == 0 and module.automatic_optimization:
+            module.schedule.set_step(module.step)
+            optimizer.zero_grad()  # type: ignore[union-attr]
+
+        def gradients(batch: Batch = batch, part: int = part) -> Tensor:
+            half = precision == "bf16-mixed"
+            with torch.autocast("cpu", torch.bfloat16, enabled=half, cache_enabled=False):
+                loss = module.training_step(batch, part)
+            if module.automatic_optimization and loss is not None:
+                (loss / module.accumulate).backward()
+            return torch.zeros(()) if loss is None else loss.detach()
+
+        losses.append(module.without_failed_graph(gradients))
+        if part == module.accumulate - 1:
+            if module.automatic_optimization:
+                module.configure_gradient_clipping(optimizer)  # type: ignore[arg-type]
+                optimizer.step()  # type: ignore[union-attr,call-arg]
+            module.step += 1
+    return losses

@@ -25,31 +25,34 @@ def watch_steps() -> None:
     """Have every training step of this process and its forks leave a line in the folder of RECORDS."""
     from motionloom.models.training.distributed import rank
     from motionloom.models.training.stage_module import StageModule
-    from motionloom.pipeline.training.execution import Execution
+    from motionloom.pipeline.training.trainer import Training
 
-    average = StageModule.average
+    average, start, end = StageModule.average, Training.on_train_batch_start, Training.on_train_batch_end
     figures: dict[str, str] = {}
+    batches: list[Any] = []
 
     def averaged(self: Any, values: Any) -> None:
         figures.update({name: float(value.detach()).hex() for name, value in values.items()})
         average(self, values)
 
-    def wrapped(step: Any) -> Any:
-        def take_step(self: Any, parts: Any) -> Any:
-            figures.clear()
-            batches = list(parts)
-            taken, digest = self.module.step, _digest(batches[0] if len(batches) == 1 else batches)
-            out = step(self, batches)
-            time.sleep(float(os.environ.get(PAUSE, 0)))
-            start = int(os.environ.get("SLURM_RESTART_COUNT", 0))
-            row = {"step": taken, "start": start, "batch": digest}
-            _leave(rank(), row | {"figures": dict(figures)})
-            return out
+    def started(self: Any, trainer: Any, module: Any, batch: Any, number: int) -> None:
+        batches.append(batch)
+        start(self, trainer, module, batch, number)
 
-        return take_step
+    def ended(self: Any, trainer: Any, module: Any, *rest: Any) -> None:
+        if module.step > self._step:
+            time.sleep(float(os.environ.get(PAUSE, 0)))
+            digest = _digest(batches[0] if len(batches) == 1 else batches)
+            restarts = int(os.environ.get("SLURM_RESTART_COUNT", 0))
+            row = {"step": module.step - 1, "start": restarts, "batch": digest}
+            _leave(rank(), row | {"figures": dict(figures)})
+            figures.clear()
+            batches.clear()
+        end(self, trainer, module, *rest)
 
     StageModule.average = averaged  # type: ignore[method-assign]
-    Execution.take_step = wrapped(Execution.take_step)  # type: ignore[method-assign]
+    Training.on_train_batch_start = started  # type: ignore[method-assign]
+    Training.on_train_batch_end = ended  # type: ignore[method-assign]
 
 
 def _digest(batch: Any) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from lightning.fabric import Fabric
+from plain_training import take_steps
 from rank_cases import CASES, Undrawn, drawing_mdm, rows_of
 from torch import nn
 from ude_training import train
@@ -19,8 +19,6 @@ from ude_training import train
 from motionloom.models.layers.attention import SelfAttention
 from motionloom.models.training import compiled
 from motionloom.models.training.stage_module import StageModule
-from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.execution import Execution
 
 pytestmark = pytest.mark.slow
 
@@ -114,9 +112,8 @@ def test_a_graph_that_fails_in_its_third_backward_pass_is_left(monkeypatch: pyte
             calls = count(1)
             if graphs:
                 module.compile_losses(graphs=True)
-            execution = Execution(Fabric(accelerator="cpu"), module.double(), TrainConfig())
             with pytest.warns(UserWarning, match="nothing to replay") if graphs else nullcontext():
-                loss = [execution.take_step([batches(k)]) for k in range(5)]
+                loss = take_steps(module.double(), [batches(k) for k in range(5)])
             figures = [(one.step, one.values) for one in module.figures]
             made.append([loss, figures, list(module.state_dict().values())])
         assert len(made[1][1]) == 5

@@ -11,22 +11,38 @@ import lightning as L
 import pytest
 import torch
 from rank_shares import require_rows
+from safetensors.torch import load_file
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.loading.plan import ALONE
 from motionloom.models.tma.module import TmaModule
 from motionloom.models.training.stage_module import StageModule
-from motionloom.pipeline.runs.training import training
+from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.plan import make_plan
+from motionloom.pipeline.runs.recipe import load_recipe
+from motionloom.pipeline.runs.training import finish, training
+from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.training.lightning_data import StageData
 
 SMALL = ["tokenizer", "face_tokenizer", "tma", "gpt", "face_gpt", "face_vae", "face_diffusion"]
 
 
-def fitted(module: StageModule, data: StageData, steps: int, folder: Path) -> L.Trainer:
-    """A Trainer that has trained for some steps and validated at the end."""
+class StopAt(L.Callback):
+    """Ends a training at a step, behind a validation."""
+
+    def __init__(self, step: int) -> None:
+        self.step = step
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        trainer.should_stop = trainer.global_step == self.step
+
+
+def fitted(module: StageModule, data: StageData, steps: int, folder: Path, start: Any = None) -> L.Trainer:
+    """A Trainer that has trained for some steps of those that the recipe has, and validated."""
     trainer = L.Trainer(
-        max_steps=steps,
-        val_check_interval=steps,
+        max_steps=module.max_steps,
+        callbacks=[StopAt(steps)],
         accelerator="cpu",
         default_root_dir=folder,
         logger=False,
@@ -34,22 +50,27 @@ def fitted(module: StageModule, data: StageData, steps: int, folder: Path) -> L.
         enable_progress_bar=False,
         enable_model_summary=False,
     )
-    trainer.fit(module, data)
+    trainer.fit(module, data, ckpt_path=start)
     return trainer
 
 
 @pytest.mark.parametrize("stage", [*SMALL, "utt", "dmd"])
 def test_a_trainer_makes_the_weights_of_the_run(stage: str, request: Any, tmp_path: Path) -> None:
-    """Bit for bit those of the run's first checkpoint that is left; and both kinds of checkpoint load."""
+    """Bit for bit those of the run's first checkpoint that is left, and from there those of the run, with
+    their average where there is one; and both kinds of checkpoint load."""
     run = request.getfixturevalue("small_run" if stage in SMALL else "ude_run").folder
     first = min((run / "stages" / stage / "checkpoints").glob("*.ckpt"))
     wanted = torch.load(first, weights_only=True)
     module, data = training(run, stage)
     trainer = fitted(module, data, wanted["global_step"], tmp_path)
     assert trainer.callback_metrics["val/loss"].isfinite()
-    assert module.state_dict().keys() == wanted["state_dict"].keys()
+    averaged = {f"net{name[6:]}": value for name, value in (wanted["average"] or {}).items()}
     for name, value in module.state_dict().items():
-        assert torch.equal(value, wanted["state_dict"][name]), name
+        assert torch.equal(value, (wanted["state_dict"] | averaged)[name]), name
+    again, same = training(run, stage)
+    fitted(again, same, again.max_steps, tmp_path, first)
+    for name, value in load_file(run / "stages" / stage / "model.safetensors").items():
+        assert torch.equal(value, again.net.state_dict()[name]), name
     trainer.save_checkpoint(tmp_path / "trainer.ckpt")
     batches = data.batches.train(8, ALONE)
     batch = batches[0]
@@ -104,6 +125,7 @@ def test_a_recipe_makes_what_the_stage_needs(
         "data",
         "stats",
     ]
+    assert data.hardware.workers == 0, "a script without a guard would be run anew by each"
     assert module.max_steps == 2 and fitted(module, data, 2, tmp_path).global_step == 2
     assert module.schedule.get_last_lr() == [0.0], "the cosine has ended"
     with pytest.raises(UserError, match="has its stage 'data' already"):
@@ -113,3 +135,32 @@ def test_a_recipe_makes_what_the_stage_needs(
         training(tmp_path / "runs/small", "gpt")
     with pytest.raises(UserError, match=r"'stats'.*trains nothing"):
         training(small_run.folder, "stats")
+
+
+def test_what_a_trainer_trained_is_a_stage_of_the_run(small_run: Any, tmp_path: Path) -> None:
+    """Its bytes are those of the run's own; later stages, plans, motions and exports take it."""
+    run = tmp_path / "run"
+    shutil.copytree(small_run.folder, run, ignore=shutil.ignore_patterns("checkpoints"))
+    own = run / "stages/tokenizer"
+    wanted = load_file(own / "model.safetensors")
+    with pytest.raises(UserError, match="is finished"):
+        finish(training(run, "tokenizer")[0], run, "tokenizer")
+    shutil.rmtree(own)
+    module, data = training(run, "tokenizer")
+    for wrong, words in (
+        (training(run, "tokenizer", ["tokenizer.train.steps=3"])[0], r"another train\.steps"),
+        (training(run, "tma")[0], "of kind tma"),
+        (TmaModule(training(run, "tma")[0].net, module.optim_config, seed=0, max_steps=1), "no settings"),
+    ):
+        with pytest.raises(UserError, match=words):
+            finish(wrong, run, "tokenizer")
+    fitted(module, data, module.max_steps, tmp_path)
+    assert finish(module, run, "tokenizer") == own
+    found = load_file(own / "model.safetensors")
+    assert found.keys() == wanted.keys() and all(torch.equal(found[name], wanted[name]) for name in wanted)
+    artifact = Artifact.load_json(own / "artifact.json")
+    assert artifact.trained_by == f"lightning.Trainer, {module.max_steps} steps"
+    plan = make_plan(load_recipe(run / "recipe.yaml"), run)
+    assert {row.action for row in plan if row.stage.name in ("tokenizer", "tokens", "gpt")} == {"skip"}
+    assert run_recipe(run / "recipe.yaml", run, select=None) == run
+    assert MotionModel.from_pretrained(run).generate(["walks"], seed=0)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import traceback
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 import torch
-from lightning.fabric import Fabric
-from lightning.fabric.accelerators import CPUAccelerator
-from lightning.fabric.strategies.single_device import SingleDeviceStrategy
+from lightning.pytorch.accelerators import CPUAccelerator
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from rich.console import Console
 from second_device import SECOND, WAITS, Far, second_device
 from toy_training import ToyBatches, toy_recipe
@@ -21,7 +20,8 @@ from toy_training import ToyBatches, toy_recipe
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import ShardInfo
 from motionloom.datasets.shards.checksums import LocalShard
-from motionloom.models.training.stage_module import Batch, StepFigures
+from motionloom.models.training.finite import Failure, first_failure
+from motionloom.models.training.stage_module import StageModule, StepFigures
 from motionloom.pipeline.contract.stage import CompletedStage
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import JointError
@@ -30,16 +30,11 @@ from motionloom.pipeline.runs.continuation import newest_step
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.training_log import rise_of_loss
-from motionloom.pipeline.training import trainer
+from motionloom.pipeline.training import execution
 from motionloom.pipeline.training.config import TrainedStageConfig
-from motionloom.pipeline.training.execution import Execution, deterministic
-from motionloom.pipeline.training.failures import (
-    Failure,
-    NotFiniteError,
-    ShardWatch,
-    StallTimer,
-    first_failure,
-)
+from motionloom.pipeline.training.execution import deterministic
+from motionloom.pipeline.training.failures import NotFiniteError, ShardWatch, StallTimer
+from motionloom.pipeline.training.trainer import Training
 
 FAILS = 13
 """Number of the batch: of step 14, between the checkpoints of steps 10 and 15."""
@@ -219,22 +214,20 @@ class Watch:
             ours = [place for place in files if "/models/" in place[0] or "/pipeline/" in place[0]]
             self.found[self.module].add(f"{name} at {ours[-1]}")
 
-    def take_step(self, execution: Execution, parts: Iterable[Batch]) -> torch.Tensor:
-        """Watch one training step, once its batch is there."""
-        read = list(parts)
-        self.module = type(execution.module).__name__
-        try:
-            return taken(execution, read)
-        finally:
+    def follow(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Watch every training step from its batch to its end."""
+        start, end = Training.on_train_batch_start, Training.on_train_batch_end
+
+        def started(training: Training, trainer: Any, module: StageModule, *rest: Any) -> None:
+            start(training, trainer, module, *rest)
+            self.module = type(module).__name__
+
+        def ended(training: Training, *rest: Any) -> None:
             self.module = ""
+            end(training, *rest)
 
-
-taken = Execution.take_step
-
-
-def on_second(*_: object) -> Fabric:
-    """One process on `SECOND`."""
-    return Fabric(strategy=SingleDeviceStrategy(SECOND, Anywhere()), devices=1)
+        monkeypatch.setattr(Training, "on_train_batch_start", started)
+        monkeypatch.setattr(Training, "on_train_batch_end", ended)
 
 
 def few_steps(recipe: str) -> list[str]:
@@ -262,9 +255,9 @@ def test_every_stage_runs_on_a_second_device(
     watch = Watch()
     monkeypatch.chdir(tmp_path)
     Path("others.yaml").write_text(OTHERS)
-    monkeypatch.setattr(trainer, "launch", on_second)
+    monkeypatch.setattr(execution, "strategy_of", lambda *_: SingleDeviceStrategy(SECOND, Anywhere()))
     monkeypatch.setattr(Hardware, "device", lambda self: SECOND)
-    monkeypatch.setattr(Execution, "take_step", lambda self, parts: watch.take_step(self, parts))
+    watch.follow(monkeypatch)
     with second_device(watch):
         run_recipe(recipe, tmp_path / "run", overrides=few_steps(recipe), console=Console(quiet=True))
     assert watch.found == {}
