@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -30,6 +31,9 @@ LOST = 76
 
 _LOOK = 1.0
 """Seconds to wait for the exit code of a process: its connections close a moment before it has one."""
+
+_ANSWER = 5.0
+"""Seconds for which ranks are asked who is still there: a step of training may end before one hears it."""
 
 _PARENT = os.getppid()
 started: list[subprocess.Popen[bytes]] = []
@@ -62,8 +66,40 @@ def _who_ended() -> str:
             if code not in (None, 0, LOST):  # those have ended because of another
                 return f"process {number} of this machine (pid {process.pid}) {_how_ended(code or 0)}"
         time.sleep(0.02)
-    where = "process 0" if led else "the lines above or the launcher's log"
-    return f"another process of this run has stopped; {where} may say which and why"
+    where = "process 0" if led else "its own log"
+    return f"{_who_is_silent()}; {where} may say why"
+
+
+members: list[str] = []
+"""Where each rank of this process's team is: its machine and number there."""
+
+
+def _who_is_silent() -> str:
+    """Name the ranks that do not answer in the store by which the team has met.
+
+    Each that lost a connection answers for `_ANSWER` seconds; one that is dead or hangs does not.
+    """
+    missing = [*range(len(members))]
+    ask = threading.Thread(target=_call_roll, args=(missing,), daemon=True)
+    ask.start()
+    ask.join(2 * _ANSWER)  # a store whose process is stopped does not answer at all
+    silent = ", ".join(f"rank {rank} ({members[rank]})" for rank in missing)
+    return f"{silent or 'another process of this run'} has stopped or hangs"
+
+
+def _call_roll(missing: list[int]) -> None:
+    """Answer, and take those who answer off the list; rank 0 alone stays where its store has gone."""
+    import torch.distributed as dist
+
+    others = [rank for rank in missing if rank != dist.get_rank()]
+    missing[:] = [0] if members else []
+    store, end = dist.distributed_c10d._get_default_store(), time.monotonic() + _ANSWER
+    with suppress(RuntimeError):
+        store.set(f"lost/{dist.get_rank()}", "")
+        while others and time.monotonic() < end:
+            time.sleep(0.1)
+            others = [rank for rank in others if not store.check([f"lost/{rank}"])]
+        missing[:] = others
 
 
 def _how_ended(code: int) -> str:
@@ -130,6 +166,27 @@ def srun_tasks() -> int:
         return int(os.environ["SLURM_STEP_NUM_TASKS"])
     # No script has another number than 0.
     return int(os.environ.get("SLURM_NTASKS", 1)) if int(os.environ["SLURM_PROCID"]) else 1
+
+
+_NODE = ("NODE_RANK", "JOB_COMPLETION_INDEX", "SKYPILOT_NODE_RANK")
+"""Which machine this is: as anybody says it, a Kubernetes Indexed Job (a JobSet, too), SkyPilot."""
+
+
+def take_place(nodes: int) -> None:
+    """Take up which of `nodes` machines this is and where they meet, unless torchrun or srun has said so."""
+    env = os.environ
+    if nodes == 1 or "RANK" in env or srun_tasks() > 1:
+        return
+    for name in (name for name in _NODE if name in env):
+        env.setdefault("NODE_RANK", env[name])
+    for address in env.get("SKYPILOT_NODE_IPS", "").split()[:1]:
+        env.setdefault("MASTER_ADDR", address)
+    env.setdefault("MASTER_PORT", "29500")
+
+
+def beside() -> int:
+    """Processes that torchrun or srun started together, this one among them: all of them meet."""
+    return int(os.environ["WORLD_SIZE"]) if "RANK" in os.environ else srun_tasks()
 
 
 def local_rank() -> int:

@@ -7,19 +7,26 @@ Lightning's launcher (which repeats the command) or from torchrun or SLURM.
 
 from __future__ import annotations
 
+import hashlib
 import os
+import platform
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import cache
+from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, cast
 
+import torch
 import torch.distributed as dist
 
+from motionloom import datasets, models, pipeline
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import sha256_of_json
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.launch.process import TeamError, srun_tasks, started
+from motionloom.pipeline.launch.process import JointError, TeamError, members, srun_tasks, started
 
 if TYPE_CHECKING:
     from lightning.fabric.plugins.environments.cluster_environment import ClusterEnvironment
@@ -49,8 +56,9 @@ class Team:
     """A group of its own, because the training group's collectives must fail early and waiting must not."""
 
     @staticmethod
-    def start(hardware: Hardware) -> Team:
-        """Launch the other processes, or join them where a launcher has; returns when all are here."""
+    def start(hardware: Hardware, facts: Mapping[str, object] | None = None) -> Team:
+        """Launch the other processes, or join them where a launcher has; returns when all are here, and have
+        the same `facts`."""
         from lightning.fabric import Fabric
         from lightning.fabric.strategies.ddp import DDPStrategy
 
@@ -71,11 +79,31 @@ class Team:
         fabric.launch()
         started.extend(getattr(fabric.strategy.launcher, "procs", ()))
         give_time()
-        return Team(fabric.global_rank, fabric.world_size, _patient_group())
+        team = Team(fabric.global_rank, fabric.world_size, _patient_group())
+        team.agree({**_versions(), **(facts or {})})
+        members[:] = team.gather(f"process {os.getpid()} on {platform.node()}")
+        return team
 
     @property
     def leads(self) -> bool:
         return self.rank == 0
+
+    def agree(self, facts: Mapping[str, object]) -> None:
+        """Refuse ranks that would compute something else, by the first of the facts that differs.
+
+        Two seeds train a model that no recipe makes again, and two numbers of steps wait for ever.
+        """
+        digests = self.gather(sha256_of_json(facts))
+        odd = next((rank for rank, digest in enumerate(digests) if digest != digests[0]), None)
+        if odd is None:
+            return
+        all_facts = self.gather(facts)
+        lead, other = all_facts[0], all_facts[odd]
+        key = next(key for key in (*lead, *other) if lead.get(key, _NONE) != other.get(key, _NONE))
+        raise JointError(
+            f"rank {odd} differs from rank 0 in {key}: {other.get(key, _NONE)} there, "
+            f"{lead.get(key, _NONE)} here; start all ranks with the same command, files and versions"
+        )
 
     def meet(self) -> None:
         if self.waiting is None:
@@ -95,6 +123,19 @@ class Team:
         except RuntimeError:
             raise TeamError.lost() from None
         return values
+
+
+_NONE = "(nothing)"
+
+
+def _versions() -> dict[str, str]:
+    """Versions that all ranks must have alike; ours with a digest: a checkout changes under its version."""
+    code = hashlib.sha256()
+    folders = [Path(package.__path__[0]) for package in (datasets, models, pipeline)]
+    for path in sorted(path for folder in folders for path in folder.rglob("*.py")):
+        code.update(f"{path.name} {path.stat().st_size}\n".encode() + path.read_bytes())
+    ours = f"{metadata.version('motionloom')} (code {code.hexdigest()[:12]})"
+    return {"motionloom": ours, "torch": torch.__version__}
 
 
 def give_time() -> None:
@@ -155,12 +196,26 @@ def _require_match(hardware: Hardware) -> None:
             raise UserError(
                 f"the launcher started {launched} processes and the recipe asks for {world}: {fix}"
             )
+        restarts = env.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
+        if world > 1 and restarts and env.get("TORCHELASTIC_USE_AGENT_STORE") == "True":
+            raise UserError(
+                "torchrun would have restarted processes look for those that died: start it with "
+                "TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1 in its environment and --rdzv-backend=c10d, or with "
+                "--max-restarts=0"
+            )
         return
     # Without srun one process starts the others on its own machine, and knows none elsewhere.
     start = f"start it with srun --nodes {nodes} --ntasks-per-node {devices}"
     if tasks == 1:
-        if nodes > 1 and "SLURM_JOB_ID" in env and "NODE_RANK" not in env:
+        node = env.get("NODE_RANK", "0" if nodes == 1 else "")
+        if "SLURM_JOB_ID" in env and not node:
             raise UserError(f"hardware.nodes is {nodes} and this process is alone in its SLURM job: {start}")
+        if not node.isdecimal() or int(node) >= nodes or (nodes > 1 and "MASTER_ADDR" not in env):
+            raise UserError(
+                f"hardware.nodes is {nodes}, NODE_RANK {node or 'not set'} and MASTER_ADDR "
+                f"{env.get('MASTER_ADDR', 'not set')}: give each node its number from 0 and the address of "
+                f"node 0"
+            )
         return
     each, stated_nodes = env.get("SLURM_NTASKS_PER_NODE"), env.get("SLURM_NNODES", str(nodes))
     if tasks != world or (each or str(devices)) != str(devices) or stated_nodes != str(nodes):

@@ -21,6 +21,7 @@ from motionloom.pipeline.contract.stage import CompletedStage, Stage, StageCache
 from motionloom.pipeline.contract.units import WORK
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.launch.hardware import choose_device
+from motionloom.pipeline.launch.process import beside, process_rank, take_place
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.dry_run import explain_replacements, plan_table, replaced_stages, say_estimate
 from motionloom.pipeline.runs.execute import context_of, execute, perform
@@ -31,6 +32,7 @@ from motionloom.pipeline.store.artifact import require_consistent, require_uncha
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import hint_at, owner_of, require_own, require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, run_state
+from motionloom.pipeline.store.yaml import flatten
 
 
 def run_recipe(
@@ -57,6 +59,8 @@ def run_recipe(
     """
     console = console or make_console()
     loaded = load_recipe(recipe, overrides)
+    take_place(loaded.hardware.nodes)
+    console.quiet = console.quiet or process_rank() > 0
     run = Path(out or Path("runs") / loaded.name)
     if verify:
         count = sum(require_unchanged(stage_folder(run, stage.name), again=True) for stage in loaded.stages)
@@ -97,7 +101,7 @@ def run_recipe(
     else:
         message = f"{run}: all {len(plan)} stages are finished, nothing to do"
     say(console, message)
-    if todo:
+    if todo or beside() > 1:  # one that has another recipe may think that nothing is to do
         execute(loaded, run, plan, console)
     for row in plan:
         page = stage_folder(run, row.stage.name) / "report.html"
@@ -127,7 +131,9 @@ def _stages_again(
     require_run(folder)
     require_own(folder)
     recipe = load_recipe(folder / "recipe.yaml")
-    team = Team.start(recipe.hardware) if share and device == "auto" else Team()
+    take_place(recipe.hardware.nodes)
+    facts = {**flatten(recipe.tree(folder)), **changes, "the run folder": str(folder.absolute())}
+    team = Team.start(recipe.hardware, facts) if share and device == "auto" else Team()
     stage_cache = StageCache(recipe.hardware.device() if device == "auto" else choose_device(device))
     stages = [s for s in recipe.stages if what in s.kind.gives(s.config)]
     if not stages:

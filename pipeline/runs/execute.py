@@ -24,7 +24,7 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
 )
 from motionloom.pipeline.launch.console import say
-from motionloom.pipeline.launch.process import process_rank
+from motionloom.pipeline.launch.process import beside, process_rank
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.continuation import Started
 from motionloom.pipeline.runs.plan import REQUEST_FILE, PlannedStage, doubts, require_fit, terms_of
@@ -33,6 +33,7 @@ from motionloom.pipeline.runs.verify_shards import verify_shards
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 from motionloom.pipeline.store.files import remove_tree, write_json
 from motionloom.pipeline.store.run_folder import identity_of, place_from, require_own, stage_folder
+from motionloom.pipeline.store.yaml import flatten
 
 LOCKS = ".locks"
 """In the run folder: a lock file for each stage."""
@@ -48,6 +49,7 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
     if recipe.hardware.part is not None:
         return _execute_part(recipe, run, plan, todo, console)
     joint = [row for row in todo if row.stage.kind.trains or row.stage.kind.shares]
+    together = bool(joint) or beside() > 1
     require_fit((row.stage for row in todo), recipe.hardware)
     if joint:
         recipe.hardware.require_devices()
@@ -56,8 +58,8 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
         todo = joint  # all other stages run in the lead alone
     with _locks(run, recipe, todo) if leads else nullcontext():
         # All processes start before anything is written, so that they make the same plan.
-        team = Team.start(recipe.hardware) if joint else Team()
-        if leads:
+        team = Team.start(recipe.hardware, facts_of(recipe, run, plan)) if together else Team()
+        if leads and todo:
             said = doubts(recipe, run, (row.stage for row in todo))
             for doubt in said:
                 say(console, doubt, "yellow")
@@ -104,6 +106,16 @@ def finish_stage(
         save(folder)
         artifact = _artifact(recipe, run, row, plan)
         artifact.model_copy(update={"trained_by": trained_by}).finish(folder)
+
+
+def facts_of(recipe: Recipe, run: Path, plan: Sequence[PlannedStage]) -> dict[str, object]:
+    """What all ranks must have alike: the run folder, every setting, and which stages are to be made."""
+    facts = {"the run folder": str(run.absolute()), **flatten(recipe.tree(run))}
+    # Who sees a checkpoint a moment later than others plans to `run`, not to `resume`: the lead decides that.
+    for row in plan:
+        facts[f"{row.stage.name}, to be made"] = row.action in {"run", "resume"}
+        facts[f"{row.stage.name}, its inputs and code"] = row.fingerprint
+    return {key.removeprefix("stages."): value for key, value in facts.items()}
 
 
 def _execute_part(

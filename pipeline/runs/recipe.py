@@ -89,19 +89,22 @@ class Recipe:
 
         Stages outside are written as they are seen from the folder `run` where it is to lie, or absolutely.
         """
+        return dump_yaml(self.tree(run))
+
+    def tree(self, run: Path | None = None) -> Tree:
+        """The resolved recipe as plain data; `run` as in `to_yaml`."""
         stages: dict[str, Tree] = {}
         for stage in self.stages:
             entry: Tree = {"kind": stage.kind.name, **stage.config.dump()}
             renamed = self._written_inputs(stage, run)
             stages[stage.name] = {**entry, "inputs": renamed} if renamed else entry
-        data = {
+        return {
             "name": self.name,
             "description": self.description,
             "seed": self.seed,
             "hardware": self.hardware.dump(),
             "stages": stages,
         }
-        return dump_yaml(data)
 
     def _written_inputs(self, stage: Stage, run: Path | None) -> Tree:
         """The `inputs` of a stage that are not as the roles' names would have them."""
