@@ -7,9 +7,8 @@ import importlib.util
 import io
 import re
 import shlex
-import subprocess
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,11 +27,11 @@ from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.contract.stage import stage_kinds
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import shipped_models
+from motionloom.pipeline.runs.cluster.launch import launch_recipe
 from motionloom.pipeline.runs.dry_run import estimate
 from motionloom.pipeline.runs.plan import make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.resolve import shipped_recipes
-from motionloom.pipeline.runs.slurm import launch_recipe
 from motionloom.pipeline.store.yaml import read_yaml
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -233,73 +232,13 @@ def test_the_readme_says_what_the_models_of_the_package_know() -> None:
         assert known and known in text, f"{name} knows {known}"
 
 
-def test_volumes_are_mounted_and_gpus_are_asked_for_in_equal_numbers() -> None:
-    spec = yaml.safe_load((ROOT / "docs" / "trainjob.yaml").read_text())["spec"]
-    template = spec["runtimePatches"][0]["trainingRuntimeSpec"]["template"]["spec"]
-    pod = template["replicatedJobs"][0]["template"]["spec"]["template"]["spec"]
-    mounts = {mount["name"] for mount in pod["containers"][0]["volumeMounts"]}
-    assert mounts == {volume["name"] for volume in pod["volumes"]}
-    asked = spec["trainer"]["resourcesPerNode"]
-    gpus = {asked[kind]["nvidia.com/gpu"] for kind in ("requests", "limits")}
-    assert gpus == {str(spec["trainer"]["numProcPerNode"])}
-
-
-@pytest.mark.parametrize("name", ["trainjob", "skypilot"])
-def test_the_examples_of_engines_run_our_command_on_their_machines(name: str) -> None:
-    data = yaml.safe_load((ROOT / "docs" / f"{name}.yaml").read_text())
-    trainer = data["spec"]["trainer"] if name == "trainjob" else None
-    words = trainer["command"] if trainer else shlex.split(data["run"].replace("\\\n", ""))
-    given = parsed(words[words.index("motionloom") :])
-    hardware = load_recipe(given["recipe"], given["sets"]).hardware
-    assert (hardware.nodes, hardware.devices) == (trainer["numNodes"] if trainer else data["num_nodes"], 8)
-
-
-def documents(name: str) -> list[dict[str, Any]]:
-    return list(yaml.safe_load_all((ROOT / "docs" / f"{name}.yaml").read_text()))
-
-
-def jobs_of_kubernetes() -> Iterator[tuple[int, str]]:
-    for one in documents("convert-job"):
-        yield (
-            one["spec"].get("completions", 1),
-            one["spec"]["template"]["spec"]["containers"][0]["command"][-1],
-        )
-
-
-def tasks_of_skypilot() -> Iterator[tuple[int, str]]:
-    for one in documents("convert-sky")[1:]:
-        yield one.get("num_nodes", 1), one["run"]
-
-
-@pytest.mark.parametrize("engine", [jobs_of_kubernetes, tasks_of_skypilot])
-def test_engines_make_every_part_once_and_join_them(engine: Callable[[], Iterator[tuple[int, str]]]) -> None:
-    """As a shell reads them, with an `echo` for a program."""
-    (count, convert), (once, join) = engine()
-    parts = []
-    for number in range(count):
-        ranks = {"JOB_COMPLETION_INDEX": str(number), "SKYPILOT_NODE_RANK": str(number)}
-        words = said(convert, ranks | {"SKYPILOT_NUM_NODES": str(count)})
-        parts.append(str(parsed(words)["part"]))
-    assert parts == [f"{number}/{count}" for number in range(1, 9)] and once == 1
-    assert parsed(said(join, {}))["out"] == Path(words[5])
-
-
-def said(script: str, environment: dict[str, str]) -> list[str]:
-    echo = (
-        script.replace("exec ", "")
-        .replace("cd /motionloom", "true")
-        .replace("motionloom data", "echo motionloom data")
-    )
-    shown = subprocess.run(["sh", "-c", echo], env=environment, capture_output=True, text=True, check=True)
-    return shown.stdout.split()
-
-
 # Options, commands, settings, recipes and memory that a page, a message or a help text names are there.
 
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "models/pretrained").glob("*/*.md")]
 SOURCES = [path for room in ("datasets", "models", "pipeline") for path in (ROOT / room).rglob("*.py")]
 OF_SLURM = "cpus-per-task dependency gpus-per-node gpus-per-task jobs kill-on-bad-exit kill-on-invalid-dep"
-OF_OTHERS = f"{OF_SLURM} nodes noheader ntasks-per-node parsable requeue extra-index-url torch-backend help"
+OF_TORCHRUN = "max-restarts rdzv-backend"
+OF_OTHERS = f"{OF_SLURM} nodes noheader ntasks-per-node parsable requeue extra-index-url torch-backend help {OF_TORCHRUN} filename yes"
 ADVISED = {
     " ".join(words): {"--help", *(option for each in command.params for option in each.opts)}
     for words, command in options_by_command()
@@ -314,7 +253,7 @@ def configs(base: type[Config]) -> Iterator[type[Config]]:
 
 
 assert converters() and stage_kinds()
-for module in ("serve.requests", "contract.editing", "inference.shown", "runs.launch_plan"):
+for module in ("serve.requests", "contract.editing", "inference.shown", "runs.cluster.launch_plan"):
     import_module(f"motionloom.pipeline.{module}")
 SETTINGS = {"face", "seed_motion", "seed", "kind", "extends", "start"}.union(
     *(kind.model_fields for kind in configs(Config))

@@ -87,7 +87,7 @@ def join_parts(out: Path) -> Manifest:
             fingerprints = planned.fingerprints.items()
             results = list(threads.map(lambda shard: finished_shard(out / shard[0], shard[1]), fingerprints))
         count = max(part.count for part in records)
-        missing = sorted({at % count + 1 for at, result in enumerate(results) if result is None})
+        missing = _missing(results, count)
         if missing:
             parts = [f"{number}/{count}" for number in missing]
             raise UserError(
@@ -96,6 +96,19 @@ def join_parts(out: Path) -> Manifest:
             )
         remove_strays(out, planned)
         return finish(out, planned, [result for result in results if result is not None])
+
+
+def missing_parts(out: Path, count: int) -> list[int]:
+    """Numbers of the parts of `count` that are not finished in `out`, as an earlier run has planned them."""
+    record = next(iter(sorted((out / PARTS_FOLDER).glob("*-of-*.json"))), None)
+    if record is None:
+        return [] if (out / MANIFEST_FILE).exists() else [*range(1, count + 1)]
+    fingerprints = Planned.load_json(record).fingerprints.items()
+    return _missing([finished_shard(out / name, fingerprint) for name, fingerprint in fingerprints], count)
+
+
+def _missing(results: Sequence[Result | None], count: int) -> list[int]:
+    return sorted({at % count + 1 for at, result in enumerate(results) if result is None})
 
 
 def _require_one_plan(out: Path, records: Mapping[Part, Planned]) -> Planned:

@@ -18,6 +18,7 @@ from pydantic import Field, field_validator
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
+from motionloom.pipeline.launch.cluster import ClusterOptions
 from motionloom.pipeline.launch.process import local_rank
 
 _MOST_WORKERS = 4
@@ -59,6 +60,8 @@ class Hardware(Config):
     verify_shards: Literal["once", "always", "never"] = "once"
     """Whether shards in folders are compared with their sha256 before a stage reads them: files that have not
     been compared in this run as they are now, all each time a stage starts, or none."""
+    cluster: ClusterOptions = Field(ClusterOptions(), exclude=True)
+    """What `motionloom launch` asks the cluster for; no matter of a run."""
     loggers: tuple[LoggerName, ...] = ("csv",)
     """Where the figures of trainings go, besides `metrics.jsonl`; all but csv are extras of these names."""
 

@@ -20,34 +20,27 @@ def why_not() -> str:
 
 @contextmanager
 def two_nodes() -> Iterator[list[tuple[str, ...]]]:
-    """For each node the words that have a command run there; the first one's address is 10.77.0.1."""
-    name = f"ml{os.getpid()}"
+    """For each node the words that have a command run there; their addresses are 10.77.0.1 and 10.77.0.2."""
+    names = [f"ml{os.getpid()}-{number}" for number in (1, 2)]
+    places = [Path("/etc/netns", name) for name in names]
     try:
-        for number in (1, 2):
+        for number, (name, place) in enumerate(zip(names, places, strict=True), start=1):
             # Both have one name, which each resolves to the address at which the other one reaches it.
-            about = Path(f"/etc/netns/{name}-{number}")
-            about.mkdir(parents=True)
-            own = f"10.77.0.{number} {os.uname().nodename}"
-            (about / "hosts").write_text(f"127.0.0.1 localhost\n{own}\n10.77.0.{3 - number} other\n")
-            (about / "resolv.conf").write_text("options timeout:1 attempts:1\n")
-            _ip("netns", "add", f"{name}-{number}")
-        pair = [f"{name[:11]}v{number}" for number in (1, 2)]
-        _ip("link", "add", pair[0], "type", "veth", "peer", "name", pair[1])
-        for number, link in enumerate(pair, start=1):
-            _ip("link", "set", link, "netns", f"{name}-{number}")
-            inside = ("-n", f"{name}-{number}")
-            _ip(*inside, "address", "add", f"10.77.0.{number}/24", "dev", link)
-            for one in (link, "lo"):
-                _ip(*inside, "link", "set", one, "up")
-        yield [
-            ("ip", "netns", "exec", f"{name}-{number}", "env", f"GLOO_SOCKET_IFNAME={pair[number - 1]}")
-            for number in (1, 2)
-        ]
+            place.mkdir(parents=True)
+            (place / "hosts").write_text(f"127.0.0.1 localhost\n10.77.0.{number} {os.uname().nodename}\n")
+            (place / "resolv.conf").write_text("options timeout:1 attempts:1\n")
+            _ip(f"netns add {name}")
+        _ip(f"link add veth netns {names[0]} type veth peer name veth netns {names[1]}")
+        for number, name in enumerate(names, start=1):
+            _ip(f"-n {name} address add 10.77.0.{number}/24 dev veth")
+            _ip(f"-n {name} link set veth up")
+            _ip(f"-n {name} link set lo up")
+        yield [("ip", "netns", "exec", name, "env", "GLOO_SOCKET_IFNAME=veth") for name in names]
     finally:
-        for number in (1, 2):
-            subprocess.run(["ip", "netns", "del", f"{name}-{number}"], capture_output=True)
-            shutil.rmtree(f"/etc/netns/{name}-{number}", ignore_errors=True)
+        for name, place in zip(names, places, strict=True):
+            subprocess.run(["ip", "netns", "del", name], capture_output=True)
+            shutil.rmtree(place, ignore_errors=True)
 
 
-def _ip(*words: str) -> None:
-    subprocess.run(["ip", *words], check=True, capture_output=True)
+def _ip(words: str) -> None:
+    subprocess.run(["ip", *words.split()], check=True, capture_output=True)

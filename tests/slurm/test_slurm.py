@@ -15,10 +15,11 @@ from preempted import GROUPS, Launched, launch, preempt, write_recipe
 from rich.console import Console
 from slurm_cluster import Cluster, why_not
 
-from motionloom.pipeline.runs import slurm
-from motionloom.pipeline.runs.launch_plan import LaunchPlan, SlurmOptions, make_launch_plan
+from motionloom.pipeline.launch.cluster import ClusterOptions
+from motionloom.pipeline.runs.cluster import slurm
+from motionloom.pipeline.runs.cluster.launch_plan import LaunchPlan, make_launch_plan
+from motionloom.pipeline.runs.cluster.slurm import submit_run
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.slurm import submit_run
 
 pytestmark = [
     pytest.mark.slurm,
@@ -26,7 +27,7 @@ pytestmark = [
     pytest.mark.skipif(bool(why_not()), reason=why_not()),
 ]
 WORDS = ["cpus=1", "memory_gb=0.5"]
-OPTIONS = SlurmOptions.from_words([*WORDS, "extra.comment=two words"])
+OPTIONS = ClusterOptions().with_words([*WORDS, "extra.comment=two words"])
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +58,7 @@ def plan(nodes: int = 2) -> LaunchPlan:
 
 
 def submitted(made: LaunchPlan) -> list[str]:
-    return submit_run(made, OPTIONS, Console(file=io.StringIO()))
+    return submit_run([made], Path(made.out), OPTIONS, Console(file=io.StringIO()))
 
 
 def until(ready: Callable[[], object], seconds: float = 60) -> None:

@@ -82,7 +82,14 @@ def evaluations_of(run: Path, label: str, measures: Iterable[Measure]) -> list[E
 
 def fill(name: str, table: PaperTable, runs: Sequence[Path] = ()) -> FilledTable:
     """The table with the rows of `runs`, each under the paper's row that it is; without any, the paper's."""
-    return _Filling(table, list(dict.fromkeys(runs))).filled(name)
+    return _Filling(table, list(dict.fromkeys(rows_of(runs)))).filled(name)
+
+
+def rows_of(runs: Sequence[Path]) -> list[Path]:
+    """The run folders; those within, where one is of a sweep."""
+    return [
+        row for run in runs for row in sorted(place.parent for place in run.glob("*=*/recipe.yaml")) or [run]
+    ]
 
 
 def _labels(runs: Sequence[Path]) -> list[str]:

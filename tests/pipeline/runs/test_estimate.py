@@ -20,10 +20,10 @@ from motionloom.models.tokenizer.single import VqConfig
 from motionloom.models.training.stage_module import OptimConfig
 from motionloom.pipeline.contract.showing import ModelCard
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.cluster.launch import launch_recipe
 from motionloom.pipeline.runs.dry_run import Sizes, estimate, estimate_table, training_times
 from motionloom.pipeline.runs.plan import Selection, doubts, make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.slurm import launch_recipe
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.training.memory import _saved_bytes
 from motionloom.pipeline.training.trained_stage import TrainedStage

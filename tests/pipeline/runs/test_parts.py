@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from preempted import write_recipe
@@ -11,6 +14,7 @@ from rich.console import Console
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.lock import file_lock
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.cluster.launch import launch_recipe
 from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import load_recipe
 
@@ -33,8 +37,12 @@ def test_parts_beside_each_other_equal_one_process(tmp_path: Path) -> None:
     run.mkdir()
     (run / "stages/data/shards").mkdir(parents=True)
     (run / "stages/data/shards/old.tar").touch()  # of another plan: the first part clears it away, no other
-    for part in ("2/2", "1/2", "2/2"):
+    for part, left in (("2/2", ["1"]), ("1/2", []), ("2/2", [])):
         convert(recipe, run, part)
+        said = Console(file=io.StringIO(), width=200)
+        how: dict[str, Any] = {"out": run, "gpus_per_node": 0, "dry_run": True, "console": said}
+        launch_recipe(recipe, options=("parts=2",), **how)
+        assert re.findall("--array=(.*)", said.file.getvalue()) == left  # type: ignore[attr-defined]
         assert not (run / "stages/data/artifact.json").exists()
     with file_lock(run / ".locks/data", shared=True), pytest.raises(UserError, match="stage 'data'"):
         convert(recipe, run)

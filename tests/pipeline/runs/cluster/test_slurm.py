@@ -16,18 +16,19 @@ import pytest
 from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.pipeline.runs import slurm
-from motionloom.pipeline.runs.launch_plan import SlurmOptions, make_launch_plan
+from motionloom.pipeline.launch.cluster import ClusterOptions
+from motionloom.pipeline.runs.cluster import slurm
+from motionloom.pipeline.runs.cluster.launch import launch_recipe
+from motionloom.pipeline.runs.cluster.launch_plan import make_launch_plan
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.slurm import launch_recipe
 
 NASTY = """it's a "$(HOME)" `x`; touch y"""
 
 
 def scripts(folder: Path, recipe: str, *words: str, nodes: int = 1, gpus: int = 0) -> list[slurm.Script]:
-    options, out = SlurmOptions.from_words(words), folder / (NASTY if "paper" in recipe else "run")
+    options, out = ClusterOptions().with_words(words), folder / (NASTY if "paper" in recipe else "run")
     plan = make_launch_plan(load_recipe(recipe), options, out=out, nodes=nodes, gpus_per_node=gpus)
-    return slurm.slurm_scripts(plan, options, folder, folder)
+    return slurm.slurm_scripts([plan], options, folder, folder)
 
 
 def console() -> Console:
@@ -65,7 +66,7 @@ def test_scripts_ask_for_a_task_a_gpu(tmp_path: Path) -> None:
     assert words[-1] == "&" and after(words, "-o") == [str(tmp_path / NASTY)]
     assert {"--nodes=2", "--ntasks-per-node=8", "--gpus-per-node=8"} <= set(words)
     assert not any(line.startswith("srun") for line in first.text.splitlines())
-    assert train.submit({"1-data": "17"}) == [
+    assert train.submit({"1-data": ["17"]}) == [
         "sbatch",
         "--parsable",
         "--dependency=afterok:17",

@@ -1,7 +1,8 @@
 """A recipe cut into groups of stages for a cluster: one job per branch of its graph, with its own machines.
 
-SLURM schedules (`slurm.py`); this only describes. A group is one command, `motionloom run RECIPE -o OUT
---until LAST`, whose selection covers exactly the stages of the group and what the groups before have made.
+An engine schedules (`slurm.py`, `kubernetes.py`, `sky.py`); this only describes. A group is one command,
+`motionloom run RECIPE -o OUT --until LAST`, whose selection covers exactly the stages of the group and what
+the groups before have made.
 Groups that do not wait for each other run at the same time in one run folder (`execute.py`). The run graph
 decides what is done: a group that is started twice, after a kill or by mistake, skips what is finished and
 resumes what is not.
@@ -13,79 +14,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Self
 
-from pydantic import AfterValidator, Field, field_validator
-
-from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.stage import Stage
+from motionloom.pipeline.launch.cluster import ClusterOptions
 from motionloom.pipeline.runs.plan import require_fit
 from motionloom.pipeline.runs.recipe import Recipe
 from motionloom.pipeline.training.config import TrainedStageConfig
-
-
-def _one_line(text: str) -> str:
-    if not text or not text.isprintable():
-        raise ValueError("write one line of printable characters")
-    return text
-
-
-Line = Annotated[str, AfterValidator(_one_line)]
-"""Text of one line: a batch script must not get another."""
-
-
-WARN_SECONDS = 120
-"""Seconds before its time limit at which a job is queued again [ours]: a training saves a step in a few."""
-
-
-class SlurmOptions(Config):
-    """Options of SLURM jobs: `motionloom launch --cluster KEY=VALUE`."""
-
-    partition: Line | None = None
-    """Partition of the groups with GPUs, and of the others if `light_partition` is not given; default the
-    cluster's."""
-    light_partition: Line | None = None
-    """Partition of the groups without GPUs."""
-    time_minutes: int = Field(1440, ge=2 * WARN_SECONDS // 60)
-    """Time limit of each group."""
-    cpus: int = Field(8, ge=1)
-    """CPU cores for each process; a conversion uses all of its one."""
-    memory_gb: float = Field(64, gt=0)
-    """Memory for each process."""
-    parts: int = Field(1, ge=1)
-    """Jobs, of an array, that make a part of every conversion each."""
-    requeues: int = Field(100, ge=0)
-    """Times that one job may be queued again at its time limit; 0 lets it end there."""
-    clips_per_gpu: int = Field(32, ge=1)
-    """Clips of a batch that a GPU takes at least: a training gets as many as its batch has for. By the step
-    on an H100 (docs/results.md, "One GPU"): with 30 clips those of TMA and GPT end as soon as their 2,000
-    kernels are launched at 10 us each, so that more GPUs are no faster."""
-    extra: dict[str, Line] = Field(default_factory=dict)
-    """More options of sbatch: `extra.account=me`, `extra.constraint=h100`."""
-
-    @field_validator("extra")
-    @classmethod
-    def _are_options(cls, extra: dict[str, str]) -> dict[str, str]:
-        for name in extra:
-            if not re.fullmatch(r"[a-z][a-z0-9-]*", name):
-                raise ValueError(f"'{name}': an sbatch option is a word such as 'mail-type'")
-        return extra
-
-    @classmethod
-    def from_words(cls, words: Sequence[str]) -> Self:
-        """From `KEY=VALUE` words; `extra.KEY=VALUE` is an option of sbatch."""
-        fields: dict[str, object] = {}
-        extra: dict[str, str] = {}
-        for word in words:
-            key, equals, value = word.partition("=")
-            if not equals:
-                raise UserError(f"--cluster '{word}': write KEY=VALUE, for example partition=gpu")
-            if key.startswith("extra."):
-                extra[key.removeprefix("extra.")] = value
-            else:
-                fields[key] = value
-        return cls.parse({**fields, "extra": extra} if extra else fields, "--cluster")
 
 
 @dataclass(frozen=True)
@@ -114,6 +49,8 @@ class Group:
     """Settings of `hardware`, as `--set` takes them."""
     parts: int = 1
     """Jobs of the array that it is, each for one part of its conversions."""
+    left: tuple[int, ...] | None = None
+    """Numbers of the parts that are missing, where some are made."""
 
 
 @dataclass(frozen=True)
@@ -147,22 +84,21 @@ class LaunchPlan:
             *sets,
         ]
 
-    def lines(self, options: SlurmOptions) -> list[str]:
-        """A line for each group: its stages, its machines and their time limit."""
+    def lines(self, options: ClusterOptions) -> list[str]:
+        """A line for each group: its stages and its machines."""
         out = []
         for group in self.groups:
             at = group.machines
             each = f"{at.processes} processes, {at.gpus} GPUs, {options.cpus * at.processes} cores"
             stages = ", ".join(group.stages) + (f" in {group.parts} parts" if group.parts > 1 else "")
             after = f", after {', '.join(group.after)}" if group.after else ""
-            limit = f"at most {options.time_minutes} min"
-            out.append(f"{group.name}: {stages}; {at.nodes} x ({each}), {limit}{after}")
+            out.append(f"{group.name}: {stages}; {at.nodes} x ({each}){after}")
         return out
 
 
 def make_launch_plan(
     recipe: Recipe,
-    options: SlurmOptions,
+    options: ClusterOptions,
     *,
     out: Path,
     nodes: int,
@@ -218,7 +154,7 @@ def make_launch_plan(
     return LaunchPlan(name, recipe, str(out), tuple(groups), tuple(go_on))
 
 
-def _settings(job: _Job, machines: Machines, options: SlurmOptions) -> tuple[str, ...]:
+def _settings(job: _Job, machines: Machines, options: ClusterOptions) -> tuple[str, ...]:
     fields = [f"nodes={machines.nodes}", f"devices={machines.processes}"]
     if job.light:
         fields.append(f"convert_workers={options.cpus}")
@@ -240,7 +176,7 @@ class _Job:
     """Places, among the jobs, of all that it waits for."""
 
 
-def _jobs(recipe: Recipe, options: SlurmOptions, nodes: int, gpus: int) -> list[_Job]:
+def _jobs(recipe: Recipe, options: ClusterOptions, nodes: int, gpus: int) -> list[_Job]:
     """The stages as jobs, each behind those that it waits for.
 
     A stage goes on in a job that would not wait for more because of it and whose trainings are all above it,
@@ -291,7 +227,7 @@ def _jobs(recipe: Recipe, options: SlurmOptions, nodes: int, gpus: int) -> list[
     return sorted(jobs, key=lambda job: len(job.before))
 
 
-def _processes(stage: Stage, options: SlurmOptions, nodes: int, gpus: int) -> int:
+def _processes(stage: Stage, options: ClusterOptions, nodes: int, gpus: int) -> int:
     """How many a stage can use: whole nodes, or a part of one, among which its batch divides."""
     each = max(gpus, 1)
     if not stage.kind.trains:

@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.pipeline.runs.launch_plan import LaunchPlan, SlurmOptions, make_launch_plan
+from motionloom.pipeline.launch.cluster import ClusterOptions
+from motionloom.pipeline.runs.cluster.launch_plan import LaunchPlan, make_launch_plan
 from motionloom.pipeline.runs.plan import Selection, selected
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.resolve import shipped_recipes
@@ -18,7 +19,7 @@ from motionloom.pipeline.runs.resolve import shipped_recipes
 def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1, parts: int = 1) -> LaunchPlan:
     return make_launch_plan(
         load_recipe(name, overrides),
-        SlurmOptions(parts=parts),
+        ClusterOptions(parts=parts),
         out=Path("/runs/x"),
         nodes=nodes,
         gpus_per_node=gpus,
@@ -138,4 +139,4 @@ def test_what_cannot_run_is_refused_before_it_waits(call: dict[str, Any], messag
 )
 def test_wrong_options_are_explained(words: list[str], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        SlurmOptions.from_words(words)
+        ClusterOptions().with_words(words)
