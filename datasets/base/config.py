@@ -5,10 +5,12 @@ sentence that names the file, the key and the nearest valid name.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.json_doors import parse_json, read_plain
@@ -31,7 +33,7 @@ class Config(BaseModel):
         try:
             made = cls.model_validate(data)
         except ValidationError as error:
-            raise UserError(explain(error, cls, where)) from None
+            raise UserError(explain(error.errors(), cls, where)) from None
         require_local(made)
         return made
 
@@ -51,10 +53,14 @@ class Config(BaseModel):
         return self.model_dump(mode="json")
 
 
-def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
-    """One line per problem, with the nearest valid key for each unknown one."""
+_SHOWN = 10
+"""Problems of one record that are told; a file may have thousands."""
+
+
+def explain(problems: Sequence[ErrorDetails], model: type[BaseModel], where: str) -> str:
+    """One line per problem, with the nearest valid key for each unknown one; ten, and how many more."""
     lines = []
-    for item in error.errors():
+    for item in problems[:_SHOWN]:
         loc = [str(part) for part in item["loc"]]
         key = ".".join(loc) or "(top level)"
         if item["type"] == "extra_forbidden":
@@ -66,6 +72,8 @@ def explain(error: ValidationError, model: type[BaseModel], where: str) -> str:
             message = item["msg"].removeprefix("Value error, ")
             shown = f"key '{key}' = {item.get('input')!r:.60}: " if loc else ""
             lines.append(f"{where}: {shown}{message}")
+    if (more := len(problems) - _SHOWN) > 0:
+        lines.append(f"{where}: and {more:,} more")
     return "\n".join(lines)
 
 

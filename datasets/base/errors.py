@@ -8,16 +8,20 @@ from collections.abc import Sequence
 _LONGEST = 2000
 """Characters of a line of a `UserError`: names and numbers of strangers in it may have any length."""
 
+_MOST_LINES = 20
+
 
 class UserError(Exception):
     """A mistake the user can fix. The command line prints the sentence alone, never a traceback.
 
-    What a terminal or a log would obey is written out, and the middle of an endless line is left out.
+    What a terminal or a log would obey is written out, and the middle is left out of what has no end.
     """
 
     def __init__(self, words: str = "") -> None:
-        lines, half = [], _LONGEST // 2
-        for line in words.split("\n"):
+        lines, half, said = list[str](), _LONGEST // 2, words.split("\n")
+        if len(said) > _MOST_LINES:  # names of strangers may hold line breaks
+            said[_MOST_LINES - 1 : -1] = ["…"]
+        for line in said:
             if not line.isprintable():
                 line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)
             lines.append(line if len(line) <= _LONGEST else f"{line[:half]} … {line[-half:]}")

@@ -48,11 +48,13 @@ def parse_json(raw: str | bytes, where: str, **how: Any) -> Any:
     """Return JSON decoded, with `how` as for `json.loads`; `UserError` beginning with `where` otherwise.
 
     All JSON from outside comes through here: numbers are finite, whole ones of 64 bits, and no text holds
-    half of a letter, which nothing can be written with. `RecursionError` bounds the depth.
+    half of a letter, which nothing can be written with. `RecursionError` bounds the depth. Figures of ours
+    may be NaN: `parse_constant=float` lets them.
     """
+    rules: dict[str, Any] = {"parse_float": _finite, "parse_int": _of_64_bits, "parse_constant": _finite}
     try:
         text = raw.decode() if isinstance(raw, bytes) else raw
-        found = json.loads(text, parse_float=_finite, parse_int=_of_64_bits, parse_constant=_finite, **how)
+        found = json.loads(text, **rules | how)
         (json.dumps(found, ensure_ascii=False) if _HALF_LETTER.search(text) else text).encode()
     except UnicodeEncodeError:
         raise UserError(f"{where}: not valid JSON (half of a letter, a lone surrogate)") from None

@@ -77,8 +77,8 @@ ANIMATORS: dict[str, Animator] = {
 class SynthConfig(Config):
     """Settings of synthetic clips."""
 
-    clips: int = Field(512, ge=1)
-    seed: int = Field(0, ge=0)
+    clips: int = Field(512, ge=1, le=10**8)
+    seed: int = Field(0, ge=0, lt=2**63)
     layout: Literal["body133", "wholebody313", "wholebody363", "smpl75"] = "wholebody363"
     fps: float | None = Field(None, gt=4, le=240)
     """None = the layout's usual frame rate (30 for whole body, 20 for body only and SMPL)."""

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import torch
 from pydantic import BaseModel, model_validator
@@ -23,6 +23,7 @@ from rich.console import Console
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import MOST
 from motionloom.datasets.base.register import VARIABLE, Table, discover
 from motionloom.datasets.base.register import register as register
 from motionloom.pipeline.contract.captioning import MotionCaptioner
@@ -63,6 +64,20 @@ class NotThereError(UserError):
         self.field = field
 
 
+def require_counts(settings: object, name: str = "") -> None:
+    """`ValueError` naming a whole number beyond `MOST` among settings and groups of them: nobody has so many
+    of anything, and a plan would take them for true. A seed may have 63 bits.
+    """
+    if isinstance(settings, Mapping):
+        for key, value in settings.items():
+            require_counts(value, f"{name}.{key}".removeprefix("."))
+    elif isinstance(settings, list | tuple):
+        for value in settings:
+            require_counts(value, name)
+    elif isinstance(settings, int) and settings > (2**63 - 1 if name.endswith("seed") else MOST):
+        raise ValueError(f"{name} = {settings}: at most {MOST:,.0f} of anything; give a smaller number")
+
+
 class StageConfig(Config):
     """Base of every stage's config."""
 
@@ -77,6 +92,11 @@ class StageConfig(Config):
             if isinstance(info.default, BaseModel) and isinstance(out.get(name), dict):
                 out[name] = _filled(info.default, out[name])
         return out
+
+    @model_validator(mode="after")
+    def _counted(self) -> Self:
+        require_counts(self.model_dump())
+        return self
 
     def require_fit(self, hardware: Hardware) -> None:
         """Refuse, before anything runs, settings that cannot run on this hardware."""

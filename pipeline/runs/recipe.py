@@ -27,7 +27,7 @@ from pydantic import Field, field_validator
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.register import VARIABLE
-from motionloom.pipeline.contract.stage import CompletedStage, Every, Stage, stage_kinds
+from motionloom.pipeline.contract.stage import CompletedStage, Every, Stage, require_counts, stage_kinds
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.inputs import Sources, as_stages
 from motionloom.pipeline.runs.resolve import Tree, find_recipe, resolve
@@ -47,6 +47,12 @@ class RecipeFile(Config):
     defaults: dict[str, Tree] = Field(default_factory=dict)
     """Settings that stages of a kind, or all that train (`trained`), share."""
     stages: dict[str, Tree]
+
+    @field_validator("hardware")
+    @classmethod
+    def _counted(cls, hardware: Hardware) -> Hardware:
+        require_counts(hardware.model_dump(), "hardware")
+        return hardware
 
     @field_validator("stages")
     @classmethod

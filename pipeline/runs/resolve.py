@@ -307,11 +307,9 @@ def _require_default(key: str, fields: object, where: str) -> None:
     try:
         config.model_validate(fields)
     except ValidationError as error:
-        lines = explain(error, config, f"{where}: defaults.{key}").splitlines()
-        pairs = zip(error.errors(), lines, strict=False)
-        wrong = [line for item, line in pairs if item["type"] not in _COMPLETED_LATER]
+        wrong = [item for item in error.errors() if item["type"] not in _COMPLETED_LATER]
         if wrong:
-            raise UserError("\n".join(wrong)) from None
+            raise UserError(explain(wrong, config, f"{where}: defaults.{key}")) from None
 
 
 # `start:`.

@@ -36,14 +36,26 @@ _CORE = (
 """Tag, what is of that kind, and the characters it may begin with; `<<` is 1.1's, and handy in recipes."""
 
 
+_TAG = "tag:yaml.org,2002:"
+_PLAIN = ("null", "bool", "int", "float", "str", "seq", "map")
+"""Types that JSON has too; the standard's sets, dates, bytes and pairs are none."""
+
+
 class _Loader(yaml.SafeLoader):
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012 - PyYAML's own
+    yaml_constructors = {  # noqa: RUF012 - PyYAML's own
+        tag: make
+        for tag, make in yaml.SafeLoader.yaml_constructors.items()
+        if tag is None or tag.removeprefix(_TAG) in _PLAIN
+    }
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        """Refuse a key that is written twice, of which PyYAML would keep the last; `<<` may repeat keys."""
+        """Refuse a key that is written twice, of which PyYAML would keep the last; `<<` may repeat keys.
+        A key that is no text, such as a number, is the name of nothing.
+        """
         seen: dict[tuple[str, str], int] = {}
         for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode) or key.tag == "tag:yaml.org,2002:merge":
+            if not isinstance(key, yaml.ScalarNode) or key.tag == f"{_TAG}merge":
                 continue
             line, name = key.start_mark.line + 1, (key.tag, key.value)
             if name in seen:
@@ -51,7 +63,17 @@ class _Loader(yaml.SafeLoader):
                     None, None, f"key '{key.value}' is in line {seen[name]} already; keep one", key.start_mark
                 )
             seen[name] = line
-        return super().construct_mapping(node, deep)
+        made = super().construct_mapping(node, deep)  # which has put what `<<` brings into the node
+        for key, _ in node.value:
+            if key.tag != f"{_TAG}str":
+                what = key.value if isinstance(key, yaml.ScalarNode) else "a list or a mapping"
+                raise yaml.constructor.ConstructorError(
+                    None,
+                    None,
+                    f"key '{what}' is no text; write a name, or '{what}' in quotes",
+                    key.start_mark,
+                )
+        return made
 
 
 class _Dumper(yaml.SafeDumper):
@@ -60,20 +82,23 @@ class _Dumper(yaml.SafeDumper):
 
 def _text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
     """Text of several lines as a block, where YAML allows it."""
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|" if "\n" in text else None)
+    return dumper.represent_scalar(f"{_TAG}str", text, style="|" if "\n" in text else None)
 
 
 def _int(loader: yaml.SafeLoader, node: yaml.ScalarNode) -> int:
     text = str(loader.construct_scalar(node))
-    return int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+    value = int(text, 0) if text[:2] in ("0o", "0x") else int(text)
+    if not -(2**63) <= value < 2**63:
+        raise ValueError(f"{text:.20} is beyond 64 bits")
+    return value
 
 
 for _kind, _pattern, _first in _CORE:
     _whole = re.compile(rf"(?:{_pattern.pattern})\Z")
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", _whole, list(_first))
-    _Dumper.add_implicit_resolver(f"tag:yaml.org,2002:{_kind}", _whole, list(_first))
+    _Loader.add_implicit_resolver(f"{_TAG}{_kind}", _whole, list(_first))
+    _Dumper.add_implicit_resolver(f"{_TAG}{_kind}", _whole, list(_first))
 _Dumper.add_representer(str, _text)
-_Loader.add_constructor("tag:yaml.org,2002:int", _int)
+_Loader.add_constructor(f"{_TAG}int", _int)
 
 
 _MOST_BYTES, _MOST_VALUES = 100_000, 20_000

@@ -227,6 +227,10 @@ def test_damaged_files_of_every_kind(tmp_path: Path, tone: np.ndarray) -> None:
         path.write_bytes(path.read_bytes()[:-2000])
         with pytest.raises(UserError, match=f"{name}: "):
             read_sound(path)
+    path.write_bytes(path.read_bytes()[:90])  # a whole header, and no frame
+    for rate in (None, 16000):
+        with pytest.raises(UserError, match=r"a\.flac: cut short"):
+            read_sound(path, rate=rate)
     path.write_bytes(b"not sound at all")
     for read in (read_sound, sound_seconds):
         with pytest.raises(UserError, match=r"a\.flac: "):

@@ -34,7 +34,11 @@ def test_scalars_are_those_of_the_core_schema(text: str, want: Any) -> None:
     assert math.isnan(load_yaml(".NaN", "here"))
 
 
-@pytest.mark.parametrize("text", ["!made x", "a: [", "a: b: c"])
+ODD_KEYS = ["3: 4", "a: {true: 4}", "null: 4", "- {1.5: 2}", "? [a]\n: 4", "<<: {3: 4}", "? !!int 3\n: 4"]
+ODD_VALUES = [f"!!{tag}" for tag in ("timestamp 2026-01-01", "set {a}", "binary YQ==", "omap [a: 1]")]
+
+
+@pytest.mark.parametrize("text", ["!made x", "a: [", "a: b: c", str(2**63), *ODD_KEYS, *ODD_VALUES])
 def test_tags_and_broken_text_are_refused_by_name(text: str) -> None:
     with pytest.raises(UserError, match="recipe: "):
         load_yaml(text, "recipe")
@@ -52,7 +56,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 TEXT = st.text(
     st.characters(exclude_categories=["Cs", "Cc", "Zl", "Zp"], exclude_characters="\ufeff"), max_size=9
 )
-PLAIN = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | TEXT
+PLAIN = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | TEXT
 LIKE_OTHERS = st.sampled_from([text.strip("'") for text, _ in CORE] + ["<<", "=", "0b1", "12e03"])
 
 
