@@ -25,6 +25,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from motionloom.datasets.audio.decoder_notes import unheard
 from motionloom.datasets.base.errors import UserError
 
 MAX_SECONDS = 3600
@@ -284,7 +285,7 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
     import soundfile  # only data with sound pays for the import
 
     try:
-        with soundfile.SoundFile(path) as file:
+        with unheard(), soundfile.SoundFile(path) as file:
             if file.format != "MP3":
                 yield file
                 return

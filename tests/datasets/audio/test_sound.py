@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 import soundfile
 
 from motionloom.datasets.audio import sound
+from motionloom.datasets.audio.decoder_notes import unheard
 from motionloom.datasets.audio.sound import Sound, read_sound, resample_sound, sound_seconds
 from motionloom.datasets.base.errors import UserError
 
@@ -207,7 +209,9 @@ def test_a_whole_file_may_lack_its_last_block(
             read_sound(path)
 
 
-def test_damaged_files_of_every_kind(tmp_path: Path, tone: np.ndarray) -> None:
+def test_damaged_files_of_every_kind(
+    tmp_path: Path, tone: np.ndarray, capfd: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "a.mp3"
     raw = mp3(path, np.tile(tone, 5))
     half = len(raw) // 2
@@ -221,13 +225,16 @@ def test_damaged_files_of_every_kind(tmp_path: Path, tone: np.ndarray) -> None:
         path.write_bytes(damaged)
         with pytest.raises(UserError, match=rf"a\.mp3: {reason}"):
             read_sound(path)
+    with unheard():
+        os.write(2, b"Note: of libmpg123\nours\n")
+    assert capfd.readouterr().err == "ours\n", "decoders speak to nobody"
     for name in ("a.ogg", "a.flac"):
         path = tmp_path / name
         soundfile.write(path, np.tile(tone, 5), RATE)
         path.write_bytes(path.read_bytes()[:-2000])
         with pytest.raises(UserError, match=f"{name}: "):
             read_sound(path)
-    path.write_bytes(path.read_bytes()[:90])  # a whole header, and no frame
+    path.write_bytes(path.read_bytes()[:90] + bytes(9000))  # a whole header, and no frame
     for rate in (None, 16000):
         with pytest.raises(UserError, match=r"a\.flac: cut short"):
             read_sound(path, rate=rate)
