@@ -24,7 +24,7 @@ _aside: tuple[int, threading.Thread] | None = None
 
 @contextmanager
 def unheard() -> Iterator[None]:
-    """Keep libmpg123's lines from standard error; all other lines come, at the end of the block at the latest."""
+    """Keep libmpg123's lines from standard error, and no other ones."""
     global _open, _aside
     with _lock:
         if _open == 0:

@@ -234,10 +234,6 @@ def test_damaged_files_of_every_kind(
         path.write_bytes(path.read_bytes()[:-2000])
         with pytest.raises(UserError, match=f"{name}: "):
             read_sound(path)
-    path.write_bytes(path.read_bytes()[:90] + bytes(9000))  # a whole header, and no frame
-    for rate in (None, 16000):
-        with pytest.raises(UserError, match=r"a\.flac: cut short"):
-            read_sound(path, rate=rate)
     path.write_bytes(b"not sound at all")
     for read in (read_sound, sound_seconds):
         with pytest.raises(UserError, match=r"a\.flac: "):
