@@ -10,7 +10,6 @@ band's mean over the piece is subtracted. Spectra need no librosa, whose import 
 
 from __future__ import annotations
 
-import json
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from torch import Tensor, nn
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json
 
 BANDS = 64
 ROWS = 60
@@ -155,7 +155,7 @@ def read_beat_net(path: Path) -> BeatNet:
     """A network with the sizes that its file states, frozen; `UserError` for a file that is none."""
     try:
         with safe_open(path, "pt") as file:
-            about = json.loads((file.metadata() or {}).get("config", "null"))
+            about = parse_json((file.metadata() or {}).get("config", "null"), str(path))
             state = {name: file.get_tensor(name).float() for name in list(file.keys())}
         net = BeatNet(BeatNetConfig.parse(about, str(path)))
         net.load_state_dict(state)

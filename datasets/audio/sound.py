@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.audio.decoder_notes import unheard
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.places import is_file
 
 MAX_SECONDS = 3600
 """Longest sound that is read."""
@@ -74,7 +75,7 @@ class Excerpt:
     def named(cls, name: Path | str) -> Excerpt:
         """Parse a name; `UserError`, naming it, for times that are none."""
         whole, match = Path(name), _PART.fullmatch(str(name))
-        if match is None or whole.exists():
+        if match is None or is_file(whole):
             return cls(whole)
         file, start, dash, end = match.group("file", "start", "dash", "end")
         if not dash or not (start or end):
@@ -335,7 +336,7 @@ def _check_header(path: Path, name: str) -> None:
     """`UserError` for files that libsndfile reads without complaint: a WAV or MP3 that is cut short; and for
     missing and empty files. The content decides, not the suffix.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise UserError(f"{name}: no such file")
     size = path.stat().st_size
     if size == 0:

@@ -65,3 +65,11 @@ def hub_is_away() -> bool:
     except OSError:
         return True
     return False
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file of that name, which may be one that no file can have, of 5,000 letters."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.pipeline.store.files import write_json
 from motionloom.pipeline.store.yaml import flatten, setting_text
 
@@ -220,11 +221,11 @@ class FigureFile:
     def read(cls, path: Path) -> Self:
         """Read it again; a `UserError` names what is wrong with the file."""
         try:
-            data = json.loads(path.read_text(encoding="utf-8"))
+            data = parse_json(read_plain(path), str(path), parse_constant=float)
         except OSError as error:
             raise UserError(f"{path}: cannot be read ({error.strerror}); evaluate again") from None
-        except ValueError as error:
-            raise UserError(f"{path}: not valid JSON ({error}); evaluate again") from None
+        except UserError as error:
+            raise UserError(f"{error}; evaluate again") from None
         if not isinstance(data, dict):
             raise UserError(f"{path}: holds no JSON object; evaluate again")
         if data.get("version") != VERSION:

@@ -22,6 +22,7 @@ from pydantic import Field, model_validator
 from motionloom.datasets.audio.sound import Excerpt, Sound
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.places import is_file
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.yaml import read_yaml
@@ -111,7 +112,7 @@ def segment_frames(generator: MotionGenerator, segment: DrivenSegment, number: i
 
 def read_music(path: Path) -> Sound:
     """A sound file to drive by, or a part of one (`song.mp3@0:30-1:00`)."""
-    if not (file := Excerpt.named(path).path).is_file():
+    if not is_file(file := Excerpt.named(path).path):
         raise UserError(f"{file}: no such sound file")
     return Sound.read(path)
 

@@ -156,6 +156,8 @@ def read_file(path: Path) -> Tree:
     data = read_yaml(path)
     if not isinstance(data, dict):
         raise UserError(f"{path}: a recipe is a mapping with 'name' and 'stages'")
+    if not isinstance(data.get("defaults") or {}, dict):
+        raise UserError(f"{path}: defaults must map kinds of stages to settings")
     start = data.get(START)
     if isinstance(start, str) and (path.parent / Path(start).expanduser()).is_dir():
         data[START] = str(path.parent / Path(start).expanduser())

@@ -10,7 +10,6 @@ times and number on the disk).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -20,6 +19,7 @@ from pydantic import Field, JsonValue, field_validator
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.datasets.base.licences import UNKNOWN, strictest
 from motionloom.datasets.base.lock import LOCK_FILE, file_lock
 from motionloom.datasets.shards.checksums import state_of
@@ -201,8 +201,8 @@ def fingerprint_now(folder: Path) -> str | None:
     if not started.is_file():
         return None
     try:
-        return str(json.loads(started.read_text(encoding="utf-8"))["fingerprint"])
-    except (ValueError, KeyError, TypeError):
+        return str(parse_json(read_plain(started), str(started))["fingerprint"])
+    except (UserError, KeyError, TypeError):
         raise UserError(
             f"{started}: not readable; delete the folder {folder} and run the recipe again"
         ) from None

@@ -5,7 +5,6 @@ The flight logs hold times and are no output.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.pipeline.store.files import open_own
 
 FILE_NAME = "metrics.jsonl"
@@ -43,15 +43,13 @@ def read_training_log(folder: Path) -> list[dict[str, float]]:
         return []
     rows = []
     try:
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            row = json.loads(line)
+        for number, line in enumerate(read_plain(path).splitlines(), start=1):
+            row = parse_json(line, f"{path}: not a training log: line {number}", parse_constant=float)
             if not isinstance(row, dict) or not isinstance(row.get("step"), int | float):
                 raise UserError(f"{path}: line {number} is no row of a training log; delete the file")
             rows.append({k: float(v) for k, v in row.items() if isinstance(v, int | float)})
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror})") from None
-    except ValueError as error:  # not UTF-8, or not JSON
-        raise UserError(f"{path}: not a training log: {error}") from None
     return rows
 
 
@@ -72,10 +70,10 @@ def read_rows(path: Path) -> list[dict[str, float]]:
     if not path.is_file():
         return []
     rows = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_plain(path).splitlines():
         try:
-            row = json.loads(line)
-        except ValueError:
+            row = parse_json(line, str(path), parse_constant=float)
+        except UserError:
             continue
         if isinstance(row, dict) and isinstance(row.get("step"), int):
             rows.append({name: value for name, value in row.items() if isinstance(value, int | float)})

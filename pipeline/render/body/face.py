@@ -99,6 +99,8 @@ ARKIT: tuple[str, ...] = tuple(
 _RIDGE = 1e-6
 """Ridge, as a share of the mean squared shape: far below what any vertex shows."""
 _BASIS_BYTES = 2**29
+_FARTHEST = 1e6
+"""No vertex moves so far, in any unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +125,8 @@ class ArkitBases:
             raise UserError(
                 f"{path}: 'source' has {source.shape[1]} vertices, 'arkit' {arkit.shape[1]}: not the same"
             )
-        if not (np.isfinite(source).all() and np.isfinite(arkit).all()):
-            raise UserError(f"{path}: a basis holds NaN or infinite values")
+        if not all((np.abs(basis) <= _FARTHEST).all() for basis in (source, arkit)):  # false for NaN
+            raise UserError(f"{path}: a basis holds values that are not finite numbers up to {_FARTHEST:g}")
         return ArkitBases(source, arkit)
 
     def weights(self, values: NDArray[np.floating]) -> Floats:

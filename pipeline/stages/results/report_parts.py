@@ -6,11 +6,11 @@ A page made within a run names no times and no machine, since equal runs write e
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 
+from motionloom.datasets.base.json_doors import parse_json
 from motionloom.datasets.base.progress import duration
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -105,7 +105,7 @@ def _draw_samples(page: Page, stage: CompletedStage) -> None:
     step, motions = int(rows[-1]["step"]) if rows else 0, []
     for path in sorted(folder.glob(f"step={step:08d}/*.npz")):
         with NpzFile(path) as stored:
-            facts, joints = json.loads(str(stored.array("metadata"))), stored.numbers("joints")
+            facts, joints = parse_json(str(stored.array("metadata")), str(path)), stored.numbers("joints")
         parents = Skeleton.named(facts["skeleton"]).parents
         motions.append(ViewerMotion(joints, facts["fps"], parents, f"step {step:,}", facts["caption"]))
     if motions:
