@@ -2,8 +2,8 @@
 
 A page of another site in the same browser must not reach the model. Under its own name it is refused by
 `Origin` (`OwnPage`); under a name that it has made to point at this machine (DNS rebinding) by `Host`
-(Starlette's `TrustedHostMiddleware`). Limits on connections are uvicorn's (`server.py`); whoever lets
-others in puts a proxy in front, which also bounds slow headers and asks for a password.
+(Starlette's `TrustedHostMiddleware`). The limit of connections is uvicorn's (`server.py`), their end is here
+(`Connection`); whoever lets others in puts a proxy in front, which asks for a password.
 """
 
 from __future__ import annotations
@@ -12,12 +12,15 @@ import asyncio
 import ipaddress
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
+import h11
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.serve.requests import ServeConfig
@@ -58,6 +61,42 @@ def is_loopback(host: str) -> bool:
         return False
 
 
+class Connection(H11Protocol):
+    """uvicorn's protocol, which closes a connection whose headers are not here `patience` seconds after it was
+    made, or after the first byte of a further request; and one that goes on sending a body for so long after
+    the request was answered. uvicorn itself waits for them without end.
+    """
+
+    def __init__(self, *, patience: float, **how: Any) -> None:
+        super().__init__(**how)
+        self._patience = patience
+        self._end: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._watch()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        self._watch()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._unwatch()
+
+    def _watch(self) -> None:
+        answered = self.conn.our_state is h11.DONE and self.conn.their_state is h11.SEND_BODY
+        if self.conn.their_state is not h11.IDLE and not answered:
+            self._unwatch()
+        elif self._end is None:  # the time of what is awaited runs on, whatever comes of it
+            self._end = self.loop.call_later(self._patience, self.transport.close)
+
+    def _unwatch(self) -> None:
+        if self._end is not None:
+            self._end.cancel()
+            self._end = None
+
+
 class OwnPage:
     """Answer 403 to requests that a page of another site makes (ASGI middleware)."""
 
@@ -91,7 +130,9 @@ class Bodies:
     @asynccontextmanager
     async def read(self, request: Request, what: str, most: int) -> AsyncIterator[bytes]:
         """Give the body, at most `most` bytes; 413 as soon as it is larger, 408 after `patience` seconds, 503
-        where those of others, which wait or still come, take all memory that there is for bodies.
+        where those of others, which wait or still come, take all memory that there is for bodies. What still
+        comes of one that is refused is read and dropped (`Connection`): a client whose connection is closed
+        while it sends sees a reset in place of the sentence.
         """
         pieces, size = list[bytes](), 0
 
@@ -102,10 +143,10 @@ class Bodies:
                 size, self._held = size + len(piece), self._held + len(piece)
                 if size > most:
                     words = f"{what} is larger than this server takes: at most {most} bytes"
-                    raise HTTPException(413, words, {"connection": "close"})
+                    raise HTTPException(413, words)
                 if self._held > self.most:
                     words = "too much is being uploaded already; try again in a moment"
-                    raise HTTPException(503, words, {"connection": "close", "retry-after": "5"})
+                    raise HTTPException(503, words, {"retry-after": "5"})
 
         try:
             await asyncio.wait_for(read(), self.patience)

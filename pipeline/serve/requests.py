@@ -57,7 +57,7 @@ class ServeConfig(Config):
     max_request_kb: float = Field(16.0, gt=0)
     """Largest request besides a sound or a clip."""
     patience: float = Field(20.0, gt=0)
-    """Seconds in which the body of a request must have arrived."""
+    """Seconds in which the headers of a request must have arrived, and then its body."""
     connections: int = Field(256, ge=1)
     """Connections at a time; one more is answered 503."""
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import socket
 from contextlib import closing
+from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import uvicorn
 from rich.console import Console
@@ -14,7 +16,7 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.serve.app import Site
-from motionloom.pipeline.serve.guard import HEADERS, is_loopback
+from motionloom.pipeline.serve.guard import HEADERS, Connection, is_loopback
 from motionloom.pipeline.serve.requests import ServeConfig
 
 _GRACE = 5
@@ -67,7 +69,7 @@ def server_of(site: Site) -> uvicorn.Server:
     """Return the HTTP server of a site."""
     config = uvicorn.Config(
         site.app,
-        http="h11",
+        http=cast(Any, partial(Connection, patience=site.config.patience)),
         ws="none",
         lifespan="off",
         log_level="error",

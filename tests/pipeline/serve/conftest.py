@@ -132,6 +132,7 @@ class Served:
     port: int
     server: Any
     thread: threading.Thread
+    site: Site
 
     def ask(self, method: str, path: str, body: bytes = b"", headers: dict[str, str] | None = None) -> Reply:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=200)
@@ -160,7 +161,7 @@ def _run_server(model: Any, **settings: Any) -> Iterator[Served]:
     server = server_of(site)
     thread = threading.Thread(target=server.run, args=([place],), daemon=True)
     thread.start()
-    made = Served(place.getsockname()[1], server, thread)
+    made = Served(place.getsockname()[1], server, thread, site)
     made.wait_for(lambda: server.started)
     try:
         yield made

@@ -8,6 +8,7 @@ import json
 import signal
 import socket
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -142,6 +143,34 @@ def test_a_slow_request_is_let_go(run_server: Callable[..., Any], quick: Any) ->
             slow[0].recv(64)
         slow[0].settimeout(20)
         assert slow[0].recv(64).startswith(b"HTTP/1.1 408")
+
+
+def test_half_sent_headers_are_let_go(run_server: Callable[..., Any], quick: Any) -> None:
+    """Of new connections, silent ones, and of one that had an answer; the bytes that still come help none."""
+    with run_server(quick, patience=1.0, connections=3) as served, contextlib.ExitStack() as held:
+        slow = [held.enter_context(socket.create_connection(("127.0.0.1", served.port))) for _ in range(3)]
+        slow[2].sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert slow[2].recv(1 << 20).startswith(b"HTTP/1.1 200")
+        for raw in slow[1:]:
+            raw.sendall(b"GET / HTTP/1.1\r\nHo")
+        served.wait_for(lambda: len(served.server.server_state.connections) == 3)
+        assert served.ask("GET", "/api/info").status == 503
+        with contextlib.suppress(OSError):
+            while served.server.server_state.connections:
+                slow[1].sendall(b"s")
+                time.sleep(0.05)
+        served.wait_for(lambda: not served.server.server_state.connections)
+        assert served.ask("GET", "/api/info").status == 200
+
+
+def test_uploads_over_the_limit_get_their_sentence(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also who sends far more than any buffer holds, and looks at the answer only then."""
+    for path in ("/api/sounds", "/api/clips"):
+        got = served.ask("POST", path, bytes(40 << 20))
+        assert got.status == 413 and "larger than this server takes" in got.json["error"]
+    monkeypatch.setattr(served.site._bodies, "most", 1000)
+    got = served.ask("POST", "/api/sounds", bytes(1 << 20))
+    assert got.status == 503 and "too much is being uploaded" in got.json["error"]
 
 
 def test_connections_are_bounded(run_server: Callable[..., Any], quick: Any) -> None:
