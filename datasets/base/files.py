@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -45,9 +46,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
     never replaced: the content is written into it.
     """
     if _takes_bytes(path):
-        with tempfile.TemporaryDirectory() as folder:
-            yield Path(folder, path.name)
-            with Path(folder, path.name).open("rb") as file, path.open("wb") as into:
+        with temporary_folder() as folder:
+            yield folder / path.name
+            with (folder / path.name).open("rb") as file, path.open("wb") as into:
                 shutil.copyfileobj(file, into)
         return
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -92,8 +93,49 @@ def remove_temporaries(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+@contextmanager
+def temporary_folder(place: Path | None = None, name: str = "motionloom") -> Iterator[Path]:
+    """A folder in `place`, by default the system's for such things, which is gone when the block ends.
+
+    What killed processes have left of this name there is removed first: the kernel frees their lock on their
+    folder. Where the file system has no locks, it stays.
+    """
+    parent = Path(tempfile.gettempdir()) if place is None else place
+    for left in parent.iterdir():
+        if left.name.startswith(f".{name}.") and _TEMPORARY.fullmatch(left.name):
+            _remove_left(left)
+    folder = parent / f".{name}.{secrets.token_hex(8)}.tmp"
+    new = folder.with_suffix(".new")  # nobody takes it for a left one before it is locked
+    new.mkdir(0o700 if place is None else 0o777)
+    handle = os.open(new, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_EX)
+        new.rename(folder)
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(handle)
+
+
+def _remove_left(folder: Path) -> None:
+    """Remove a folder of ours whose lock nobody holds."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        try:
+            if os.fstat(handle).st_uid == os.geteuid():
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(folder)
+        finally:
+            os.close(handle)
+
+
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write bytes atomically."""
+    """Write bytes atomically; a file that holds them stays as it is, also where nothing can be written."""
+    if path.is_file() and not path.is_symlink() and path.stat().st_size == len(data) > 0:
+        with suppress(OSError):
+            if path.read_bytes() == data:
+                return
     with atomic_file(path) as file:
         file.write(data)
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from motionloom.datasets.base.errors import UserError
 
 LOCK_FILE = ".lock"
+_READ_ONLY = {errno.EROFS, errno.EACCES, errno.EPERM}
 _CANNOT_LOCK = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 
 
@@ -46,7 +47,8 @@ def folder_lock(out: Path, *, shared: bool = False) -> Iterator[None]:
 
     The lock file is removed at the end of a whole run, so a finished folder holds none. A file system without
     locks is written without, with a warning. Even then nothing is torn: every file is renamed into place
-    whole and every writer of one conversion writes the same bytes, so the loss is work done twice.
+    whole and every writer of one conversion writes the same bytes, so the loss is work done twice. A place
+    that may only be read needs no lock: a finished set is found finished, and a write says what is wrong.
     """
     path = out / LOCK_FILE
     handle: int | None = None
@@ -57,18 +59,19 @@ def folder_lock(out: Path, *, shared: bool = False) -> Iterator[None]:
             f"{out}: another conversion is writing here; wait for it or choose another folder"
         ) from None
     except OSError as error:
-        if error.errno not in _CANNOT_LOCK:
+        if error.errno not in _CANNOT_LOCK | _READ_ONLY:
             raise
-        warnings.warn(
-            f"{out}: this file system has no locks ({error.strerror}); "
-            f"do not start a second conversion into this folder",
-            stacklevel=3,
-        )
+        if error.errno in _CANNOT_LOCK:
+            warnings.warn(
+                f"{out}: this file system has no locks ({error.strerror}); "
+                f"do not start a second conversion into this folder",
+                stacklevel=3,
+            )
     try:
         yield
     finally:
         # Removed while it is still held: who opened it before sees another file at its name, and opens again.
-        if not shared:
+        if not shared and handle is not None:
             path.unlink(missing_ok=True)
         if handle is not None:
             os.close(handle)

@@ -111,6 +111,21 @@ MOST_STRETCH = 100
 """Frames that one frame becomes at most: 240 a second are made of 2.4 [ours]."""
 
 
+_MOST_TIMES, _ANYWAY = 3, 2400
+"""Frames that a file may become for each that it has, and others that it may: two minutes [ours]."""
+
+
+def require_rate(frames: int, fps: float, wanted: float) -> None:
+    """`UserError` where so many frames, at the rate that a file states, are too few for the wanted one: a few
+    bytes would become hours of motion that nobody has recorded.
+    """
+    if frames * wanted > fps * (_MOST_TIMES * frames + _ANYWAY):
+        raise UserError(
+            f"{frames:,} frames at {fps:.3g} a second, {frames / fps / 60:.0f} min, are too few for "
+            f"{wanted:g} a second; is the frame rate right?"
+        )
+
+
 def resample(values: NDArray[Float], fps_in: float, fps_out: float) -> NDArray[Float]:
     """Linear resampling in time of [T, ...] from one frame rate to another; frame 0 stays at time 0.
 

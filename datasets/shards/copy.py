@@ -6,12 +6,11 @@ compared there. The manifest goes last, and an older one is deleted first: no re
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import sha256_of
+from motionloom.datasets.base.files import sha256_of, temporary_folder
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.base.records import CLEANED_FILE, INDEX_FILE, MANIFEST_FILE, REMOVED_FILE, Manifest
 from motionloom.datasets.shards.index import index_path
@@ -43,10 +42,10 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
     beside = [name for name in _BESIDE if name != REMOVED_FILE or not there.place.startswith("hf:")]
     names = [*sums, *map(_index_name, sums), *beside, INDEX_FILE, MANIFEST_FILE]
     sent = kept = 0
-    with tempfile.TemporaryDirectory() as folder, Meter("copying", len(names), shown=progress) as meter:
+    with temporary_folder() as folder, Meter("copying", len(names), shown=progress) as meter:
         for name in names:
             try:
-                new = _send_file(here, there, name, sums.get(name), Path(folder))
+                new = _send_file(here, there, name, sums.get(name), folder)
             except MissingFileError:
                 if name in needed:
                     raise

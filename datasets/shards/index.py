@@ -19,6 +19,7 @@ Arrays, n clips of a split and M = `len(MEMBERS)`:
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import atomic_file
+from motionloom.datasets.base.files import write_bytes
 from motionloom.datasets.base.json_doors import open_plain
 from motionloom.datasets.base.records import INDEX_FILE, PRESENT_ALL, Dropped, ShardInfo, Split
 from motionloom.datasets.motion.npz import NpzFile, read_npy_header
@@ -176,8 +177,9 @@ class SplitIndex:
 def save_index(root: Path, splits: dict[Split, SplitIndex]) -> None:
     """Write `index.npz` atomically; zip entries carry a fixed date, so equal content is equal bytes."""
     arrays = {f"{split}.{name}": getattr(index, name) for split, index in splits.items() for name in _ARRAYS}
-    with atomic_file(root / INDEX_FILE) as file:
-        np.savez(file, allow_pickle=False, **arrays)
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, **arrays)
+    write_bytes(root / INDEX_FILE, content.getvalue())
 
 
 def load_index(root: Path, split: Split, shards: list[ShardInfo]) -> SplitIndex:

@@ -27,6 +27,8 @@ _FILE = re.compile(r"[^\s'\",;()]*(?:/|\.[A-Za-z]\w{1,4}\b)[^\s'\",;:()]*")
 def drop(label: str, error: Exception) -> Dropped:
     """The manifest's record of a clip or file that failed."""
     text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+    if isinstance(error, OSError) and error.strerror:  # whose own words name a path of this machine
+        text = f"cannot be read ({error.strerror.lower()})"
     return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
 
 
@@ -91,8 +93,8 @@ def tally(dropped: Iterable[Dropped]) -> str:
 def write_left_out(out: Path, dropped: Sequence[Dropped]) -> None:
     """List everything that was left out in `LEFT_OUT_FILE`, in the manifest's order; no file for nothing."""
     path = out / LEFT_OUT_FILE
-    if not dropped:
-        path.unlink(missing_ok=True)
-        return
     lines = [f"{drop.kind}\t{printable(drop.source)}\t{printable(drop.reason)}\n" for drop in dropped]
-    write_text(path, "".join(lines))
+    if lines:
+        write_text(path, "".join(lines))
+    elif path.is_file():
+        path.unlink()

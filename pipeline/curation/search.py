@@ -22,7 +22,7 @@ from motionloom.datasets.base.json_doors import read_plain
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.base.records import HANDS, PRESENT_ALL
 from motionloom.datasets.check.faults import Fault
-from motionloom.datasets.motion.canonical import canonicalize, resample
+from motionloom.datasets.motion.canonical import canonicalize, require_rate, resample
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import BODY_JOINTS
@@ -193,6 +193,7 @@ class Search:
 def features_for(tma: LoadedTma, joints: NDArray[np.floating], fps: float) -> tuple[Vectors, int]:
     """Return what a TMA reads of joints [T, 22 or 52, 3] of any frame rate, and the parts present in it."""
     layout, present = tma.layout, PRESENT_ALL
+    require_rate(len(joints), fps, layout.fps)
     if layout.num_joints > joints.shape[1]:
         present &= ~HANDS  # fingers stay at the wrists, and are not looked at
         fingers = (layout.num_joints - BODY_JOINTS) // 2

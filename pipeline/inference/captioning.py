@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import temporary_folder
 from motionloom.datasets.base.records import HANDS, PRESENT_ALL, Dropped
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.registry import prepare
@@ -127,9 +127,9 @@ def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped
     read, left_out = set[str](), list[Dropped]()
     for fingers in ways:
         config = BvhConfig.parse({**given, "min_seconds": 0, "fingers": fingers}, str(source))
-        with TemporaryDirectory() as maps:
+        with temporary_folder() as maps:
             try:
-                conversion = prepare(config, out=Path(maps))
+                conversion = prepare(config, out=maps)
             except UserError:
                 if fingers == ways[-1] and not read:
                     raise

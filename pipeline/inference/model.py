@@ -38,15 +38,8 @@ from motionloom.pipeline.inference.edits.clip_file import (
     read_seed_motion,
     require_clip,
 )
-from motionloom.pipeline.inference.edits.edit import (
-    finish,
-    own_bvh,
-    own_figure,
-    report_of,
-    require_editor,
-    require_work,
-)
-from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames
+from motionloom.pipeline.inference.edits.edit import finish, own_bvh, own_figure, report_of, require_editor
+from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames, require_work
 from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
 from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
@@ -228,12 +221,12 @@ def edit_clip(
     require_seed(seed)
     require_samples(samples)
     layout, sampling = bundle.layout, bundle.drawing(sampling)
+    require_work(task, clip, layout)
     if task.changes_clip:
         before = edit_frames(EditTask(), clip, layout)
         frames = edit_frames(task, changed(clip, task), layout)
     else:
         before = frames = edit_frames(task, clip, layout)
-        require_work(frames)
     editor, generator = require_editor(bundle.generator), bundle.generator
     prompt, original = Prompt(task.caption), original_of(before, clip)
     words = bundle.encode(bundle.main, [prompt], [prompt.text]) if prompt.text.strip() else {}

@@ -12,13 +12,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, TypeVar
 
 from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.files import temporary_folder, write_text
 from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import (
     CAPTIONER,
@@ -71,8 +70,8 @@ def run_at(run: P, at: str | None, what: str = GENERATOR) -> Iterator[P]:
     if not chosen:
         yield run  # all trainings that have begun are finished
         return
-    with TemporaryDirectory(prefix="motionloom-") as temporary:
-        made = _write(Path(temporary), folder, recipe, finished, chosen, exact=not at.endswith(NEWEST))
+    with temporary_folder() as temporary:
+        made = _write(temporary, folder, recipe, finished, chosen, exact=not at.endswith(NEWEST))
         try:
             yield type(run)(made)
         except UserError as error:

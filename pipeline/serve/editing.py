@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import tempfile
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
@@ -13,6 +11,7 @@ from pydantic import AfterValidator, Field
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import temporary_folder
 from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.inference.edits.clip_file import read_clip
 from motionloom.pipeline.inference.edits.edit import require_editor
@@ -76,8 +75,8 @@ class Clips:
         kind = next((ending for first, ending in _KINDS.items() if data.startswith(first)), ".bvh")
         if kind == ".bvh" and b"HIERARCHY" not in data[:_HEAD].replace(b"\0", b"").upper():
             raise UserError(f"{CLIP}: no motion; send a BVH, or a GLB or npz that was made here")
-        with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
-            path = Path(folder) / f"clip{kind}"
+        with temporary_folder() as folder:
+            path = folder / f"clip{kind}"
             path.write_bytes(data)
             try:
                 clip = read_clip(path)

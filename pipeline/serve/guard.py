@@ -62,9 +62,9 @@ def is_loopback(host: str) -> bool:
 
 
 class Connection(H11Protocol):
-    """uvicorn's protocol, which closes a connection whose headers are not here `patience` seconds after it was
-    made, or after the first byte of a further request; and one that goes on sending a body for so long after
-    the request was answered. uvicorn itself waits for them without end.
+    """uvicorn's protocol, which closes a connection whose headers are not here `patience` seconds after it
+    was made, or after the first byte of a further request; and one that goes on sending a body for so long
+    after the request was answered. uvicorn itself waits for them without end.
     """
 
     def __init__(self, *, patience: float, **how: Any) -> None:

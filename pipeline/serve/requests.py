@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import tempfile
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Generic, TypeVar
 
 import numpy as np
@@ -19,6 +17,7 @@ from pydantic import AfterValidator, Field
 from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import temporary_folder
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
@@ -177,8 +176,8 @@ def answer(
     """
     if form in WRITERS:
         writer = WRITERS[form]
-        with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
-            path = Path(folder) / f"motion{writer.suffix}"
+        with temporary_folder() as folder:
+            path = folder / f"motion{writer.suffix}"
             save(path, motion, note)
             name = f"{file_stem(motion.seed or 0, motion.caption)}{writer.suffix}"
             return Answer(path.read_bytes(), writer.mime, name)
@@ -260,8 +259,8 @@ class Sounds:
 
     def _decode(self, data: bytes) -> Sound:
         longest = self._config.max_sound_seconds
-        with tempfile.TemporaryDirectory(prefix="motionloom-") as folder:
-            path = Path(folder) / f"sound{_KINDS.get(data[:4], '.mp3')}"
+        with temporary_folder() as folder:
+            path = folder / f"sound{_KINDS.get(data[:4], '.mp3')}"
             path.write_bytes(data)
             seconds = sound_seconds(path, _SOUND)
             if seconds > longest:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from typing import IO, Any
 from motionloom.datasets.base import files
 from motionloom.datasets.base.config import require_local
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import temporary_folder
 from motionloom.datasets.base.json_doors import read_plain
 
 
@@ -94,22 +94,19 @@ def new_files(folder: Path) -> Iterator[Path]:
 @contextmanager
 def _aside(folder: Path, place: Path) -> Iterator[Path]:
     """A temporary folder in `place`; errors about what is in it name `folder`."""
-    temporary = place / f".{folder.name}.{secrets.token_hex(8)}.tmp"
-    try:
-        temporary.mkdir()
-        yield temporary
-    except OSError as error:
-        for side in ("filename", "filename2"):
-            name = getattr(error, side)
-            if name is not None and str(name).startswith(str(temporary)):
-                setattr(error, side, str(name).replace(str(temporary), str(folder), 1))
-        raise
-    except UserError as error:
-        if str(temporary) not in str(error):
+    with temporary_folder(place, folder.name) as temporary:
+        try:
+            yield temporary
+        except OSError as error:
+            for side in ("filename", "filename2"):
+                name = getattr(error, side)
+                if name is not None and str(name).startswith(str(temporary)):
+                    setattr(error, side, str(name).replace(str(temporary), str(folder), 1))
             raise
-        raise UserError(str(error).replace(str(temporary), str(folder))) from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        except UserError as error:
+            if str(temporary) not in str(error):
+                raise
+            raise UserError(str(error).replace(str(temporary), str(folder))) from None
 
 
 def open_own(path: Path, mode: str) -> IO[Any]:

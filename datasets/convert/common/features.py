@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
-from motionloom.datasets.motion.canonical import canonicalize, resample, resample_quaternions, retarget
+from motionloom.datasets.motion.canonical import (
+    canonicalize,
+    require_rate,
+    resample,
+    resample_quaternions,
+    retarget,
+)
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS, smpl75_of
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
@@ -42,6 +48,7 @@ def features_of(
     +Z), encoded. `face` [T, 50] is resampled alike. `same_bones` gives every clip the bone lengths of the
     layout's skeleton. Refuses figures that cannot be a person in metres.
     """
+    require_rate(len(joints), fps, layout.fps)
     require_human(joints, fps)
     joints = resample(joints, fps, layout.fps)
     if same_bones:
@@ -85,6 +92,7 @@ def canonical_smpl75(
     import roma
     import torch
 
+    require_rate(len(poses), fps_in, fps_out)
     turns = roma.rotvec_to_unitquat(torch.from_numpy(np.asarray(poses, dtype=np.float64))).numpy()
     turns = torch.from_numpy(resample_quaternions(turns, fps_in, fps_out))
     trans = resample(np.asarray(trans, dtype=np.float64), fps_in, fps_out)

@@ -21,7 +21,7 @@ from motionloom.datasets.motion.easing import eased
 from motionloom.datasets.motion.features.codec import encode, place
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
-from motionloom.datasets.motion.layout import PIECES, piece_columns, piece_joints
+from motionloom.datasets.motion.layout import PIECES, piece_joints
 from motionloom.models.metrics.dance import ANKLES_TOES
 from motionloom.pipeline.contract.editing import EditReport
 from motionloom.pipeline.contract.generation import Motion, MotionGenerator
@@ -46,21 +46,6 @@ def require_editor(generator: MotionGenerator) -> Callable[..., list[Motion]]:
             f"as the package's `inbetween`"
         )
     return generator.capabilities.edit
-
-
-def require_work(frames: EditFrames) -> None:
-    """Refuse a task that leaves nothing to make, and one that takes nothing from the clip."""
-    present = np.isin(np.arange(len(PIECES)), piece_columns(frames.layout))
-    if frames.pieces[:, present].all():
-        raise UserError(
-            "everything of the clip is kept, so there is nothing to make: keep less of it, or give seconds "
-            "or lead for more"
-        )
-    if not (frames.pieces.any() or frames.pins or np.isfinite(frames.path).any()):
-        raise UserError(
-            "nothing of the clip is kept and nothing else is asked: say what to keep, draw a path, or pin a "
-            "joint"
-        )
 
 
 def finish(

@@ -13,10 +13,19 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.body.rigid import RigidMotion, at_rate, fit_rigid, moved
 from motionloom.datasets.motion.bvh.own_file import between_rows
-from motionloom.datasets.motion.canonical import canonicalize, facing, ground, resample, retarget, runs
+from motionloom.datasets.motion.canonical import (
+    canonicalize,
+    facing,
+    ground,
+    require_rate,
+    resample,
+    retarget,
+    runs,
+)
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.layout import (
@@ -24,6 +33,7 @@ from motionloom.datasets.motion.layout import (
     LOWER,
     PIECES,
     MotionLayout,
+    piece_columns,
     piece_joints,
     pieces_of,
     step_columns,
@@ -142,6 +152,7 @@ class EditFrames:
 
 def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> EditFrames:
     """The task in frames of a layout. `UserError` where it cannot be done with the clip."""
+    require_rate(len(clip.joints), clip.fps, layout.fps)
     remarks = []
     if abs(clip.fps - layout.fps) > 1e-6:
         remarks.append(f"read at {clip.fps:g} frames/s, edited at the model's {layout.fps:g}")
@@ -189,9 +200,7 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     heading, x, z = (one.numpy() for one in torch_way(torch.from_numpy(features).double(), layout))
     clip_root = RootPath(heading, (z + 1j * x) / scale)
     timed = _TimedTask(task, layout, lead, total)
-    # What the clip does not have cannot be kept: fingers and face are made where it has none.
-    has = np.array([True] * 4 + [clip.has_hands or not hands] * 2 + [face is not None])
-    pieces = timed.pieces(len(features)) & has
+    pieces = timed.pieces(len(features)) & _present(clip, layout)
     path = timed.path(origin, turn)
     timed.require_free(path, pieces[:, LOWER], clip_root)
     pins = timed.pins(pieces, origin, turn, height)
@@ -222,6 +231,45 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         bare_wrists=() if clip.has_hands or not hands else tuple(map(layout.skeleton.index, _WRISTS)),
         remarks=tuple(remarks),
     )
+
+
+def _present(clip: RecordedClip, layout: MotionLayout) -> NDArray[np.bool_]:
+    """Pieces [P] that can be kept: fingers and face are made where the clip has none."""
+    hands = clip.has_hands or layout.num_joints == BODY_JOINTS
+    return np.array([True] * 4 + [hands] * 2 + [clip.face is not None])
+
+
+MOST_FRAMES = 12_000
+"""Of a clip that is edited, at the model's frame rate: ten minutes at 20 a second, in 270 MB."""
+
+
+def require_work(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> None:
+    """Refuse a task that leaves nothing to make, one that takes nothing from the clip, and a clip that is too
+    long: by lengths alone, before any frame is made.
+    """
+    require_rate(len(clip.joints), clip.fps, layout.fps)
+    lead, frames = round(task.lead * layout.fps), frames_after(len(clip.joints), clip.fps, layout)
+    total = lead + (frames if task.seconds is None else max(2, round(task.seconds * layout.fps)))
+    longest = max(total, frames, frames * task.repeat / task.speed)
+    if longest > MOST_FRAMES:
+        minutes = [count / layout.fps / 60 for count in (longest, MOST_FRAMES)]
+        raise UserError(
+            f"{clip.name}: {minutes[0]:.1f} min of motion, and at most {minutes[1]:g} min are edited at a "
+            f"time; cut the clip, or ask for less"
+        )
+    if task.changes_clip:
+        return
+    kept = _TimedTask(task, layout, lead, total).pieces(frames) & _present(clip, layout)
+    if kept[:, np.isin(np.arange(len(PIECES)), piece_columns(layout))].all():
+        raise UserError(
+            "everything of the clip is kept, so there is nothing to make: keep less of it, or give seconds "
+            "or lead for more"
+        )
+    if not (kept.any() or task.pins or task.path):
+        raise UserError(
+            "nothing of the clip is kept and nothing else is asked: say what to keep, draw a path, or pin a "
+            "joint"
+        )
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Workers of a conversion leave the last word to their parent."""
+"""Workers of a conversion leave the last word to their parent; what killed processes leave is removed."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
 import pytest
+
+from motionloom.datasets.base.files import temporary_folder
+from motionloom.pipeline.store.files import new_files, new_folder
 
 PROGRAM = """
 import signal, time
@@ -47,3 +51,33 @@ def test_of_ctrl_c_and_of_a_program_on_standard_input(seconds: float, after: flo
     _, said = program.communicate(timeout=50)
     assert said.count("Traceback") == (after is not None) and "Process" not in said
     assert (program.returncode == 0) == (after is None)
+
+
+def test_what_killed_commands_left_goes_with_the_next_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Folders for the files of a motion, of an export, and of the system's place; not those of the living."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    others = (tmp_path / "out/.mine.0123456789abcdef.tmp", tmp_path / "out/.out.tmp")
+    for folder in others:
+        folder.mkdir(parents=True)
+    for make in (
+        lambda: new_files(tmp_path / "out"),
+        lambda: new_folder(tmp_path / "export"),
+        temporary_folder,
+    ):
+        ready, told = os.pipe()
+        if not (child := os.fork()):
+            with make() as folder:
+                (folder / "half.npz").touch()
+                os.write(told, str(folder).encode())
+                time.sleep(600)
+        left = Path(os.read(ready, 4096).decode())
+        with make():
+            assert (left / "half.npz").exists()
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        assert left.exists()
+        with make() as mine:
+            assert mine.is_dir() and not left.exists()
+    assert all(map(Path.is_dir, others)), "what has another name is another's"

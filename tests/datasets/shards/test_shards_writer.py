@@ -6,6 +6,7 @@ import errno
 import fcntl
 import hashlib
 import json
+import os
 import pickle
 import re
 import subprocess
@@ -14,11 +15,13 @@ import time
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 from shard_samples import digests
 
+from motionloom.datasets.base import files
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.lock import LOCK_FILE, folder_lock
 from motionloom.datasets.base.records import Dropped
@@ -223,6 +226,24 @@ def test_a_lock_that_was_removed_meanwhile_is_taken_anew(tmp_path: Path) -> None
         (tmp_path / LOCK_FILE).unlink()
         with folder_lock(tmp_path, shared=True), pytest.raises(UserError), folder_lock(tmp_path):
             pass
+
+
+def test_a_finished_set_is_found_where_nothing_can_be_written(
+    made: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    manifest, before = made.write(tmp_path / "a", count=10), digests(tmp_path / "a")
+    real = os.open
+
+    def read_only(path: Any, flags: int, *how: Any, **named: Any) -> int:
+        if flags & (os.O_CREAT | os.O_WRONLY | os.O_RDWR):
+            raise OSError(errno.EROFS, "Read-only file system", str(path))
+        return real(path, flags, *how, **named)
+
+    monkeypatch.setattr(os, "open", read_only)
+    monkeypatch.setattr(files, "atomic_path", lambda path: read_only(path, os.O_CREAT))
+    assert made.write(tmp_path / "a", count=10) == manifest and digests(tmp_path / "a") == before
+    with pytest.raises(OSError, match="Read-only"):
+        made.write(tmp_path / "b", count=10)
 
 
 def test_a_file_system_without_locks_is_written_with_a_warning(

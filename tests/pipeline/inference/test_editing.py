@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from toy_stages import FixedEncoder, MadeStage
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.convert.common.features import features_of
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.canonical import canonicalize, ground, mirror
 from motionloom.datasets.motion.features.codec import encode
@@ -257,6 +259,29 @@ def test_what_cannot_be_done_is_refused_in_one_sentence(
     with pytest.raises(UserError, match=said) as error:
         edit(editor(), clip(walk), **task)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("frames", "fps", "said"),
+    [
+        (3000, 1 / 1.15, "3,000 frames at 0.87 a second, 57 min, are too few"),
+        (16_000, 20.0, "13.3 min of motion"),
+    ],
+)
+def test_long_and_slow_clips_are_refused_before_a_frame_is_made(
+    walk: Walk, frames: int, fps: float, said: str
+) -> None:
+    """A clip of an hour and 4 MB took 2 GB and 32 s, before it was said that nothing was asked."""
+    recorded = RecordedClip("slow", np.resize(walk(100, fps), (frames, 52, 3)), fps)
+    tracemalloc.start()
+    for task in ({}, {"keep": ENDS}):
+        with pytest.raises(UserError, match=said):
+            edit(editor(), recorded, **task)
+    assert tracemalloc.get_traced_memory()[1] < recorded.joints.nbytes
+    tracemalloc.stop()
+    if fps < 1:
+        with pytest.raises(UserError, match="too few"):
+            features_of(recorded.joints, fps, MotionLayout.named("body133"))
 
 
 def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:
