@@ -63,13 +63,13 @@ def read_aist_motion(path: Path, name: str = "") -> tuple[NDArray[np.float32], N
             raise _Refused(f"{len(poses)} frames of smpl_poses, but {len(trans)} of smpl_trans")
         if scaling.size != 1 or not 0 < scaling[0] < np.inf:
             raise _Refused(f"smpl_scaling is {scaling[:3].tolist()}; it must be one positive number")
-    except (UserError, MemoryError):
+    except UserError:
         raise
     except OSError as error:
         raise UserError(f"{name}: cannot read ({error.strerror})") from None
     except _Refused as error:
         raise UserError(f"{name}: refused, {error}") from None
-    except Exception as error:  # damaged bytes make pickle raise nearly anything
+    except Exception as error:  # damaged bytes make pickle raise nearly anything, also MemoryError at once
         raise UserError(
             f"{name}: not a whole pickle, cut short or damaged ({type(error).__name__}: {str(error)[:120]})"
         ) from None

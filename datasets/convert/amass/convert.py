@@ -47,6 +47,7 @@ from motionloom.datasets.convert.common.files import check_id, walk_files
 from motionloom.datasets.convert.common.look import SourceJoints
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
+from motionloom.datasets.convert.common.tables import BadRows
 from motionloom.datasets.motion.body.smpl import BodyModel, SkeletonName, smpl_joints
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
@@ -143,7 +144,9 @@ class Amass(Release[AmassConfig]):
             first = by_key.setdefault(clip_key(label), label)
             if first is not label:
                 draft.leave_out(label, f"the same clip as {first}")
-        found = [(row, by_key.get(clip_key(row.source))) for row in read_index(index)]
+        bad: BadRows = {}
+        found = [(row, by_key.get(clip_key(row.source))) for row in read_index(index, bad)]
+        draft.fail_rows(bad)
         for one in index_clips(self.config, found, self.listed):
             self.rows[one.id] = one.row
             yield Entry(one.id, one.file or one.row.source, split=one.split, mirror_of=one.mirror_of)

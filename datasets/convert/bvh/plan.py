@@ -35,7 +35,7 @@ from motionloom.datasets.convert.common.facts import Fact, Facts
 from motionloom.datasets.convert.common.features import frames_after
 from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.convert.common.tables import captions_within
+from motionloom.datasets.convert.common.tables import BadRows, captions_within
 from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, Unit, Up, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -236,6 +236,11 @@ class BvhConfig(HumanmlConfig):
         """Facts of a file in the set's metadata; none for plain folders."""
         return {}
 
+    @property
+    def bad_rows(self) -> BadRows:
+        """What is wrong with rows of the set's tables, by the names of their files, or by their places."""
+        return {}
+
     def unfit(self, path: str) -> str:
         """Return the reason that the set's lists leave a file out; empty when they do not."""
         return ""
@@ -321,6 +326,9 @@ def plan_bvh(
 def _decide(config: BvhConfig, folder: Path, found: list[FoundFile], stated: str) -> ConversionPlan[BvhClip]:
     listing = config.listing([file.path for file in found])
     draft = ConversionPlan[BvhClip](config, notes=listing.notes, stated=stated)
+    names = {PurePosixPath(file.path).stem for file in found}
+    # A file that is here is left out for its row.
+    draft.fail_rows({name: why for name, why in config.bad_rows.items() if name not in names})
     contents: dict[str, str] = {}
     # Captioned files first, so that a stray copy never takes the place of the clip that has captions.
     for clip in sorted(found, key=lambda file: file.path not in listing.rows):

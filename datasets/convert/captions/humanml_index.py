@@ -33,7 +33,7 @@ from motionloom.datasets.convert.common.splits import (
     read_split_files,
     split_files,
 )
-from motionloom.datasets.convert.common.tables import read_csv
+from motionloom.datasets.convert.common.tables import BadRows, read_csv, reading_row
 
 INDEX_FPS = 20
 """Frames a second that the index means."""
@@ -252,9 +252,11 @@ def find_originals(
         for end in _ends(path):
             by_end[end].append(path)
     rows: dict[str, list[tuple[IndexRow, str | None, str]]] = {subset: [] for subset in ORIGINALS}
-    for row in read_index(index):
+    bad: BadRows = {}
+    for row in read_index(index, bad):
         if row.subset in ORIGINALS:
             rows[row.subset].append((row, *_original_of(row, by_end)))
+    draft.fail_rows(bad)
     known = sorted(set(ORIGINALS.values()))
     if config.licence not in (None, *known):
         raise UserError(
@@ -302,14 +304,15 @@ def _ends(path: str) -> list[str]:
     return ["/".join(pieces[first:]) for first in range(len(pieces))]
 
 
-def read_index(path: Path) -> list[IndexRow]:
-    """All rows; `UserError` names the line of a malformed one or of an id seen before."""
+def read_index(path: Path, bad: BadRows) -> list[IndexRow]:
+    """All rows; malformed ones, and those of an id seen before, go into `bad`."""
     rows: dict[str, IndexRow] = {}
-    for where, line in read_csv(path, _COLUMNS):
-        row = _row(line, where)
-        if row.id in rows:
-            raise UserError(f"{where}: clip '{row.id}' has a row already")
-        rows[row.id] = row
+    for where, line in read_csv(path, _COLUMNS, bad):
+        with reading_row(where, bad):
+            row = _row(line, where)
+            if row.id in rows:
+                raise UserError(f"{where}: clip '{row.id}' has a row already")
+            rows[row.id] = row
     return list(rows.values())
 
 

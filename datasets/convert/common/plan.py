@@ -7,7 +7,7 @@ and why, so nothing is skipped silently (`convert ... --plan` prints it and stop
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
@@ -144,6 +144,11 @@ class ConversionPlan(Generic[C]):
     def fail(self, source: str, error: Exception) -> None:
         """This one cannot be read."""
         self.broken.append(drop(source, error))
+
+    def fail_rows(self, bad: Mapping[str, str]) -> None:
+        """These rows of the source's tables cannot be read."""
+        for place, reason in bad.items():
+            self.fail(place, UserError(reason))
 
     @contextmanager
     def reading(self, source: str) -> Iterator[None]:

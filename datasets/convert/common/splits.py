@@ -101,7 +101,11 @@ def read_ids(path: Path) -> tuple[dict[str, int], list[str]]:
         clip_id = _FILE.sub("", line.strip())
         if not clip_id:
             continue
-        check_id(clip_id, f"{path}:{number}")
+        try:
+            check_id(clip_id, f"{path.name}:{number}")
+        except UserError as error:
+            notes.append(f"{error}; the line is left out")
+            continue
         if clip_id in lines:
             notes.append(f"{path.name}:{number}: '{clip_id}' is listed twice; line {lines[clip_id]} counts")
         lines.setdefault(clip_id, number)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from motionloom.datasets.base.errors import UserError
@@ -21,12 +22,29 @@ def read_json(path: Path, name: str) -> object:
     return parse_json(read_text_file(path, name), name)
 
 
-def read_json_lines(path: Path, name: str) -> Iterator[tuple[str, dict[str, object]]]:
-    """(place, record) of every line that is not blank."""
+BadRows = dict[str, str]
+"""What is wrong with a row of a table, by its place or, where it says one, the clip that it is of. A table of
+a hundred thousand rows is not refused for one of them."""
+
+
+@contextmanager
+def reading_row(place: str, bad: BadRows, needs: str = "is not as expected") -> Iterator[None]:
+    """Note a row as bad, and why, where what is read of it within fails; `needs` says what it must hold."""
+    try:
+        yield
+    except (UserError, LookupError, TypeError, ValueError) as error:
+        bad[place] = str(error) if isinstance(error, UserError) else f"{place}: {needs} ({error})"
+
+
+def read_json_lines(path: Path, name: str, bad: BadRows) -> Iterator[tuple[str, dict[str, object]]]:
+    """(place, record) of every line that is not blank; those that are no record go into `bad`."""
     for number, line in enumerate(read_text_file(path, name).split("\n"), start=1):
         if line.strip():
-            place = f"{name}:{number}"
-            yield place, require_record(parse_json(line, place), place)
+            place, record = f"{name}:{number}", None
+            with reading_row(place, bad):
+                record = require_record(parse_json(line, place), place)
+            if record is not None:
+                yield place, record
 
 
 def require_record(value: object, place: str) -> dict[str, object]:
@@ -36,8 +54,10 @@ def require_record(value: object, place: str) -> dict[str, object]:
     return value
 
 
-def read_csv(path: Path, columns: Iterable[str]) -> list[tuple[str, dict[str, str]]]:
-    """(place, row) of a table with a header; `UserError` names a missing column or a row that is cut."""
+def read_csv(path: Path, columns: Iterable[str], bad: BadRows) -> list[tuple[str, dict[str, str]]]:
+    """(place, row) of a table with a header; rows that are cut go into `bad`. `UserError` names a missing
+    column.
+    """
     lines = read_text_file(path, path.name).split("\n")
     try:
         header = [name.strip() for name in next(csv.reader(lines[:1]), [])]
@@ -51,8 +71,9 @@ def read_csv(path: Path, columns: Iterable[str]) -> list[tuple[str, dict[str, st
     rows = []
     for place, row in table_rows(lines[1:], 2, header, ",", path.name):
         if isinstance(row, UserError):
-            raise row
-        rows.append((place, row))
+            bad[place] = str(row)
+        else:
+            rows.append((place, row))
     return rows
 
 

@@ -23,7 +23,7 @@ from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
-from motionloom.datasets.convert.common.tables import captions_of, read_csv
+from motionloom.datasets.convert.common.tables import BadRows, captions_of, read_csv
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.motion.npz import NpzFile
 
@@ -73,10 +73,10 @@ class Beat2(BodyRelease[Beat2Config]):
             below = "" if folder == source else f"{folder.name}/"
             listed = {}
             if (folder / LISTS).is_file():
-                listed = {
-                    row["id"].strip(): row["type"].strip()
-                    for _, row in read_csv(folder / LISTS, ("id", "type"))
-                }
+                bad: BadRows = {}
+                rows = read_csv(folder / LISTS, ("id", "type"), bad)
+                listed = {row["id"].strip(): row["type"].strip() for _, row in rows}
+                draft.fail_rows({f"{below}{place}": reason for place, reason in bad.items()})
             else:
                 draft.notes.append(f"no {below}{LISTS}: split 80/5/15 by hash of the name")
             language = folder.name.removeprefix("beat_").split("_v")[0]

@@ -20,7 +20,13 @@ from motionloom.datasets.base.records import Caption
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.bvh.read import list_files
-from motionloom.datasets.convert.common.tables import captions_of, read_csv, read_json_lines
+from motionloom.datasets.convert.common.tables import (
+    BadRows,
+    captions_of,
+    read_csv,
+    read_json_lines,
+    reading_row,
+)
 from motionloom.datasets.convert.sets.bvh_sets import BvhSetConfig, Row
 
 FPS = 120.0
@@ -52,23 +58,36 @@ class BonesSeedConfig(BvhSetConfig):
         return list_files(folder)
 
     @cached_property
-    def rows(self) -> dict[str, Row]:
+    def tables(self) -> tuple[dict[str, Row], BadRows]:
         """The metadata by file name; clips of one actor stay in one split."""
         return _rows(self.source / "metadata")
 
+    @property
+    def rows(self) -> dict[str, Row]:
+        return self.tables[0]
 
-def _rows(folder: Path) -> dict[str, Row]:
+    @property
+    def bad_rows(self) -> BadRows:
+        return self.tables[1]
+
+
+def _rows(folder: Path) -> tuple[dict[str, Row], BadRows]:
     tables = sorted(folder.glob("seed_metadata_v*.csv"))
     if not tables:
         parquet = sorted(folder.glob("*.parquet"))
         hint = f"; save {parquet[-1].name} as CSV" if parquet else "; give the folder of the release"
         raise UserError(f"{folder}: no seed_metadata_v00N.csv in it{hint}")
     labels = sorted(folder.glob("*temporal_labels.jsonl"))
-    timeline = _timeline(labels[-1]) if labels else {}
+    bad: BadRows = {}
+    timeline = _timeline(labels[-1], bad) if labels else {}
     found: dict[str, Row] = {}
-    for _, row in read_csv(tables[-1], ("filename", "move_duration_frames", "is_mirror", "actor_uid")):
-        name, frames = row["filename"], row["move_duration_frames"]
-        seconds = whole(frames, f"{tables[-1].name}: '{name}': move_duration_frames") / FPS
+    needed = ("filename", "move_duration_frames", "is_mirror", "actor_uid")
+    for place, row in read_csv(tables[-1], needed, bad):
+        name, seconds = row["filename"], -1.0
+        with reading_row(name, bad):
+            seconds = whole(row["move_duration_frames"], f"{place}: '{name}': move_duration_frames") / FPS
+        if seconds < 0:
+            continue
         texts = [
             text
             for kind, columns in _CAPTIONS.items()
@@ -80,22 +99,20 @@ def _rows(folder: Path) -> dict[str, Row]:
                 texts.append(text.model_copy(update={"end": min(text.end or seconds, seconds)}))
         facts = {key: sys.intern(row[key]) for key in _FACTS if row.get(key)}
         found[name] = Row(tuple(texts), facts.get("actor_uid") or name, facts)
-    return found
+    return found, bad
 
 
-def _timeline(path: Path) -> dict[str, list[Caption]]:
+def _timeline(path: Path, bad: BadRows) -> dict[str, list[Caption]]:
     """The sentences of the temporal labels by file name, with start and end in seconds."""
     found: dict[str, list[Caption]] = {}
-    for place, record in read_json_lines(path, path.name):
+    for place, record in read_json_lines(path, path.name, bad):
         events = record.get("events")
-        try:
+        needs = "a record needs filename, and events with start_time, end_time and description"
+        with reading_row(place, bad, needs):
             for event in events if isinstance(events, list) else ():
                 start, end = (number(event[key], f"{place}: {key}") for key in ("start_time", "end_time"))
                 texts = captions_of(event["description"], "timeline", start, end)
                 found.setdefault(str(record["filename"]), []).extend(texts if start < end else ())
-        except (KeyError, TypeError, ValueError) as error:
-            reason = f"needs filename, and events with start_time, end_time and description ({error})"
-            raise UserError(f"{place}: a record {reason}") from None
     return found
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePosixPath
 from typing import NamedTuple
 
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Caption
 from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.captions.options import Listing, list_clips
@@ -49,18 +50,22 @@ class BvhSetConfig(BvhConfig):
         return row.facts if row else {}
 
     def unfit(self, path: str) -> str:
-        return "" if stem(path) in self.rows else "not in the tables of the set"
+        missing = self.bad_rows.get(stem(path), "not in the tables of the set")
+        return "" if stem(path) in self.rows else missing
 
     def listing(self, paths: Sequence[str]) -> Listing:
         if self.captions:
             return super().listing(paths)
+        if not self.rows and self.bad_rows:
+            raise UserError(next(iter(self.bad_rows.values())))
         known, here = self.rows, {stem(path): path for path in paths}
         rows = [
             CaptionRow(name, row.texts, here[name], hash_split(row.group), name)
             for name, row in known.items()
             if name in here
         ]
-        found = list_clips(paths, rows, read_split_files(self.splits)[0] if self.splits else None, [])
+        listed, notes = read_split_files(self.splits) if self.splits else (None, [])
+        found = list_clips(paths, rows, listed, notes)
         found.missing.update({name: name for name in known if name not in here})
         return found
 

@@ -107,7 +107,10 @@ class MotionHub(BodyRelease[MotionHubConfig]):
             listed = require_record(read_json(path, name), name).get("data_list")
             rows = enumerate(listed) if isinstance(listed, list) else require_record(listed, name).items()
             for key, row in rows:
-                yield task, split, str(key), require_record(row, f"{name}: '{key}'")
+                if isinstance(row, dict):
+                    yield task, split, str(key), row
+                else:
+                    draft.fail(f"{name}: '{key}'", UserError(f"no JSON object, but {type(row).__name__}"))
         if not here:
             raise UserError(
                 f"{self.config.source}: no annotations/{self.config.tasks[0]}/train.json in it; give the "

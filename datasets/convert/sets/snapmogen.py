@@ -25,6 +25,7 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import whole
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
+from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
@@ -65,17 +66,23 @@ class SnapMoGen(Release[SnapMoGenConfig]):
             raise UserError(f"{source}: no {FEATURES}/ in it; give the folder of the release")
         records = require_record(read_json(source / CAPTIONS, CAPTIONS), CAPTIONS)
         for key in dict.fromkeys([*records, *(self.listed or {})]):
-            where = f"{CAPTIONS}: '{key}'"
-            record = require_record(records.get(key, {}), where)
-            recording, *bounds = key.split("#")
-            if len(bounds) != 2:
-                raise UserError(f"{where}: a clip is named NAME#FIRST#LAST, with frames for FIRST and LAST")
-            first, last = (whole(bound, f"{where}: FIRST and LAST of NAME#FIRST#LAST") for bound in bounds)
-            texts = [text for kind in ("manual", "gpt") for text in captions_of(record.get(kind), kind)]
-            yield Entry(
-                key, f"{FEATURES}/{recording}.npy", tuple(texts), None, recording,
-                {"recording": recording}, first=first, last=last,
-            )  # fmt: skip
+            entries = list[Entry]()
+            with draft.reading(f"{CAPTIONS}: '{key}'"):
+                entries.append(self._entry(key, records.get(key, {})))
+            yield from entries
+
+    @staticmethod
+    def _entry(key: str, stated: object) -> Entry:
+        where = f"{CAPTIONS}: '{key}'"
+        record = require_record(stated, where)
+        recording, *bounds = key.split("#")
+        if len(bounds) != 2:
+            raise UserError(f"{where}: a clip is named NAME#FIRST#LAST, with frames for FIRST and LAST")
+        first, last = (whole(bound, f"{where}: FIRST and LAST of NAME#FIRST#LAST") for bound in bounds)
+        texts = [text for kind in ("manual", "gpt") for text in captions_of(record.get(kind), kind)]
+        facts: dict[str, Fact] = {"recording": recording}
+        file = f"{FEATURES}/{recording}.npy"
+        return Entry(key, file, tuple(texts), None, recording, facts, first=first, last=last)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         return check_array_header(path, width=WIDTH, name=label), FPS

@@ -15,7 +15,7 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import whole
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.common.tables import captions_of, read_csv
+from motionloom.datasets.convert.common.tables import BadRows, captions_of, read_csv, reading_row
 from motionloom.datasets.convert.sets.bvh_sets import BvhSetConfig, Row, stem
 
 CUTS, STYLES = "Frame_Cuts.csv", "Dataset_List.csv"
@@ -43,17 +43,28 @@ class Style100Config(BvhSetConfig):
         return self.cuts.get(stem(label), slice(None))
 
     def unfit(self, path: str) -> str:
-        return "" if stem(path) in self.cuts else f"no frames of it in {CUTS}"
+        return "" if stem(path) in self.cuts else self.bad_rows.get(stem(path), f"no frames of it in {CUTS}")
 
-    @cached_property
+    @property
     def cuts(self) -> dict[str, slice]:
         """First and last frame of every file that has them, by its name without suffix."""
-        return _cuts(self.source)
+        return self.tables[0]
 
-    @cached_property
+    @property
     def rows(self) -> dict[str, Row]:
         """Captions of every file that has frames. Clips of one style stay together: new styles are tested."""
-        return _rows(self.source, self.cuts)
+        return self.tables[1]
+
+    @property
+    def bad_rows(self) -> BadRows:
+        return self.tables[2]
+
+    @cached_property
+    def tables(self) -> tuple[dict[str, slice], dict[str, Row], BadRows]:
+        """Both tables of the set."""
+        bad: BadRows = {}
+        cuts = _cuts(self.source, bad)
+        return cuts, _rows(self.source, cuts, bad), bad
 
 
 class Style100(Bvh):
@@ -74,22 +85,24 @@ def _words(style: str) -> str:
     return " ".join(spaced.lower().split())
 
 
-def _cuts(source: Path) -> dict[str, slice]:
+def _cuts(source: Path, bad: BadRows) -> dict[str, slice]:
     if not (source / CUTS).is_file():
         raise UserError(f"{source}: no {CUTS} in it; give the folder of the release")
     found = {}
-    for _, row in read_csv(source / CUTS, ("STYLE_NAME",)):
+    for _, row in read_csv(source / CUTS, ("STYLE_NAME",), bad):
         for movement in MOVEMENTS:
             start, stop = (row.get(f"{movement}_{end}", "").strip() for end in ("START", "STOP"))
             if start in ("", "N/A", "NA", "nan") or stop in ("", "N/A", "NA", "nan"):
                 continue
             name = f"{row['STYLE_NAME'].strip()}_{movement}"
-            found[name] = slice(*(whole(frame, f"{CUTS}: {name}: frames") for frame in (start, stop)))
+            with reading_row(name, bad):
+                found[name] = slice(*(whole(frame, f"{CUTS}: {name}: frames") for frame in (start, stop)))
     return found
 
 
-def _rows(source: Path, cuts: Iterable[str]) -> dict[str, Row]:
-    styles = read_csv(source / STYLES, ("Style Name", "Description")) if (source / STYLES).is_file() else []
+def _rows(source: Path, cuts: Iterable[str], bad: BadRows) -> dict[str, Row]:
+    there = (source / STYLES).is_file()
+    styles = read_csv(source / STYLES, ("Style Name", "Description"), bad) if there else []
     described = {_words(row["Style Name"]): row["Description"].strip().rstrip(".") for _, row in styles}
     found = {}
     for name in cuts:

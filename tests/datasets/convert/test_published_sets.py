@@ -233,7 +233,7 @@ DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
     ("finedance", lambda root: wide(root / DANCE, 319), f"{DANCE}: expected [T, 315], found [90, 319]"),
     ("finedance", lambda root: wide(root / DANCE, 315), f"{DANCE}: no rotation at frame 0, joint 0"),
     ("bones_seed", lambda root: text(root / META, "actor_uid", "actor"), "no column 'actor_uid'"),
-    ("bones_seed", lambda root: text(root / META, ",A1,", ","), "6 columns, the header has 7"),
+    ("bones_seed", lambda root: text(root / META, ",True,A1,", ",True,"), "6 columns, the header has 7"),
     ("bones_seed", lambda root: text(root / LABELS, "end_time", "end"), "needs filename, and events with"),
     ("motion272", lambda root: wide(root / VECTORS, 263), f"{VECTORS}: expected [T, 272], found [90, 263]"),
     ("snapmogen", lambda root: text(root / SAID, "gone#0#90", "gone"), "a clip is named NAME#FIRST#LAST"),
@@ -260,3 +260,42 @@ def test_damage_is_named_in_one_sentence(
         sentences = [str(error)]
     (sentence,) = [one for one in sentences if said in one]
     assert "\n" not in sentence
+
+
+BAD_ROWS: dict[str, tuple[str, str, str, str]] = {
+    "bones_seed": (
+        META,
+        "walk_001__A1_M,walk_001,361",
+        "walk_001__A1_M,walk_001,long",
+        "'long' is no number",
+    ),
+    "style100": (CUTS, "Old,40,221", "Old,40,1e99", "'1e99' is no number"),
+    "beat2": (
+        f"{BEAT}/train_test_split.csv",
+        "2_scott_0_2_2,additional",
+        "a,b,c",
+        "3 columns, the header has 2",
+    ),
+    "snapmogen": (SAID, "m_ep2_00086#30#80", "m_ep2_00086#30#-80", "'-80' is no number"),
+    "motionhub": (LIST, '"fps": 30.0}, "M000001"', '"fps": 30.0}, "bad": 7, "M000001"', "train.json: 'bad'"),
+    "motion272": ("split/train.txt", "M000000", "../M000000", "../M000000"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ROWS)
+def test_one_bad_row_of_a_sets_table_leaves_that_row_out(
+    name: str, built: Callable[[str], Path], tmp_path: Path
+) -> None:
+    whole = {clip.id for _, clip in planned(name, built(name)).plan.items}
+    source, (table, old, new, said) = getattr(trees, name)(tmp_path / "in"), BAD_ROWS[name]
+    assert old in (source / table).read_text()
+    text(source / table, old, new)
+    plan = planned(name, source).plan
+    assert whole - {clip.id for _, clip in plan.items} <= {
+        old.split(",")[0],
+        "Old_FW",
+        f"{BEAT}/2_scott_0_2_2",
+    }
+    assert len(plan.items) >= len(whole) - 1
+    told = [*plan.notes, *(f"{one.source}: {one.reason}" for one in plan.left_out())]
+    assert any(said in one for one in told), told
