@@ -160,7 +160,7 @@ def _choose(path: Path, tree: NDArray[np.float64], skeleton: Skeleton) -> tuple[
         if fingers is None:
             raise UserError(f"{path}: {kind} has no fingers, but skeleton {skeleton.name} does; use SMPL-H/X")
         chosen += range(fingers, fingers + FINGERS)
-    parents = [int(parent) for parent in tree[0, chosen]]
+    parents = tree[0, chosen].tolist()  # as numbers: they may be NaN
     wanted = [chosen[parent] for parent in skeleton.parents[1:]]
     if parents[1:] != wanted or (tree[1] != np.arange(tree.shape[1])).any():
         raise UserError(f"{path}: kintree_table is not the joint tree of {kind}")
