@@ -5,6 +5,7 @@ The flight logs hold times and are no output.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
