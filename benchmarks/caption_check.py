@@ -19,6 +19,8 @@ from motionloom.datasets.motion.canonical import heading
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.request import Request
 
 Joints = NDArray[np.float64]
 SKELETON = Skeleton.named("smpl22")
@@ -80,7 +82,7 @@ def obeyed(bundle: Bundle, samples: int, sampling: SamplingConfig | None = None)
     return {
         caption: sum(
             BY_CONTENT[content](motion.joints, bundle.layout.fps)
-            for motion in bundle.generate([caption] * samples, seed=0, sampling=sampling)
+            for motion in generate(bundle, Request.of([caption] * samples, seed=0, sampling=sampling))
         )
         for caption, content in CAPTIONS.items()
     }

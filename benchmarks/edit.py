@@ -37,14 +37,14 @@ from motionloom.datasets.motion.canonical import ground, heading, resample
 from motionloom.datasets.motion.easing import eased
 from motionloom.datasets.motion.features.joints import local_joints_of
 from motionloom.datasets.synth.generate import SynthConfig, make_sample, split_of
-from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.editing.edit import edit_clip
+from motionloom.pipeline.editing.finish import accelerations, sliding
+from motionloom.pipeline.editing.task import EditTask
 from motionloom.pipeline.evaluation.estimate import estimate
 from motionloom.pipeline.evaluation.truth import Truth
-from motionloom.pipeline.inference.edits.clip_file import read_clip
-from motionloom.pipeline.inference.edits.edit import accelerations, sliding
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
-from motionloom.pipeline.inference.model import MotionModel, edit_clip
+from motionloom.pipeline.inference.clip_file import RecordedClip, read_clip
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
 from motionloom.pipeline.runs.recipe import load_recipe
 
@@ -155,7 +155,7 @@ def figures_of(
     fps, out, drawing, asked = models[0].fps, [], SamplingConfig(), EditTask.parse(task, "task")
     try:
         draws = [
-            edit_clip(models[draw % len(models)].bundle, clip, asked, samples=1, seed=draw, sampling=drawing)
+            edit_clip(models[draw % len(models)].bundle, clip, asked, 1, draw, drawing)
             for draw in range(DRAWS)
         ]
     except UserError:

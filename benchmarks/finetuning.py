@@ -44,6 +44,8 @@ from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.latent_metrics import LatentRow, recalls
 from motionloom.pipeline.evaluation.truth import Truth, truth_of
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.store.evaluator import embed_motions
 from motionloom.pipeline.store.training_log import read_training_log
@@ -226,7 +228,7 @@ def best_rate(args: argparse.Namespace, arm: str, steps: Mapping[str, int]) -> f
 def figures_of(bundle: Bundle, clips: Clips, seed: int, args: argparse.Namespace) -> dict[str, float]:
     """Figures of motions for the captions."""
     sampling = SamplingConfig(top_p=args.top_p, cfg_scale=args.cfg_scale)
-    made = bundle.generate(clips.captions, seed=seed, sampling=sampling)
+    made = generate(bundle, Request.of(clips.captions, seed=seed, sampling=sampling))
     return clips.figures([m.joints for m in made])
 
 

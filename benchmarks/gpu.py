@@ -44,6 +44,8 @@ from motionloom.pipeline.contract.lookup import previews
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import Stage
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
@@ -275,9 +277,11 @@ class Benchmark:
         seconds = min(FRAMES / bundle.layout.fps, bundle.max_seconds)
         for seed in range(2):  # the first one chooses kernels
             begin = time.perf_counter()
-            how = {"seconds": seconds, "seed": seed, "batch": batch}
+            how = {"seconds": seconds, "seed": seed}
             with torch.autocast(self.device.type, torch.bfloat16, enabled=half):
-                made = bundle.generate(["a person walks forward"] * batch, sampling=SamplingConfig(), **how)
+                made = generate(
+                    bundle, Request.of(["a person walks forward"] * batch, sampling=SamplingConfig(), **how)
+                )
             self.synchronize()
             took = time.perf_counter() - begin
         return {

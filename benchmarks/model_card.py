@@ -45,6 +45,8 @@ from motionloom.pipeline.evaluation.figures import NEAREST_LABELS, NEAREST_WORDS
 from motionloom.pipeline.evaluation.reference_baselines import most_similar, nearest_texts
 from motionloom.pipeline.evaluation.truth import Truth
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.inference.shipped_models import CARD_FIGURES, model_folder
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 
@@ -208,7 +210,7 @@ def main() -> None:
     def measured(how: SamplingConfig) -> dict[str, Shares]:
         out = {}
         for title, (captions, faces) in said.items():
-            made = bundle.generate(captions, face=faces, sampling=how, seed=seed)
+            made = generate(bundle, Request.of(captions, face=faces, sampling=how, seed=seed))
             out[title] = judge(truths, ((motion.joints, motion.face) for motion in made), fps, hold_out)
         return out
 

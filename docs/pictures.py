@@ -29,9 +29,11 @@ from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.inference.writers import cell_of
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
@@ -88,7 +90,7 @@ def poses(motion: GeneratedMotion, caption: str, at: Sequence[int]) -> list[View
 
 def generated_rows(run: Path, captions: tuple[str, ...], frames: int, seed: int) -> list[list[ViewerMotion]]:
     """Motions that a trained run makes of the captions, at times that are spread evenly."""
-    motions = Bundle.open(run).generate(captions, seed=seed)
+    motions = generate(Bundle.open(run), Request.of(captions, seed=seed))
     spread = [np.linspace(0, len(m.joints) - 1, frames).round().astype(int).tolist() for m in motions]
     return [poses(motion, motion.caption, at) for motion, at in zip(motions, spread, strict=True)]
 
@@ -104,11 +106,14 @@ def dance_rows(run: Path, count: int, frames: int, seed: int) -> list[list[Viewe
         if len(clip.beats) >= frames:
             kinds.setdefault((clip.truth or {}).get("genre"), clip)
     clips = list(kinds.values())[:count]
-    motions = bundle.generate(
-        sounds=[c.sound for c in clips],
-        conditions={"audio": [c.music for c in clips]},
-        seconds=[c.seconds for c in clips],
-        seed=seed,
+    motions = generate(
+        bundle,
+        Request.of(
+            sounds=[c.sound for c in clips],
+            conditions={"audio": [c.music for c in clips]},
+            seconds=[c.seconds for c in clips],
+            seed=seed,
+        ),
     )
     rows = []
     for clip, motion in zip(clips, motions, strict=True):

@@ -20,7 +20,7 @@ RECORDS = tuple(f"motionloom.datasets.base.{name}" for name in ("errors", "json_
 BOTTOM = ("motionloom.datasets.motion", *RECORDS, "motionloom.datasets.conditions")
 BELOW = ("motionloom.datasets.base.files", "motionloom.datasets.base.randomness")
 """What the bottom layer itself may use: files of the standard library and numpy alone."""
-FENCE = ("pipeline/baselines", "pipeline/curation", "datasets/convert/sets")
+FENCE = ("pipeline/baselines", "pipeline/curation", "pipeline/editing", "datasets/convert/sets")
 """Folders of what neither paper needs: nothing imports them, and each may be removed."""
 BOTTOM_LIBRARIES = {"numpy", "torch", "roma", "scipy", "pydantic", "motionloom"}
 
@@ -148,8 +148,8 @@ def test_no_room_imports_itself_by_way_of_others() -> None:
 
 
 FLOORS = {
-    "pipeline": "curation cli serve runs baselines stages results evaluation training inference contract "
-    "store render launch",
+    "pipeline": "curation editing cli serve runs baselines stages results evaluation training inference "
+    "contract store render launch",
     "models": "utt diffusion gpt tokenizer pretrained tma evaluator quantize discriminator "
     "condition metrics training layers",
     "datasets": "check convert synth actions loading shards modalities text motion audio base",

@@ -32,7 +32,7 @@ from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.inference.edits.clip_file import read_clip
+from motionloom.pipeline.inference.clip_file import read_clip
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import save
 from motionloom.pipeline.render.body.face import ARKIT, ArkitBases
@@ -115,7 +115,7 @@ def _bvh(folder: Path) -> Made:
     return seeds, lambda seed, content: read(seed, content).positions()  # type: ignore[attr-defined]
 
 
-@reader("clip bvh", "pipeline/inference/edits/clip_file.py")
+@reader("clip bvh", "pipeline/inference/clip_file.py")
 def _clip_bvh(folder: Path) -> Made:
     return of_files(folder, "a.bvh", [bvh_clip(folder)], damaged_text, read_clip)
 

@@ -30,7 +30,7 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.shards.tar import scan_tar
 from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
-from motionloom.pipeline.contract.editing import EditTask
+from motionloom.pipeline.editing.task import EditTask
 from motionloom.pipeline.contract.lookup import finished_stages, open_exported
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.curation.search import _stored

@@ -148,8 +148,9 @@ def declare(called: str, places: Mapping[str, str], others: Iterable[str] = ()) 
 def register(thing: T) -> T:
     """Add something of your own; recipes, files and the command line know it by its `name` from then on.
 
-    `thing` is a `StageKind`, a `ClipMetric`, a `Modality`, a `Writer`, a `Command`, or a class of
-    `Converter`. Returns it. Raises `UserError` where the name is taken, and where `thing` is none of these.
+    `thing` is of a class that has a `Table` (`StageKind`, `ClipMetric`, `Modality`, `Writer`, `Command` and
+    more), or a subclass of `Converter`. Returns it. Raises `UserError` where the name is taken, and where
+    `thing` is none of these.
     """
     named: Any = thing
     classes = isinstance(named, type)

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from motionloom.models.diffusion.dmd import Dmd
-from motionloom.models.diffusion.network import InBetweener, TextDenoiser
-from motionloom.models.diffusion.observed import Observations
+from motionloom.models.diffusion.network import TextDenoiser
 from motionloom.models.layers.frozen import Frozen
 from motionloom.models.layers.transformer import length_mask
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer
@@ -77,29 +76,6 @@ class TextDenoiserModule(DenoiserModule):
 
     def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
         return mean_of_rows(error.square(), mask, present)
-
-
-class InBetweenModule(TextDenoiserModule):
-    """Trains an `InBetweener`, which observes a part of each motion."""
-
-    net: InBetweener
-
-    def __init__(
-        self, net: InBetweener, optim: OptimConfig, *, seed: int, max_steps: int, observations: Observations
-    ) -> None:
-        super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.observations = observations
-
-    def predict(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
-        conditions = self.conditions(noisy, step, batch, mask)
-        observed = self.observations(batch["motion"], batch["length"])
-        predicted: Tensor = self.net(*conditions, observed)
-        return predicted
-
-    def mean(self, error: Tensor, mask: Tensor, present: Tensor | None) -> Tensor:
-        loss = super().mean(error, mask, present)
-        speed_error = mean_of_rows(error.diff(dim=1).square(), mask[:, 1:], present)
-        return loss + self.net.config.velocity_weight * speed_error
 
 
 class DmdModule(DenoiserModule):

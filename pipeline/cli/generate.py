@@ -59,86 +59,71 @@ def generate(
     """
     from motionloom.datasets.audio.sound import Excerpt
     from motionloom.pipeline.contract.sampling import SamplingConfig
-    from motionloom.pipeline.inference.edits.clip_file import read_seed_motion
+    from motionloom.pipeline.inference.display_figure import FigureOptions
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.outputs import page_note, page_title
-    from motionloom.pipeline.inference.requests import require_seed, require_words
-    from motionloom.pipeline.inference.script import Script, read_music
-    from motionloom.pipeline.inference.shown import FigureOptions
-    from motionloom.pipeline.launch.hardware import threads_for
+    from motionloom.pipeline.inference.request import Request, require_words
+    from motionloom.pipeline.inference.script import read_music
     from motionloom.pipeline.runs.snapshot import run_at
 
     fields, figure, more = settings_of(
         settings, SamplingConfig.model_fields, FigureOptions.model_fields, ("face", "seed_motion")
     )
-    sampling = SamplingConfig.parse(fields, "--set")
-    face, seed_motion = more.get("face"), more.get("seed_motion")
+    posing, wanted = FigureOptions.parse(figure, "--set"), formats_of(formats)
+    posing.require_formats(wanted)
+    face, begun = more.get("face"), more.get("seed_motion")
     faces = None if face is None else [str(one) for one in (face if isinstance(face, list) else [face])]
     texts, songs = list(captions or []), audio or []
     file = Path(texts.pop(0)) if texts and texts[0].lower().endswith(_SCRIPTS) else None
     # All that needs no model is checked before one is opened.
     if not texts and not songs and file is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
-    if file is not None and (texts or songs or seconds is not None or faces or seed_motion):
-        raise UserError(
-            f"{file}: a script says everything: leave captions, --audio, --seconds, face and seed_motion out"
-        )
-    require_seed(seed)
     require_words(texts)
-    wanted, posing = formats_of(formats), FigureOptions.parse(figure, "--set")
-    for name, form in (("body_model", "smplx"), ("arkit_bases", "arkit")):
-        if getattr(posing, name) is not None and form not in wanted:
-            raise UserError(f"{name} is what --format {form} is made by: name that format too")
-    with run_at(run_folder, at) as folder:
-        require_folder(out)
-        segments = None if file is None else Script.read(file)
-        sounds = [read_music(path) for path in songs]
-        aside = make_console(aside=True)  # standard output is the list of files
-
-        def each(values: Sequence[Any]) -> list[Any] | None:
-            return [value for value in values for _ in range(samples)] or None
-
-        with threads_for(samples * max(len(texts), len(sounds), 1)):
-            bundle = MotionModel(folder, device).bundle
-            if segments is not None:
-                motions = bundle.perform(segments, samples=samples, seed=seed, sampling=sampling)
-            else:
-                begun = (
-                    None if seed_motion is None else [read_seed_motion(Path(str(seed_motion)), bundle.layout)]
-                )
-                motions = bundle.generate(
-                    each(texts),
-                    face=faces if faces is None or len(faces) == 1 else each(faces),
-                    sounds=each(sounds),
-                    seconds=seconds,
-                    seed=seed,
-                    sampling=sampling,
-                    seed_motions=begun,
-                    strict=True,
-                )
-                if begun is None and (seed_frames := bundle.generator.capabilities.seed_frames):
-                    start = f"the first {seed_frames / bundle.layout.fps:.2g} s are of a training dance"
-                    print_note(aside, f"{start}; --set seed_motion=FILE takes yours")
-
-            def notes(some: Sequence[GeneratedMotion]) -> Sequence[object]:
-                prompts = [one.prompt for one in segments or some]
-                return bundle.notes(prompts, some, sampling.face_model, seconds)
-
-            for note in notes(motions):
-                print_note(aside, note)
-            title = page_title([motion.caption for motion in motions], [path.name for path in songs], file)
-            write_files(
-                out,
-                motions,
-                wanted,
-                title=title,
-                note=page_note(len(motions), Path(folder).resolve().name, seed, terms=bundle.terms),
-                notes=[notes([motion]) for motion in motions],
-                names=None if texts else each([Excerpt.named(path).path.stem for path in songs]),
-                figure=posing,
-                made_from=None if seed_motion is None else Path(str(seed_motion)),
-                say=partial(say, aside),
+    require_words(faces or (), "face")
+    drawn: dict[str, Any] = {"seed": seed, "sampling": SamplingConfig.parse(fields, "--set")}
+    require_folder(out)
+    if file is not None:
+        if texts or songs or seconds is not None or faces or begun:
+            raise UserError(
+                f"{file}: a script says everything: leave captions, --audio, --seconds, face and seed_motion "
+                f"out"
             )
+        request = Request.of_script(file, samples=samples, **drawn)
+    else:
+        request = Request.of(
+            _each(texts, samples),
+            face=faces if faces is None or len(faces) == 1 else _each(faces, samples),
+            sounds=_each([read_music(path) for path in songs], samples),
+            seconds=seconds,
+            seed_motions=None if begun is None else str(begun),
+            **drawn,
+        )
+    aside = make_console(aside=True)  # standard output is the list of files
+    with run_at(run_folder, at) as folder:
+        model = MotionModel(folder, device)
+        motions = model.make(request)
+        if begun is None and file is None and (start := model.bundle.generator.capabilities.seed_frames):
+            lead = f"the first {start / model.fps:.2g} s are of a training dance"
+            print_note(aside, f"{lead}; --set seed_motion=FILE takes yours")
+        for note in model.notes(request, motions):
+            print_note(aside, note)
+        write_files(
+            out,
+            motions,
+            wanted,
+            title=page_title([motion.caption for motion in motions], [path.name for path in songs], file),
+            note=page_note(len(motions), Path(folder).resolve().name, seed, terms=model.bundle.terms),
+            notes=[model.notes(request.alone(row), [motion]) for row, motion in enumerate(motions)],
+            names=None if texts else _each([Excerpt.named(path).path.stem for path in songs], samples),
+            figure=posing,
+            made_from=None if begun is None else Path(str(begun)),
+            say=partial(say, aside),
+        )
+
+
+def _each(values: Sequence[Any], samples: int) -> list[Any] | None:
+    """Every value so many times; None without any."""
+    return [value for value in values for _ in range(samples)] or None
 
 
 def formats_of(formats: str | None) -> list[str]:

@@ -24,7 +24,6 @@ from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.base.register import discover
 from motionloom.pipeline.cli.caption import caption
 from motionloom.pipeline.cli.data import data_app
-from motionloom.pipeline.cli.edit import edit
 from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.generate import generate
 from motionloom.pipeline.cli.options import (
@@ -219,7 +218,6 @@ def launch(
 
 app.command()(generate)
 app.command()(caption)
-app.command()(edit)
 
 
 @app.command()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -149,14 +149,14 @@ class Capabilities:
 
     drive: Callable[[Sequence[Stretch], Sequence[int], SamplingConfig], list[Motion]] | None = None
     """Generates stretches that follow each other, with a seed for each motion; [T, C] each."""
-    edit: Callable[..., list[Motion]] | None = None
-    """Makes the free parts of an edit, as `DiffusionMotion.edit` does."""
     denoising: Callable[[SamplingConfig], tuple[Sampler, int]] | None = None
     """Returns sampler and number of steps of its diffusion model under these settings."""
     seed_frames: int = 0
     """Frames of the seed motion that it continues; its output begins with them."""
     note: str = ""
     """A remark that must stand beside its figures."""
+    more: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
+    """What packages add to generators, by the name of their `Ability`."""
 
 
 class MotionGenerator(Protocol):

@@ -33,8 +33,7 @@ from motionloom.datasets.shards.tar import npy_from_bytes
 from motionloom.pipeline.contract.lookup import finished_stages, open_exported
 from motionloom.pipeline.contract.stage import ALIGNMENT, StageCache
 from motionloom.pipeline.curation.suspects import Place, Splits, floored_joints, open_splits
-from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
+from motionloom.pipeline.inference.clip_file import RecordedClip, read_clip, require_clip
 from motionloom.pipeline.inference.shipped_models import model_folder, no_such_model
 from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.store.evaluator import embed_motions

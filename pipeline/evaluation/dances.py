@@ -18,7 +18,9 @@ from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.pipeline.evaluation.truth import different_first
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.render.sound import Score, Segment
 
 SOUND = "audio.flac"
@@ -166,18 +168,19 @@ def seed_frames(bundle: Bundle) -> int:
 
 
 def dance_to(bundle: Bundle, clips: Sequence[DanceClip], **drawn: Any) -> list[GeneratedMotion]:
-    """Dances to the music of clips, each as long as its clip; `drawn` is for `Bundle.generate`.
+    """Dances to the music of clips, each as long as its clip; `drawn` is for `Request.of`.
 
     A model that goes on from a motion begins with the clip's own first frames.
     """
     begun = seed_frames(bundle)
-    return bundle.generate(
+    request = Request.of(
         seed_motions=[clip.motion[:begun] for clip in clips] if begun else None,
         sounds=[clip.sound for clip in clips],
         conditions={"audio": [clip.music for clip in clips]},
         seconds=[clip.seconds for clip in clips],
         **drawn,
     )
+    return generate(bundle, request)
 
 
 def require_dances(dataset: ClipDataset) -> None:

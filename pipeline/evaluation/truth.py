@@ -72,14 +72,18 @@ def perform(
     sampling: SamplingConfig | None = None,
 ) -> list[GeneratedMotion]:
     """Motions for clips' captions, as long as the clips unless `seconds` or the model decides."""
+    from motionloom.pipeline.inference.generation import generate
+    from motionloom.pipeline.inference.request import Request
+
     maker = bundle.generator
-    return bundle.generate(
+    request = Request.of(
         [truth.caption for truth in truths],
         face=[truth.face_caption for truth in truths],
         seconds=recorded_seconds(truths, maker) if seconds is None and not maker.decides_length else seconds,
         seed=seed,
         sampling=sampling,
     )
+    return generate(bundle, request)
 
 
 def truth_of(

@@ -19,7 +19,7 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.shards.left_out import drop
 from motionloom.datasets.shards.sample import Sample
 from motionloom.pipeline.contract.captioning import Sentence
-from motionloom.pipeline.inference.edits.clip_file import LEAST_FRAMES, features_for, read_clip
+from motionloom.pipeline.inference.clip_file import LEAST_FRAMES, features_for, read_clip
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 

@@ -41,12 +41,9 @@ def unknown_captions(source: object, captions: Sequence[str], *, face: bool = Fa
 
 
 def rounded_lengths(
-    generator: MotionGenerator,
-    seconds: float | Sequence[float | None] | None,
-    motions: Sequence[GeneratedMotion],
+    generator: MotionGenerator, asked: Sequence[float | None], motions: Sequence[GeneratedMotion]
 ) -> list[str]:
-    """Return a sentence for each of `seconds` that a motion's length, in whole units, is not."""
-    asked = [seconds] * len(motions) if isinstance(seconds, int | float) else seconds or ()
+    """Return a sentence for each length in seconds that a motion's, in whole units, is not."""
     fps, unit = generator.layout.fps, generator.unit_frames
     lengths = dict.fromkeys((wanted, one.seconds) for wanted, one in zip(asked, motions, strict=False))
     return [

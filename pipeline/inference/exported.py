@@ -42,9 +42,9 @@ def write_bundle(
     """
     bundle, sampling = Bundle.from_run(run), sampling or SamplingConfig()
     if bundle.stages:
-        bundle.require_used(None, sampling)
+        bundle.require_used(sampling)
     for stage in bundle.stages:
-        bundle.of(stage)  # opens every stage, so a broken one is found before anything is copied
+        bundle.generator_of(stage)  # opens every stage, so a broken one is found before anything is copied
     for stage in bundle.captioners:
         bundle.stage_cache.captioner(stage)
     out.mkdir(parents=True, exist_ok=True)

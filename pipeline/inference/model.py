@@ -12,55 +12,35 @@ from __future__ import annotations
 
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from huggingface_hub import ModelHubMixin
-from numpy.typing import NDArray
 
-from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.motion.body.rigid import RigidMotion
-from motionloom.datasets.motion.bvh.own_file import between_rows
-from motionloom.datasets.motion.layout import PIECES, piece_joints
-from motionloom.models.layers.seeds import sample_seeds
-from motionloom.pipeline.contract.editing import EditTask
-from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.contract.ability import ability_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.clip_file import (
-    changed,
-    features_for,
-    read_clip,
-    read_seed_motion,
-    require_clip,
-)
-from motionloom.pipeline.inference.edits.edit import finish, own_bvh, own_figure, report_of, require_editor
-from motionloom.pipeline.inference.edits.frames import EditFrames, edit_frames, require_work
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
 from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
-from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
-from motionloom.pipeline.inference.requests import (
-    caption_list,
-    lengths_of,
-    require_samples,
-    require_seed,
-    sound_list,
-    weight_bytes,
-)
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.request import Columns, Request, caption_list, require_words
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import find_model
-from motionloom.pipeline.inference.shown import shown
 from motionloom.pipeline.launch.hardware import choose_device, threads_for
 from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 from motionloom.pipeline.store.text import TextSource
+from motionloom.pipeline.store.weights import MODEL_FILES
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
+
+Sampling = SamplingConfig | Mapping[str, object]
+"""Settings, or a mapping like `{"top_p": 0.9}`."""
 
 
 class MotionModel(
@@ -99,36 +79,69 @@ class MotionModel(
         *,
         face: Sequence[str] | None = None,
         sounds: Sequence[Sound | None] | None = None,
+        conditions: Mapping[str, Sequence[object]] | None = None,
         seconds: float | Sequence[float | None] | None = None,
         seed: int = 0,
-        sampling: SamplingConfig | Mapping[str, object] | None = None,
-        seed_motion: Path | str | NDArray[np.float32] | None = None,
+        noise_seed: int | None = None,
+        sampling: Sampling | None = None,
+        seed_motion: Path | str | Columns | Sequence[Columns] | None = None,
     ) -> list[GeneratedMotion]:
         """Motions for captions, sounds or both, in order; equal arguments give equal motions.
 
         A motion's draws go by its place in the list. `seconds` is one length for all or one each; without it
         a motion is as long as its sound, or else the model decides. To silence it stands, or does what the
-        words say, and it warns, as of a sound with hardly a beat. `sampling` is a `SamplingConfig` or a
-        mapping like `{"top_p": 0.9}`. An option that this model takes no notice of is refused; of a caption
-        that is far from all it was trained on, it warns. What `sampling` leaves out is as the model's export
-        recommends, or the default. `seed_motion` is for models that go on from a motion, with whose last
-        frames theirs begin: a file (.npz, .bvh, .glb), or the layout's columns [T, D]; without it they take
-        the start of a training dance.
+        words say, and it warns, as of a sound with hardly a beat. An option that this model takes no notice
+        of is refused; of a caption that is far from all it was trained on, it warns. What `sampling` leaves
+        out is as the model's export recommends, or the default. `seed_motion` is for models that go on from a
+        motion, with whose last frames theirs begin: a file (.npz, .bvh, .glb), or the layout's columns [T,
+        D], for all or one for each; without it they take the start of a training dance. `conditions` are more
+        of what motions are conditioned on, by modality: of "audio" the sounds' features [T, 438], where they
+        are known, such as those that a data set stores. `noise_seed` decodes the same tokens with other
+        noise, where a diffusion model decodes.
         """
-        captions = None if captions is None else caption_list(captions)
-        sounds = None if sounds is None else sound_list(sounds)
-        seconds = lengths_of(seconds)
-        if isinstance(seed_motion, Path | str):
-            seed_motion = read_seed_motion(Path(seed_motion), self.bundle.layout)
-        with threads_for(len(sounds or captions or ()), weight_bytes(self.bundle.stages)):
-            motions = self.bundle.generate(
-                captions, face=face, sounds=sounds, seconds=seconds, seed=seed,
-                sampling=SamplingConfig.of(sampling), strict=True,
-                seed_motions=None if seed_motion is None else [seed_motion],
-            )  # fmt: skip
-        for note in self.bundle.notes([motion.prompt for motion in motions], motions, seconds=seconds):
-            warnings.warn(str(note), stacklevel=2)
+        request = Request.of(
+            captions, face=face, sounds=sounds, conditions=conditions, seconds=seconds, seed=seed,
+            noise_seed=noise_seed, sampling=sampling, seed_motions=seed_motion,
+        )  # fmt: skip
+        require_words(face or (), "face")
+        return self._told(request)
+
+    def perform(
+        self,
+        script: Path | str | Script,
+        *,
+        samples: int = 1,
+        seed: int = 0,
+        sampling: Sampling | None = None,
+    ) -> list[GeneratedMotion]:
+        """One motion driven by a script of text and music in turn, and `samples` - 1 others of it.
+
+        `script` is a file, or a `Script` whose sound files are seen from the current folder.
+        """
+        return self._told(Request.of_script(script, samples=samples, seed=seed, sampling=sampling))
+
+    def _told(self, request: Request) -> list[GeneratedMotion]:
+        """The motions of a request, with warnings about them."""
+        motions = self.make(request)
+        for note in self.notes(request, motions):
+            warnings.warn(str(note), stacklevel=3)
         return motions
+
+    def make(self, request: Request) -> list[GeneratedMotion]:
+        """The motions of a request, without a word about them; options without effect are refused."""
+        self.bundle.require_used(request.sampling, request.prompts)
+        with self.threads(request.count):
+            return generate(self.bundle, request)
+
+    def notes(self, request: Request, motions: Sequence[GeneratedMotion]) -> list[Unknown | str]:
+        """What a person should know of these motions of a request."""
+        face_model = request.sampling.face_model
+        return self.bundle.notes(request.prompts, motions, face_model, request.lengths)
+
+    def threads(self, motions: int) -> AbstractContextManager[None]:
+        """As many threads as so many motions at once can use."""
+        files = (stage.folder / MODEL_FILES[0] for stage in self.bundle.stages)
+        return threads_for(motions, sum(path.stat().st_size for path in files if path.is_file()))
 
     def examples(self, count: int = 6) -> list[str]:
         """Some captions that it knows, unlike each other; none where it does not say what it knows."""
@@ -140,35 +153,20 @@ class MotionModel(
         """Captions that are far from all that it was trained on, and what it knows nearest to each."""
         return self.bundle.unknown_captions(caption_list(captions), caption_list(face, "face"))
 
-    def perform(
-        self,
-        script: Path | str | Script,
-        *,
-        samples: int = 1,
-        seed: int = 0,
-        sampling: SamplingConfig | Mapping[str, object] | None = None,
-    ) -> list[GeneratedMotion]:
-        """One motion driven by a script of text and music in turn, and `samples` - 1 others of it.
-
-        `script` is a file, or a `Script` whose sound files are seen from the current folder.
-        """
-        segments = script.open() if isinstance(script, Script) else Script.read(Path(script))
-        drawn = SamplingConfig.of(sampling)
-        motions = self.bundle.perform(segments, samples=samples, seed=seed, sampling=drawn)
-        for note in self.bundle.notes([segment.prompt for segment in segments]):
-            warnings.warn(str(note), stacklevel=2)
-        return motions
+    def ability(self, name: str) -> Callable[..., Any]:
+        """What a package has added to models, such as "edit". `UserError` where this one cannot do it."""
+        return partial(ability_of(self.bundle.generator, name), self)
 
     def edit(
         self,
         clip: Path | str | GeneratedMotion,
-        task: EditTask | Mapping[str, object],
+        task: object,
         *,
         samples: int = 1,
         seed: int = 0,
-        sampling: SamplingConfig | Mapping[str, object] | None = None,
-    ) -> list[EditedMotion]:
-        """A clip of which a part is made anew, `samples` times.
+        sampling: Sampling | None = None,
+    ) -> list[Any]:
+        """A clip of which a part is made anew, `samples` times: `EditedMotion`s of `pipeline/editing`.
 
         Args:
             clip: A file (BVH, or the npz or GLB of a motion), or a generated motion.
@@ -177,20 +175,9 @@ class MotionModel(
             sampling: As of `generate`.
 
         Only models whose body is made by diffusion edit. Each result says how near it is to its task
-        (`EditedMotion.report`).
+        (`report`).
         """
-        require_editor(self.bundle.generator)
-        asked = EditTask.parse(task, "task")
-        if isinstance(clip, GeneratedMotion):
-            figure = shown(clip).figure
-            facts = (clip.fps, clip.face, clip.caption, clip.bvh, figure)
-            recorded = require_clip(RecordedClip("the motion", figure.joints, *facts))
-        else:
-            recorded = read_clip(Path(clip))
-        with threads_for(samples, weight_bytes(self.bundle.stages)):
-            return edit_clip(
-                self.bundle, recorded, asked, samples=samples, seed=seed, sampling=SamplingConfig.of(sampling)
-            )
+        return list(self.ability("edit")(clip, task, samples=samples, seed=seed, sampling=sampling))
 
     @property
     def fps(self) -> float:
@@ -212,84 +199,3 @@ class MotionModel(
             shutil.copytree(self.folder, save_directory, dirs_exist_ok=True)
         else:
             write_bundle(self.folder, save_directory)
-
-
-def edit_clip(
-    bundle: Bundle, clip: RecordedClip, task: EditTask, *, samples: int, seed: int, sampling: SamplingConfig
-) -> list[EditedMotion]:
-    """Edit a clip as `MotionModel.edit`."""
-    require_seed(seed)
-    require_samples(samples)
-    layout, sampling = bundle.layout, bundle.drawing(sampling)
-    require_work(task, clip, layout)
-    if task.changes_clip:
-        before = edit_frames(EditTask(), clip, layout)
-        frames = edit_frames(task, changed(clip, task), layout)
-    else:
-        before = frames = edit_frames(task, clip, layout)
-    editor, generator = require_editor(bundle.generator), bundle.generator
-    prompt, original = Prompt(task.caption), original_of(before, clip)
-    words = bundle.encode(bundle.main, [prompt], [prompt.text]) if prompt.text.strip() else {}
-    columns = layout.part(generator.part)
-    whole = np.repeat(frames.features[None], samples, axis=0)
-    whole[..., columns] = np.stack(editor(frames, words, sample_seeds(seed, samples), sampling))
-    # A face that the model does not make is the clip's, if that has one.
-    has_face = layout.has("face") and (generator.part == "all" or frames.face is not None)
-    out = []
-    for made in whole:
-        features, figure, heading = finish(frames, made[:, layout.part("bodyhand")])
-        face = made[:, layout.part("face")] if has_face else None
-        # Words are looked for in each stretch that was made, as in motions that are generated.
-        stretches = [
-            GeneratedMotion(prompt, features[start:end], figure.joints[start:end], None, layout)
-            for start, end in frames.stretches
-        ]
-        notes = [*map(str, bundle.notes([prompt], stretches))] if words else []
-        bvh, fps = None, layout.fps
-        if clip.bvh is not None:
-            try:
-                bvh = own_bvh(clip.bvh, frames, figure)
-            except UserError as error:
-                notes.append(f"a BVH of this has a skeleton of ours, not the clip's: {error}")
-        elif frames.drawn and not task.changes_clip:
-            figure, fps = own_figure(clip, frames, figure), clip.fps
-        # What is said is of the joints that a file holds.
-        rounded = figure.joints.astype(np.float32) + np.array([0, frames.base, 0])
-        rate = fps if bvh is None else bvh.motion.fps
-        joints = frames.of_file(rounded if bvh is None else bvh.places(), rate)
-        if words and frames.pieces[:, : PIECES.index("left_hand")].all():
-            made_anew = ~frames.pieces[frames.inside][:, piece_joints(layout)[: joints.shape[1]]]
-            if joints.shape == frames.seen.shape and made_anew.any():
-                moved = np.linalg.norm(joints - frames.seen, axis=-1)[made_anew].mean()
-                notes.append(f"hands alone are made anew: by {100 * moved:.1f} cm on average")
-        edited = EditedMotion(
-            prompt, features, figure.joints, face, layout, seed=seed, original=original, bvh=bvh,
-            report=report_of(frames, joints, heading, rate), remarks=(*frames.remarks, *notes),
-        )  # fmt: skip
-        out.append(_drawn(edited, figure, fps))
-    return out
-
-
-def original_of(frames: EditFrames, clip: RecordedClip) -> GeneratedMotion:
-    """The clip of a task: a figure of ours as it is, others as the model reads them."""
-    layout, figure = frames.layout, frames.to_world(frames.figure)
-    features = frames.features[frames.inside][:, layout.part("bodyhand")]
-    motion = GeneratedMotion(Prompt(clip.caption), features, figure.joints, frames.face, layout, bvh=clip.bvh)
-    if frames.drawn and clip.figure is not None and clip.bvh is None:
-        return _drawn(motion, clip.figure, clip.fps)
-    return _drawn(motion, figure, layout.fps)
-
-
-Drawn = TypeVar("Drawn", bound=GeneratedMotion)
-
-
-def _drawn(motion: Drawn, figure: RigidMotion, fps: float) -> Drawn:
-    """The motion with the figure that is shown of it, at the frame rate of that."""
-    joints, face, layout = figure.joints, motion.face, replace(motion.layout, fps=fps)
-    if fps == motion.fps:
-        return replace(motion, figure=figure, joints=joints)
-    if face is not None:
-        at = np.arange(len(joints)) / fps * motion.fps
-        face = between_rows(face[..., None], at.clip(0, len(face) - 1))[..., 0].astype(np.float32)
-    features = features_for(joints, fps, layout.without_face())[0]
-    return replace(motion, figure=figure, joints=joints, face=face, features=features, layout=layout)

@@ -10,8 +10,8 @@ from pathlib import Path
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.files import write_text
-from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.shown import FigureOptions, shown
+from motionloom.pipeline.inference.display_figure import FigureOptions, shown
+from motionloom.pipeline.inference.motion_data import MotionData
 from motionloom.pipeline.inference.writers import WRITERS, OutputClip, Outputs, cell_of, writer_for
 from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.render.viewer import viewer_page
@@ -33,7 +33,7 @@ def file_stem(number: int, name: str) -> str:
 
 def write_motions(
     folder: Path | str,
-    motions: Iterable[GeneratedMotion],
+    motions: Iterable[MotionData],
     formats: Sequence[str],
     *,
     title: str,
@@ -111,7 +111,7 @@ def _written(folder: Path) -> list[Path]:
     return [path for path in paths if path.is_file()]
 
 
-def save(path: Path, motion: GeneratedMotion, note: str = "") -> None:
+def save(path: Path, motion: MotionData, note: str = "") -> None:
     """Write one file, of the format that its ending names; `note` is a page's."""
     writer = writer_for(path)
     if not path.parent.is_dir():
@@ -119,13 +119,13 @@ def save(path: Path, motion: GeneratedMotion, note: str = "") -> None:
     writer.write(path, Outputs([clip_of(motion)], page_title([motion.caption]), note))
 
 
-def clip_of(motion: GeneratedMotion) -> OutputClip:
+def clip_of(motion: MotionData) -> OutputClip:
     """The motion with all that drove it."""
     options = FigureOptions()
     return OutputClip(shown(motion, options), score_of(motion), options)
 
 
-def frame_of(motion: GeneratedMotion, height: int = 480) -> str:
+def frame_of(motion: MotionData, height: int = 480) -> str:
     """The viewer page within an `iframe` whose script runs apart from all around it."""
     page = viewer_page([cell_of(clip_of(motion))], page_title([motion.caption]))
     return (
@@ -134,7 +134,7 @@ def frame_of(motion: GeneratedMotion, height: int = 480) -> str:
     )
 
 
-def score_of(motion: GeneratedMotion) -> Score:
+def score_of(motion: MotionData) -> Score:
     """The music that a motion was driven by, its beats, and the segments; beats only where music drove."""
     sound = motion.prompt.sound
     if sound is None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from motionloom.pipeline.inference.shown import FigureOptions, ShownMotion
+    from motionloom.pipeline.inference.display_figure import FigureOptions, ShownMotion
     from motionloom.pipeline.render.body.glb import GlbClip
     from motionloom.pipeline.render.sound import Score
     from motionloom.pipeline.render.viewer import ViewerMotion

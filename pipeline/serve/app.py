@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from importlib import resources
-from typing import TypeVar
 from urllib.parse import quote
 
 from starlette.applications import Starlette
@@ -21,20 +20,17 @@ from starlette.types import ASGIApp
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import parse_json
-from motionloom.pipeline.contract.editing import MAX_SPEED
-from motionloom.pipeline.inference.edits.edit import require_editor
+from motionloom.datasets.base.register import discover
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import resource, viewer_script
-from motionloom.pipeline.serve.editing import CLIP, ChangeRequest, Clips
 from motionloom.pipeline.serve.guard import Bodies, OwnPage, allowed_hosts
-from motionloom.pipeline.serve.requests import Answer, MotionRequest, ServeConfig, Sounds
+from motionloom.pipeline.serve.part import SERVED, A
+from motionloom.pipeline.serve.requests import Answer, MotionRequest, Motions, ServeConfig, Sounds
 
-RequestT = TypeVar("RequestT", MotionRequest, ChangeRequest)
-
+_WEB = resources.files("motionloom.pipeline.serve") / "web"
+_PARTS = "<!-- parts -->"
+"""Where the page has the markup of its parts."""
 _BROKEN = "something broke here; the server's log says what"
-
-_SCRIPTS = ("serve.js", "edit.js", "lanes.js", "figure.js", "task.js")
-"""Scripts of the page, besides the viewer's."""
 
 _UPLOADS = 4
 """Sounds and clips that are decoded at a time; a place is taken when all of one is here, so that slow senders
@@ -48,12 +44,19 @@ class Site:
         self.model, self.config, self.name = model, config, name
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="model")
         self._asked = 0
-        self.sounds, self.clips = Sounds(config), Clips(model, config)
+        self.sounds, self.motions = Sounds(config), Motions(model, config)
         self._bodies, self._uploads = Bodies(config.patience), asyncio.Semaphore(_UPLOADS)
+        discover()
+        self.parts = {part.name: part.open(self) for part in SERVED.values()}
+        webs = [_WEB, *(part.web for part in SERVED.values())]
+        files = {file.name: file.read_text(encoding="utf-8") for web in webs for file in web.iterdir()}
+        styles = [text for name, text in files.items() if name.endswith(".css")]
+        panels = [files[f"{name}.html"] for name in self.parts]
+        self._page = files["page.html"].replace(_PARTS, "".join(panels))
         self._assets = {
-            "serve.css": resource("viewer/viewer.css") + _web_file("serve.css"),
+            **{name: text for name, text in files.items() if name.endswith(".js")},
+            "serve.css": resource("viewer/viewer.css") + "".join(styles),
             "viewer.js": viewer_script(),
-            **{script: _web_file(script) for script in _SCRIPTS},
         }
 
     def stop(self) -> None:
@@ -69,9 +72,9 @@ class Site:
             Route("/api/info", self.info),
             Route("/api/generate", self.generate, methods=["POST"]),
             Route("/api/sounds", self.add_sound, methods=["POST"]),
-            Route("/api/clips", self.add_clip, methods=["POST"]),
-            Route("/api/edit", self.edit, methods=["POST"]),
         ]
+        posts = {path: do for part in self.parts.values() for path, do in part.posts.items()}
+        routes += [Route(path, do, methods=["POST"]) for path, do in posts.items()]
         hosts = allowed_hosts(self.config)
         return Starlette(
             routes=routes,
@@ -83,7 +86,7 @@ class Site:
         )
 
     async def page(self, http: Request) -> Response:
-        return Response(_web_file("page.html"), media_type="text/html; charset=utf-8")
+        return Response(self._page, media_type="text/html; charset=utf-8")
 
     async def asset(self, http: Request) -> Response:
         """A script or the style, from memory."""
@@ -96,11 +99,7 @@ class Site:
     async def info(self, http: Request) -> Response:
         bundle, limits = self.model.bundle, self.config
         longest = min(limits.max_seconds, self.model.max_seconds)
-        skeleton, why = bundle.layout.skeleton, ""
-        try:
-            require_editor(bundle.generator)
-        except UserError as error:
-            why = str(error)
+        skeleton = bundle.layout.skeleton
         return JSONResponse(
             {
                 "model": self.name,
@@ -111,7 +110,8 @@ class Site:
                 "fps": self.model.fps,
                 "joint_names": list(skeleton.joints),
                 "parents": [int(parent) for parent in skeleton.parents],
-                "edit": {"possible": not why, "why": why, "max_speed": MAX_SPEED},
+                "parts": list(self.parts),
+                **{name: part.facts for name, part in self.parts.items()},
                 "sampling": bundle.recommended.model_dump(mode="json", exclude_unset=True),
                 "limits": {
                     "seconds": longest,
@@ -123,23 +123,18 @@ class Site:
         )
 
     async def generate(self, http: Request) -> Response:
-        request = await self._read_request(http, MotionRequest)
+        request = await self.read(http, MotionRequest)
         sound = None if request.sound is None else self.sounds.kept.get(request.sound)
-        return await self._respond(lambda: self.clips.generate(request, sound))
+        return await self.respond(lambda: self.motions.generate(request, sound))
 
-    async def edit(self, http: Request) -> Response:
-        """A clip of which a part is made anew."""
-        request = await self._read_request(http, ChangeRequest)
-        return await self._respond(lambda: self.clips.change(request))
-
-    async def _respond(self, call: Callable[[], Answer]) -> Response:
+    async def respond(self, make: Callable[[], Answer]) -> Response:
         """Return the answer of the model's thread; 429 where too many wait, besides the one that runs."""
         if self._asked > self.config.waiting:
             words = f"{self.config.waiting} requests are waiting already; try again in a moment"
             raise HTTPException(429, words, {"retry-after": "2"})
         self._asked += 1
         try:
-            answer = await asyncio.get_running_loop().run_in_executor(self._thread, call)
+            answer = await asyncio.get_running_loop().run_in_executor(self._thread, make)
         finally:
             self._asked -= 1
         headers = dict[str, str]()
@@ -152,22 +147,16 @@ class Site:
         if "audio" not in self.model.modalities:
             raise HTTPException(400, "this model knows no music; give it captions")
         # Decoded in another thread, so that the server answers meanwhile.
-        async with self._upload(http, "the sound", self.config.max_sound_mb) as data:
+        async with self.upload(http, "the sound", self.config.max_sound_mb) as data:
             name, sound = await asyncio.to_thread(self.sounds.add, data)
         return JSONResponse({"sound": name, "seconds": round(sound.seconds, 3)})
 
-    async def add_clip(self, http: Request) -> Response:
-        """Keep the motion file that the body is, under a name for later requests."""
-        require_editor(self.model.bundle.generator)
-        async with self._upload(http, CLIP, self.config.max_clip_mb) as data:
-            return JSONResponse(await asyncio.to_thread(self.clips.add, data))
-
     @asynccontextmanager
-    async def _upload(self, http: Request, what: str, most: float) -> AsyncIterator[bytes]:
-        async with self._bodies.read(http, what, _bytes(most)) as data, self._uploads:
+    async def upload(self, http: Request, what: str, megabytes: float) -> AsyncIterator[bytes]:
+        async with self._bodies.read(http, what, _bytes(megabytes)) as data, self._uploads:
             yield data
 
-    async def _read_request(self, http: Request, kind: type[RequestT]) -> RequestT:
+    async def read(self, http: Request, kind: type[A]) -> A:
         media = http.headers.get("content-type", "").split(";")[0].strip().lower()
         if media != "application/json":
             raise HTTPException(415, "send JSON with Content-Type: application/json")
@@ -196,11 +185,6 @@ async def refused(http: Request, error: Exception) -> Response:
 async def broken(http: Request, error: Exception) -> Response:
     """Return 500 for an error of ours, which Starlette logs."""
     return JSONResponse({"error": _BROKEN}, 500)
-
-
-def _web_file(name: str) -> str:
-    """Return the text of a file of the folder `web`."""
-    return (resources.files("motionloom.pipeline.serve") / "web" / name).read_text(encoding="utf-8")
 
 
 def _bytes(megabytes: float) -> int:

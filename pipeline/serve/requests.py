@@ -18,11 +18,10 @@ from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import temporary_folder
-from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import clip_of, file_stem, save
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.inference.writers import WRITERS, cell_of
 from motionloom.pipeline.render.viewer import viewer_data
 from motionloom.pipeline.store.known_captions import Unknown
@@ -85,7 +84,14 @@ _KINDS = {b"RIFF": ".wav", b"RF64": ".wav", b"fLaC": ".flac", b"OggS": ".ogg"}
 """First bytes and the file's ending; what begins otherwise is tried as MP3."""
 
 
-class MotionRequest(Config):
+class Asked(Config):
+    """A request as JSON; a subclass has its fields."""
+
+    def require_within(self, limits: ServeConfig, model: MotionModel) -> None:
+        """Refuse what is too much; `UserError` in one sentence."""
+
+
+class MotionRequest(Asked):
     """One motion, as a client asks for it."""
 
     caption: str = ""
@@ -104,18 +110,28 @@ class MotionRequest(Config):
     """Numbers (`joints`), the viewer's data (`viewer`), or a file of a format of `WRITERS`."""
 
     def require_within(self, limits: ServeConfig, model: MotionModel) -> None:
-        """Refuse what is too much; `UserError` in one sentence."""
         limits.require_small([self.caption, self.face], self.seconds or 0.0)
         if not self.caption.strip() and self.sound is None:
             raise UserError("caption is empty; say what the person does")
-        if self.face and not model.bundle.faces:
-            raise UserError("this model makes no face; leave face out")
 
-    @property
-    def sampling(self) -> SamplingConfig:
-        """The sampling settings; only fields of the request are set."""
-        names = {"cfg_scale", "temperature", "top_p"} & self.model_fields_set
-        return SamplingConfig.parse({name: getattr(self, name) for name in names}, "request")
+    def of_model(self, model: MotionModel, sound: Sound | None, limits: ServeConfig) -> Request:
+        """The request of a model that this is, with the sound that it names."""
+        seconds = self.seconds
+        if seconds is None and sound is None and not model.bundle.generator.decides_length:
+            seconds = min(_USUAL, limits.max_seconds)
+        if sound is not None:
+            seconds = min(sound.seconds, limits.max_seconds) if seconds is None else seconds
+            if seconds <= sound.seconds:
+                sound = sound.slice(0.0, seconds)
+        drawn = {"cfg_scale", "temperature", "top_p"} & self.model_fields_set
+        return Request.of(
+            [self.caption] if self.caption.strip() else None,
+            face=[self.face] if self.face else None,
+            sounds=None if sound is None else [sound],
+            seconds=seconds,
+            seed=self.seed,
+            sampling={name: getattr(self, name) for name in drawn},
+        )
 
 
 @dataclass(frozen=True)
@@ -127,41 +143,26 @@ class Answer:
     file: str = ""
 
 
-def notes_of(
-    model: MotionModel, asked: MotionRequest, sound: Sound | None, motion: GeneratedMotion
-) -> dict[str, list[str]]:
-    """Notes for the person on the motion: captions that are unlike all that the model knows, what could
-    be said of the body instead, that a sound has no beat, and that the motion does something else.
-    """
-    prompt = Prompt(asked.caption, asked.face, sound)
-    found = model.bundle.notes([prompt], [motion], seconds=asked.seconds)
-    unknown = [one for one in found if isinstance(one, Unknown)]
-    nearest = [text for one in unknown if one.caption == asked.caption for text in one.nearest]
-    return {"notes": [one.what if isinstance(one, Unknown) else one for one in found], "nearest": nearest}
+class Motions:
+    """The motions used last: those that are asked for, and what parts of the server keep."""
 
+    def __init__(self, model: MotionModel, config: ServeConfig) -> None:
+        self._model, self._config = model, config
+        self.kept = Recent[GeneratedMotion](config.clips, "the clip")
 
-def motion_of(
-    model: MotionModel, asked: MotionRequest, sound: Sound | None, limits: ServeConfig
-) -> GeneratedMotion:
-    """The motion that is asked for."""
-    seconds = asked.seconds
-    if seconds is None and sound is None and not model.bundle.generator.decides_length:
-        seconds = min(_USUAL, limits.max_seconds)
-    if sound is not None:
-        longest = min(sound.seconds, limits.max_seconds)
-        seconds = longest if seconds is None else seconds
-        if seconds > sound.seconds + 0.5:
-            raise UserError(f"{seconds:g} s were asked for and the sound lasts {sound.seconds:.1f} s")
-        sound = sound.slice(0.0, min(seconds, sound.seconds))
-    return model.bundle.generate(
-        [asked.caption] if asked.caption.strip() else None,
-        face=[asked.face] if asked.face else None,
-        sounds=None if sound is None else [sound],
-        seconds=seconds,
-        seed=asked.seed,
-        sampling=asked.sampling,
-        strict=True,
-    )[0]
+    def generate(self, asked: MotionRequest, sound: Sound | None) -> Answer:
+        """The motion that is asked for. The same request is answered with the same motion, made once."""
+        model = self._model
+        name = name_of_facts(asked.model_dump(mode="json", exclude={"format"}, exclude_unset=True))
+        request = asked.of_model(model, sound, self._config)
+        motion = self.kept.made(name, lambda: model.make(request)[0])
+        found = model.notes(request, [motion])
+        notes = [one.what if isinstance(one, Unknown) else one for one in found]
+        # What could be said of the body instead of a caption that is unlike all that the model knows.
+        unknown = (one for one in found if isinstance(one, Unknown) and one.caption == asked.caption)
+        nearest = [text for one in unknown for text in one.nearest]
+        facts = {"clip": name, "seed": asked.seed, "face": asked.face, "notes": notes, "nearest": nearest}
+        return answer(motion, asked.format, facts, "\n".join(notes), {"generated": motion})
 
 
 def answer(
@@ -208,6 +209,11 @@ def _rounded(values: NDArray[np.floating]) -> object:
 def name_of(data: bytes) -> str:
     """The name under which a client finds what it sent, or what was made of it, again."""
     return hashlib.sha256(data).hexdigest()[:24]
+
+
+def name_of_facts(facts: Mapping[str, object]) -> str:
+    """The name of what is made by these facts."""
+    return name_of(json.dumps(facts, sort_keys=True).encode())
 
 
 T = TypeVar("T")

@@ -14,7 +14,6 @@ _KINDS = {
     "networks.tokens": ("tokens",),
     "networks.tma": ("tma",),
     "networks.gpt": ("gpt",),
-    "networks.inbetween": ("inbetween",),
     "networks.evaluator": ("evaluator",),
     "networks.guo_evaluator": ("guo_evaluator",),
     "networks.dmd": ("dmd",),

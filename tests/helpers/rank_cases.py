@@ -12,9 +12,8 @@ from ude_training import draws_of_all
 
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.layout import PIECES, MotionLayout
-from motionloom.models.diffusion.module import DenoiserModule, InBetweenModule, TextDenoiserModule
-from motionloom.models.diffusion.network import InBetweenConfig, InBetweener, TextDenoiserConfig
-from motionloom.models.diffusion.observed import Observations
+from motionloom.models.diffusion.module import DenoiserModule, TextDenoiserModule
+from motionloom.models.diffusion.network import TextDenoiserConfig
 from motionloom.models.evaluator.module import EvaluatorModule
 from motionloom.models.evaluator.network import Evaluator, EvaluatorConfig
 from motionloom.models.gpt.losses import GptLossConfig
@@ -59,6 +58,9 @@ from motionloom.pipeline.baselines.tm2t.network import (
 )
 from motionloom.pipeline.baselines.tm2t.seq2seq import Seq2Seq, Seq2SeqConfig
 from motionloom.pipeline.baselines.tm2t.tokenizer import Tm2tConfig
+from motionloom.pipeline.editing.inbetween.module import InBetweenModule
+from motionloom.pipeline.editing.inbetween.network import InBetweenConfig, InBetweener
+from motionloom.pipeline.editing.inbetween.observed import Observations
 
 STEPS = 12
 BATCH, FRAMES, TEXT = 6, 24, 6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -45,6 +45,14 @@ class UdeConfig(StageConfig):
     [ours]. It must be trained for that (`net.hide` of its stage); 0 decodes every token."""
 
 
+@dataclass
+class LastTokens:
+    """The tokens that were drawn last, and what tells apart what they were drawn from."""
+
+    key: str = ""
+    codes: Codes | None = None
+
+
 @dataclass(frozen=True)
 class UdeGenerator(OfTokens):
     """Motion of text, music or both, of any length."""
@@ -52,6 +60,7 @@ class UdeGenerator(OfTokens):
     utt: LoadedWindowed[ConditionedUtt]
     dmd: LoadedWindowed[Dmd] | None
     config: UdeConfig
+    last: LastTokens = field(default_factory=LastTokens, compare=False, repr=False)
     method = "ude"
 
     @property
@@ -87,10 +96,10 @@ class UdeGenerator(OfTokens):
             return self.drive(stretches, request.seeds, request.sampling)
         # Decoded many times in a row: the tokens are drawn once.
         key = _digest(request)
-        if key not in self._last:
-            self._last.clear()
-            self._last[key] = self.timeline.tokens(stretches, request.seeds, request.sampling)
-        return self._decoded(self._last[key], stretches, request.noise_seeds, request.sampling)
+        if self.last.key != key or self.last.codes is None:
+            self.last.codes = self.timeline.tokens(stretches, request.seeds, request.sampling)
+            self.last.key = key
+        return self._decoded(self.last.codes, stretches, request.noise_seeds, request.sampling)
 
     def drive(
         self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig
@@ -98,11 +107,6 @@ class UdeGenerator(OfTokens):
         """Tokens that go on from stretch to stretch, then all of them decoded at once."""
         codes = self.timeline.tokens(stretches, seeds, sampling)
         return self._decoded(codes, stretches, seeds, sampling)
-
-    @cached_property
-    def _last(self) -> dict[str, Codes]:
-        """The tokens drawn last, by `_digest`."""
-        return {}
 
     def _decoded(
         self, codes: Codes, stretches: Sequence[Stretch], noise: Sequence[int], sampling: SamplingConfig

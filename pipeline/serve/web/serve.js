@@ -1,16 +1,28 @@
-/* The page of `motionloom serve`: asks for a motion and shows it. Everything that is shown goes through `textContent`. */
+/* The page of `motionloom serve`: asks for a motion and shows it. Everything that is shown goes through `textContent`.
 
-import { makeEditor } from "./edit.js";
-import { element } from "./lanes.js";
+   A package's part of the page (`info.parts`) is a script of its name that exports `begin(page)`. `page` gives it `info` and
+   the functions below; `page.current` is what is shown: `{ ref, viewer, frames, caption, name }`, `ref` being what the server
+   knows it by, and `saved` where it can be saved. `begin` returns what the page asks of the part: `opened`, whether it has
+   taken the page over, and then `tell(words, wrong)` instead of the status line; `able`, whether files can be dropped on it;
+   `take(file, alone)`, which takes such a file or says false, `alone` where nothing else would; `refresh()`, called when what
+   can be saved has changed. */
 
 const one = (id) => document.getElementById(id);
 const form = one("ask"), status = one("status"), go = one("go"), save = one("save");
-const notes = one("notes"), start = one("start"), CLIP = /\.(npz|bvh|glb)$/i;
-let info = null, shown = null, asked = null, music = null, turn = 0;
-let editor = null, current = null; // what is shown, as the editor takes it
+const notes = one("notes"), start = one("start"), parts = [];
+let info = null, shown = null, asked = null, music = null, turn = 0, current = null;
+
+/* A node with properties and children. */
+export function element(tag, properties, ...children) {
+  const node = Object.assign(document.createElement(tag), properties);
+  node.append(...children);
+  return node;
+}
+
+const opened = () => parts.find((part) => part.opened);
 
 function say(words, wrong) {
-  if (editor && editor.opened) editor.tell(words, wrong);
+  if (opened()) opened().tell(words, wrong);
   status.textContent = words;
   status.classList.toggle("serve-wrong", Boolean(wrong));
 }
@@ -86,10 +98,10 @@ function show(answer, body) {
 /* What the buttons save; nothing hides them. */
 function savable(what) {
   asked = what;
-  save.hidden = !what && !(current && !editor.opened);
+  save.hidden = !what && !(current && !opened());
   save.firstElementChild.hidden = !what;
-  one("save-words").textContent = editor.opened ? "Save the result as" : "Save as";
-  one("change").hidden = editor.opened || !info.edit.possible;
+  one("save-words").textContent = opened() ? "Save the result as" : "Save as";
+  for (const part of parts) part.refresh();
 }
 
 /* Captions to be clicked. */
@@ -131,16 +143,6 @@ async function send(path, file, most, words) {
   }
 }
 
-/* A motion file, to be changed. */
-async function takeClip(file) {
-  const mine = ++turn, answer = await send("/api/clips", file, info.limits.clip_bytes, `Reading ${file.name}…`);
-  if (!answer || mine !== turn) return;
-  current = { ref: answer.clip, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, name: file.name };
-  note(answer.notes, []);
-  say(`${file.name}: ${answer.seconds.toFixed(1)} s of motion`);
-  editor.open(current);
-}
-
 async function take(file) {
   music = file ? await send("/api/sounds", file, info.limits.sound_bytes, `Sending ${file.name}…`) : null;
   if (music) say(`${file.name}: ${music.seconds.toFixed(1)} s of music`);
@@ -148,29 +150,32 @@ async function take(file) {
 
 form.addEventListener("submit", (event) => { event.preventDefault(); generate(); });
 for (const button of save.querySelectorAll("[data-format]")) button.addEventListener("click", () => keep(button.dataset.format));
-one("change").addEventListener("click", () => { note([], []); editor.open(current); });
 one("sound").addEventListener("change", () => take(one("sound").files[0]));
-one("clip").addEventListener("change", () => { if (one("clip").files.length) takeClip(one("clip").files[0]); });
 for (const name of ["dragover", "drop", "dragleave"]) {
   document.addEventListener(name, (event) => {
-    if (!info || !(info.modalities.includes("audio") || info.edit.possible)) return;
+    if (!info || !(info.modalities.includes("audio") || parts.some((part) => part.able))) return;
     event.preventDefault();
     document.body.classList.toggle("serve-over", name === "dragover");
     if (name !== "drop" || !event.dataTransfer.files.length) return;
     const [file] = event.dataTransfer.files;
-    if (CLIP.test(file.name) || !info.modalities.includes("audio")) dropClip(file);
-    else {
+    const sounds = info.modalities.includes("audio");
+    if (!parts.some((part) => part.take(file, !sounds)) && sounds) {
       one("sound").files = event.dataTransfer.files;
       take(file);
     }
   });
 }
 
-function dropClip(file) {
-  if (!info.edit.possible) say(`${file.name}: ${info.edit.why}`, true);
-  else if (!CLIP.test(file.name)) say(`${file.name} is no motion that can be read here: drop a BVH, GLB or npz file`, true);
-  else takeClip(file);
-}
+const page = {
+  say, post, send, mount, note, savable,
+  get info() { return info; },
+  get current() { return current; },
+  set current(clip) { current = clip; },
+  get turn() { return turn; },
+  /* Begins a request, of which the newest alone is shown; its number is `turn` until another begins. */
+  next: () => (turn += 1),
+  show: (clip) => { current = clip; mount(clip.viewer); savable(clip.saved); },
+};
 
 one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
 
@@ -190,18 +195,8 @@ one("more").open = window.innerWidth > 620 && window.innerHeight > 500;
   one("sound-field").hidden = !info.modalities.includes("audio");
   const drivers = info.modalities.map((name) => (name === "audio" ? "music" : name)).join(" or ");
   say(`${info.model}: ${drivers} to motion, at most ${info.limits.seconds} s`);
-  editor = makeEditor({
-    info, post, mount,
-    savable,
-    closed: (clip) => {
-      current = clip;
-      mount(clip.viewer);
-      savable(clip.saved);
-    },
-  });
-  for (const node of document.querySelectorAll(".edit-can")) node.hidden = !info.edit.possible;
-  one("change-not").hidden = info.edit.possible;
-  one("change-not").textContent = info.edit.why;
+  for (const node of document.querySelectorAll("[data-in]")) one(node.dataset.in).append(node);
+  for (const name of info.parts) parts.push((await import(`./${name}.js`)).begin(page));
   one("start-words").textContent = info.examples.length ? "It knows, for example:" : "What you ask for is shown here.";
   one("start-examples").replaceChildren(...choices(info.examples));
   start.hidden = false;

@@ -102,8 +102,7 @@ class DenoiserStage(CaptionStage[D, CaptionInputs, T]):
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
-        window = stage.config.max_frames  # the longest motion of its training
-        return DiffusionMotion(given["stats"].layout, part, given, net, window)
+        return DiffusionMotion(given["stats"].layout, part, given, net)
 
 
 def clips_of(config: CaptionStageConfig, layout: MotionLayout, captioned: Captioned | None) -> dict[str, Any]:

@@ -35,6 +35,8 @@ from motionloom.pipeline.evaluation.truth import (
     truth_of,
 )
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.stages.results.evaluation import Evaluation, bundle_driven_by
 from motionloom.pipeline.store.evaluator import LoadedEvaluator, embed_motions
 from motionloom.pipeline.store.networks import TrainedTokenizer
@@ -226,7 +228,7 @@ class EvaluationUnits(Evaluation):
         truths, fps = self.truths[piece], self.dataset.layout.fps
         recorded = self.config.lengths == "recorded"
         seed, noise_seed = self.seeds(draw, piece.start)
-        motions = self.bundle.generate(
+        request = Request.of(
             [t.caption for t in truths],
             face=[t.face_caption for t in truths],
             seconds=recorded_seconds(truths, self.bundle.generator) if recorded else None,
@@ -234,6 +236,7 @@ class EvaluationUnits(Evaluation):
             noise_seed=noise_seed,
             sampling=self.config.sampling,
         )
+        motions = generate(self.bundle, request)
         made_for = [
             Performance(m.joints, t.joints, fps, m.face, t.truth)
             for t, m in zip(truths, motions, strict=True)

@@ -176,11 +176,11 @@ def bundle_driven_by(
 ) -> Bundle | None:
     """Return the first generator of body motion that takes `modality`, and face generators, or None."""
     bundle = Bundle(stages, stage_cache)
-    faces = [stage for stage in stages if bundle.of(stage).part == "face"]
+    faces = [stage for stage in stages if bundle.generator_of(stage).part == "face"]
     for stage in stages:
-        maker = bundle.of(stage)
+        maker = bundle.generator_of(stage)
         if maker.part != "face" and modality in maker.modalities:
             # A face generator that is not conditioned on it would have nothing to go by.
-            fitting = [face for face in faces if modality in bundle.of(face).modalities]
+            fitting = [face for face in faces if modality in bundle.generator_of(face).modalities]
             return Bundle([stage, *fitting], stage_cache)
     return None

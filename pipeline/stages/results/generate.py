@@ -19,8 +19,10 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_for, with_music
 from motionloom.pipeline.evaluation.truth import perform, spread_truths
+from motionloom.pipeline.inference.display_figure import FigureOptions
+from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.shown import FigureOptions
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.inference.writers import WRITERS, Format, default_formats
 from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
@@ -102,7 +104,8 @@ def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[list[
         return [], []
     if config.captions:
         said = config.captions
-        made = bundle.generate(said, face=said, seconds=seconds, seed=seed, sampling=sampling)
+        asked = Request.of(said, face=said, seconds=seconds, seed=seed, sampling=sampling)
+        made = generate(bundle, asked)
     else:
         truths = spread_truths(context.given["data"].held_out(prefer="test"), config.count)
         made = perform(bundle, truths, seconds=seconds, seed=seed, sampling=sampling) if truths else []

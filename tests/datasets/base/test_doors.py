@@ -29,14 +29,14 @@ from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import number, parse_json, whole
 from motionloom.datasets.convert.captions.humanml_text import parse_caption
-from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.stage import stage_kinds
+from motionloom.pipeline.editing.task import EditTask
 from motionloom.pipeline.results.paper.schema import Bounds
 from motionloom.pipeline.store.weights import exact_tensors, load_weights
 
 ROOT = Path(__file__).parents[3]
 FLOATS = ("float32", "float16", "bfloat16", "float64")
-FOLDERS = ("datasets/convert", "datasets/shards", "pipeline/serve", "pipeline/inference/edits")
+FOLDERS = ("datasets/convert", "datasets/shards", "pipeline/serve", "pipeline/inference")
 LETTERS = st.text(st.characters(exclude_categories=()), max_size=6)
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats() | LETTERS
 VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner) | st.dictionaries(LETTERS, inner), max_leaves=8)

@@ -39,7 +39,7 @@ from motionloom.datasets.motion.npz import NpzFile, map_npy
 from motionloom.datasets.shards.index import read_index
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.tar import MOST_CLIPS, scan_tar
-from motionloom.pipeline.inference.edits.clip_file import read_clip
+from motionloom.pipeline.inference.clip_file import read_clip
 
 REJECTED: dict[str, list[str] | None] = yaml.safe_load(
     Path(__file__).with_name("broken.yaml").read_text("utf-8")

@@ -11,10 +11,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from motionloom.models.diffusion.network import InBetweenConfig, InBetweener, TextDenoiser, TextDenoiserConfig
+from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig
 from motionloom.models.diffusion.sampling import sample_motions
 from motionloom.models.diffusion.schedule import Sampler, ScheduleConfig
 from motionloom.pipeline.baselines.mdm.network import Mdm
+from motionloom.pipeline.editing.inbetween.network import InBetweenConfig, InBetweener
 
 SMALL = TextDenoiserConfig(dim=32, ff=64, layers=2, heads=2, dropout=0.0)
 OURS = InBetweenConfig(dim=32, ff=64, layers=2, heads=2, dropout=0.0)

@@ -20,8 +20,10 @@ from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import dances_for, dances_of
 from motionloom.pipeline.evaluation.figures import MODEL, FigureFile
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.clip_file import read_seed_motion
+from motionloom.pipeline.inference.clip_file import read_seed_motion
+from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.store.data import Data
 
@@ -195,10 +197,12 @@ def test_an_export_dances_from_its_own_seeds_or_given_ones(
     [only] = [one for one in Bundle.open(tmp_path / "model").stages if one.name == stage]
     bundle = Bundle([only], StageCache())
     maker = bundle.generator
-    own = bundle.generate(sounds=[song(3.0)] * 2, seed=1)
+    own = generate(bundle, Request.of(sounds=[song(3.0)] * 2, seed=1))
     assert [len(motion.joints) for motion in own] == [60, 60]
     [clip] = dances_for(bundle, Data(run / "stages/data").split("test"), 1, seconds=3.0, least=8)
-    [made] = bundle.generate(sounds=[clip.sound], seconds=clip.seconds, seed_motions=[clip.motion])
+    [made] = generate(
+        bundle, Request.of(sounds=[clip.sound], seconds=clip.seconds, seed_motions=[clip.motion])
+    )
     assert made.features.shape == (len(clip.motion), len(bundle.layout.part(maker.part)))
     if stage == "fact":
         begun = maker.capabilities.seed_frames
@@ -207,9 +211,9 @@ def test_an_export_dances_from_its_own_seeds_or_given_ones(
         )
     short = clip.motion[: maker.capabilities.seed_frames - 1]
     with pytest.raises(UserError, match=f"{len(short)} frames"):
-        bundle.generate(sounds=[clip.sound], seed_motions=[short])
+        generate(bundle, Request.of(sounds=[clip.sound], seed_motions=[short]))
     with pytest.raises(UserError, match="ask for more"):
-        bundle.generate(sounds=[clip.sound], seconds=maker.capabilities.seed_frames / 20)
+        generate(bundle, Request.of(sounds=[clip.sound], seconds=maker.capabilities.seed_frames / 20))
 
 
 @pytest.mark.slow
@@ -241,7 +245,7 @@ def test_a_seed_motion_that_nothing_goes_on_from_is_refused(ude_run: Any) -> Non
     bundle = Bundle.open(ude_run.folder)
     motion = np.zeros((20, bundle.layout.dim), np.float32)
     with pytest.raises(UserError, match="seed motion"):
-        bundle.generate(["a person walks"], seed_motions=[motion])
+        generate(bundle, Request.of(["a person walks"], seed_motions=[motion]))
 
 
 @pytest.mark.slow
@@ -258,5 +262,5 @@ def test_bailando_dances_in_smpls_parameters(tmp_path: Path) -> None:
     run = run_recipe(tmp_path / "smpl.yaml", tmp_path / "run", console=Console(quiet=True))
     assert FigureFile.read(run / "stages/of_bailando/metrics.json").figures
     [only] = [one for one in Bundle.open(run).stages if one.name == "actor_critic"]
-    [made] = Bundle([only], StageCache()).generate(sounds=[song(3.0)])
+    [made] = generate(Bundle([only], StageCache()), Request.of(sounds=[song(3.0)]))
     assert made.features.shape == (60, 75) and np.isfinite(made.joints).all()

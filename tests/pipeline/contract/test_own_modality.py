@@ -68,17 +68,19 @@ import sys
 import numpy as np
 
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.inference.bundle import Bundle
 
 bundle, pulse = Bundle.open(sys.argv[1]), np.ones((40, 2), np.float32)
 assert bundle.generator.modalities == {"audio", "pulse"}
 rows = {"pulse": [pulse, None], "audio": [None, np.ones((32, 438), np.float32)]}
-driven, danced = bundle.generate(
+driven, danced = generate(bundle, Request.of(
     conditions=rows, seconds=1.6, seed=1, strict=True, sampling=SamplingConfig(guidance={"pulse": 1e4})
-)
+))
 assert len(driven.joints) == len(danced.joints) == 32
 assert driven.prompt.modalities == {"pulse"} and danced.prompt.modalities == {"audio"}
-(plain,) = bundle.generate(conditions={"pulse": [pulse]}, seconds=1.6, seed=1)
+(plain,) = generate(bundle, Request.of(conditions={"pulse": [pulse]}, seconds=1.6, seed=1))
 assert not np.array_equal(plain.joints, driven.joints), "guidance by the name of the modality"
 print("drove", sorted(bundle.generator.modalities))
 """

@@ -23,7 +23,9 @@ from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.exported import write_bundle
+from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.inference.shipped_models import model_folder
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
@@ -99,16 +101,16 @@ def test_the_text_encoder_is_never_outside(name: str, model: Path) -> None:
     (model / "a/b").mkdir(parents=True)
     change(model / "text/text.json", lambda facts: facts.update(encoder=name))
     with pytest.raises(UserError, match=r"text\.json.*minilm"):
-        Bundle.open(model).generate(["a person waves"], seconds=1.0)
+        MotionModel(model).generate(["a person waves"], seconds=1.0)
 
 
 def test_the_encoder_of_the_config_is_not_followed(model: Path) -> None:
     """What a text stage was configured with is a place on another machine."""
     change(model / "text/artifact.json", lambda facts: facts["config"].update(encoder="/etc"))
-    assert Bundle.open(model).generate(["a person waves"], seconds=1.0)
+    assert MotionModel(model).generate(["a person waves"], seconds=1.0)
     (model / "text/text.json").unlink()
     with pytest.raises(UserError, match=r"text.json: is gone"):
-        Bundle.open(model).generate(["a person waves"], seconds=1.0)
+        MotionModel(model).generate(["a person waves"], seconds=1.0)
 
 
 @pytest.mark.parametrize("name", ["../gpt", "/etc", "..", ".", "", "gtp", "a/b"])
@@ -225,7 +227,7 @@ def test_an_export_draws_as_it_recommends(small_run: Any, call: Any, tmp_path: P
     assert mixed.model_dump(exclude_unset=True) == {"cfg_scale": 2.0, "temperature": 0.0, "top_p": 0.8}
     words = {"captions": ["a person waves"], "seconds": 1.0, "seed": 4}
     plain = Bundle.open(small_run.folder)
-    (wanted,) = plain.generate(**words, sampling=SamplingConfig(cfg_scale=1.5, temperature=0.0))
+    (wanted,) = generate(plain, Request.of(**words, sampling=SamplingConfig(cfg_scale=1.5, temperature=0.0)))
     (made,) = model.generate(**words)
     np.testing.assert_array_equal(made.joints, wanted.joints)
 
@@ -258,7 +260,7 @@ def train(folder: Path, encoder: str) -> Path:
 
 
 def motions(folder: Path) -> list[np.ndarray]:
-    return [motion.joints for motion in Bundle.open(folder).generate(CAPTIONS, seconds=1.0, seed=3)]
+    return [motion.joints for motion in MotionModel(folder).generate(CAPTIONS, seconds=1.0, seed=3)]
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from second_device import second_device
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.launch.hardware import Hardware, choose_device
 
 CAPTIONS = ["a person waves with the left hand", "a person walks"]
@@ -35,11 +35,11 @@ def test_motions_are_made_where_the_networks_lie(face: str, small_run: Any) -> N
     kind, _, sampler = face.partition(" ")
     asked = {"face_model": kind, "cfg_scale": 1.5, "denoising_steps": 3, "sampler": sampler or "ddpm"}
     sampling = SamplingConfig.parse(asked, "sampling")
-    near = Bundle.open(small_run.folder)
+    near = MotionModel(small_run.folder)
     with second_device() as device:
-        far = Bundle.open(small_run.folder, device)
-        given = far.stage_cache.given(far.main.inputs)
-        assert far.device == given["tma"].device == device
+        far = MotionModel(small_run.folder, device)
+        given = far.bundle.stage_cache.given(far.bundle.main.inputs)
+        assert far.bundle.device == given["tma"].device == device
         made = far.generate(CAPTIONS, seconds=2.0, seed=3, sampling=sampling)
     assert {str(weight.device) for weight in given["text"].encoder._weights.values()} == {str(device)}
     for ours, theirs in zip(

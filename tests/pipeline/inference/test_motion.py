@@ -30,9 +30,9 @@ from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.checks import STANDS, standing
+from motionloom.pipeline.inference.display_figure import FAR_MM, FigureOptions, shown
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import write_motions
-from motionloom.pipeline.inference.shown import FAR_MM, FigureOptions, shown
 from motionloom.pipeline.inference.writers import WRITERS, default_formats
 from motionloom.pipeline.serve.requests import MotionRequest
 from motionloom.pipeline.stages.results.generate import GenerateConfig
@@ -209,7 +209,7 @@ def test_new_motions_take_the_place_of_old_ones(
         path.write_text("half")
         raise OSError(errno.ENOSPC, "full", str(path))
 
-    monkeypatch.setitem(WRITERS, "html", replace(WRITERS["html"], write=full))
+    monkeypatch.setitem(WRITERS._things, "html", replace(WRITERS["html"], write=full))
     with pytest.raises(OSError, match=re.escape(str(out / "index.html"))):
         write_motions(out, motions, ["npz", "html"], title="t", names=names)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before

@@ -26,10 +26,12 @@ from motionloom.pipeline.contract.generation import Capabilities, GenerationRequ
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage, StageCache
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import encode, generate
 from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
 from motionloom.pipeline.inference.generators.gpt import GptGenerator, candidate_seeds, repeated
 from motionloom.pipeline.inference.generators.ude import UdeGenerator
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.stages.networks.tma import VaeMotion
@@ -51,9 +53,9 @@ def opinionated(gpt: InterleavedGPT) -> InterleavedGPT:
     return gpt
 
 
-def bundle(
+def untrained(
     *, fps: float = 20.0, faces: tuple[str, ...] = (), config: GptConfig = GPT, face: Any = None
-) -> Bundle:
+) -> MotionModel:
     """An untrained model; `face` is the config of its face generators' networks."""
     torch.manual_seed(0)
     layout = MotionLayout.named("wholebody363", fps=fps)
@@ -77,7 +79,9 @@ def bundle(
         made.append(DiffusionMotion(layout, "face", given, denoiser.eval().requires_grad_(False)))
     if "vae" in faces:
         made.append(VaeMotion(layout, "face", given, SimpleNamespace()))  # type: ignore[arg-type]
-    return Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], StageCache())
+    model = object.__new__(MotionModel)
+    model.bundle = Bundle([stage(f"stage{k}", one) for k, one in enumerate(made)], StageCache())
+    return model
 
 
 def stage(name: str, made: Any, **given: Any) -> CompletedStage:
@@ -87,10 +91,10 @@ def stage(name: str, made: Any, **given: Any) -> CompletedStage:
 
 
 def test_a_length_for_each_caption() -> None:
-    model = bundle()
-    made = model.generate(CAPTIONS, seconds=[0.4, 1.0, 0.2], seed=1, batch=2)
+    model = untrained()
+    made = generate(model.bundle, Request.of(CAPTIONS, seconds=[0.4, 1.0, 0.2], seed=1), 2)
     assert [len(motion.joints) for motion in made] == [8, 20, 4]
-    (note,) = model.notes([motion.prompt for motion in made], made, seconds=[0.35, 1.0, 0.2])
+    (note,) = model.notes(Request.of(CAPTIONS, seconds=[0.35, 1.0, 0.2]), made)
     assert isinstance(note, str) and note.startswith("0.35 s were asked for and 0.4 s")
     for row, motion in enumerate(model.generate(CAPTIONS, seconds=1.0, seed=1)):
         assert len(motion.joints) == 20
@@ -102,7 +106,7 @@ def test_a_length_for_each_caption() -> None:
 
 @pytest.mark.parametrize(("fps", "least"), [(20.0, "0.2"), (30.0, "0.13")])
 def test_lengths_out_of_reach_are_refused_with_the_true_range(fps: float, least: str) -> None:
-    model = bundle(fps=fps)
+    model = untrained(fps=fps)
     for seconds in (99.0, -1.0, float("nan"), float("inf"), [1.0, 1.0, 99.0]):
         with pytest.raises(UserError, match=f"this model makes {least} to {model.max_seconds:.1f} s"):
             model.generate(CAPTIONS, seconds=seconds)
@@ -110,7 +114,7 @@ def test_lengths_out_of_reach_are_refused_with_the_true_range(fps: float, least:
 
 
 def test_body_and_face_are_those_of_each_motion_alone() -> None:
-    model, before = bundle(faces=("gpt",)), torch.get_rng_state()
+    model, before = untrained(faces=("gpt",)), torch.get_rng_state()
     first, *_ = model.generate(CAPTIONS, seconds=1.0, seed=3)
     (alone,) = model.generate(CAPTIONS[:1], seconds=1.0, seed=3)
     np.testing.assert_allclose(alone.features, first.features, atol=1e-5)
@@ -119,7 +123,7 @@ def test_body_and_face_are_those_of_each_motion_alone() -> None:
 
 
 def test_temperature_zero_is_greedy() -> None:
-    model, greedy = bundle(faces=("gpt",)), SamplingConfig(temperature=0)
+    model, greedy = untrained(faces=("gpt",)), SamplingConfig(temperature=0)
     first, second = (model.generate(CAPTIONS, seconds=1.0, seed=s, sampling=greedy) for s in (1, 2))
     drawn = model.generate(CAPTIONS, seconds=1.0, seed=2)
     for one, other, free in zip(first, second, drawn, strict=True):
@@ -134,11 +138,11 @@ def test_temperature_zero_is_greedy() -> None:
 
 @pytest.mark.parametrize("kind", ["gpt", "diffusion"])
 def test_the_face_has_its_own_guidance(kind: str) -> None:
-    model = bundle(faces=(kind,))
+    model = untrained(faces=(kind,))
 
     def made(**options: float) -> Any:
         sampling = SamplingConfig(denoising_steps=4, **options)
-        return model.generate(CAPTIONS[:1], seconds=1.0, seed=3, sampling=sampling)[0]
+        return generate(model.bundle, Request.of(CAPTIONS[:1], seconds=1.0, seed=3, sampling=sampling))[0]
 
     plain, both = made(), made(cfg_scale=4.0)
     body, face = made(cfg_scale=4.0, face_cfg_scale=1.0), made(face_cfg_scale=4.0)
@@ -152,16 +156,16 @@ def test_the_face_has_its_own_guidance(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["gpt", "diffusion"])
 def test_guidance_of_a_face_that_never_trained_without_text_is_refused(kind: str) -> None:
     config: Any = GPT if kind == "gpt" else DENOISER
-    model = bundle(faces=(kind,), face=config.model_copy(update={"condition_dropout": 0.0}))
+    model = untrained(faces=(kind,), face=config.model_copy(update={"condition_dropout": 0.0}))
     with pytest.raises(UserError, match=r"condition_dropout > 0.*face_cfg_scale"):
         model.generate(CAPTIONS, seconds=1.0, sampling=SamplingConfig(cfg_scale=2.0))
     fine = SamplingConfig(cfg_scale=2.0, face_cfg_scale=1.0, denoising_steps=2)
-    assert len(model.generate(CAPTIONS, seconds=1.0, sampling=fine)) == 3
+    assert len(generate(model.bundle, Request.of(CAPTIONS, seconds=1.0, sampling=fine))) == 3
 
 
 @pytest.mark.parametrize("sampler", ["ddpm", "ddim", "dpm++"])
 def test_more_steps_than_were_trained_are_refused(sampler: Any) -> None:
-    model = bundle(faces=("diffusion",))
+    model = untrained(faces=("diffusion",))
     asked = SamplingConfig(sampler=sampler, denoising_steps=2000)
     with pytest.raises(UserError, match="2000 denoising steps"):
         model.generate(CAPTIONS[:1], seconds=0.2, sampling=asked)
@@ -175,7 +179,6 @@ WRONG_ASKS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
     "one face text": ((), {"face": "abc"}, r"face is one text; .*\['abc'\]"),
     "no text": ((), {"captions": ["a", 3, "b"]}, r"captions\[1\] = 3: not a text"),
     "empty": ((), {"captions": ["a", " ", "b"]}, r"captions\[1\] is empty"),
-    "empty, not strict": ((), {"captions": [""], "strict": False}, r"captions\[0\] is empty"),
     "nothing": ((), {"captions": None}, "nothing to generate from: give captions, sounds or both"),
     "negative seed": ((), {"seed": -1}, "seed -1: a seed is a whole number"),
     "broken seed": ((), {"seed": 0.5}, "seed 0.5: a seed is a whole number"),
@@ -199,18 +202,18 @@ WRONG_ASKS: dict[str, tuple[tuple[str, ...], dict[str, Any], str]] = {
 @pytest.mark.parametrize("name", WRONG_ASKS)
 def test_what_has_no_sense_or_no_effect_is_refused(name: str) -> None:
     faces, given, says = WRONG_ASKS[name]
-    asked = {"captions": CAPTIONS, "seconds": 0.2, "strict": True, **given}
+    asked = {"captions": CAPTIONS, "seconds": 0.2, **given}
     with pytest.raises(UserError, match=says):
         asked["sampling"] = SamplingConfig.of(given.get("sampling"))
-        bundle(faces=faces).generate(**asked)
+        untrained(faces=faces).generate(**asked)
 
 
 def test_a_face_is_chosen_by_its_method_or_its_stage() -> None:
-    model = bundle(faces=("gpt", "diffusion"))
-    assert model.choose_face(None) == model.choose_face("gpt") == model.choose_face("stage1")
-    assert model.choose_face("diffusion") == model.choose_face("stage2") == model.stages[2]
+    bundle = untrained(faces=("gpt", "diffusion")).bundle
+    assert bundle.choose_face(None) is bundle.choose_face("gpt") is bundle.choose_face("stage1")
+    assert bundle.choose_face("diffusion") is bundle.choose_face("stage2") is bundle.stages[2]
     with pytest.raises(UserError, match=r"'vae' here; .*gpt, diffusion"):
-        model.choose_face("vae")
+        bundle.choose_face("vae")
 
 
 def test_the_commands_settings_reach_the_sampling(
@@ -218,17 +221,15 @@ def test_the_commands_settings_reach_the_sampling(
 ) -> None:
     seen: dict[str, Any] = {}
     watching = SimpleNamespace(
-        generate=lambda captions, **options: seen.update(options) or [],
-        generator=SimpleNamespace(capabilities=Capabilities()),
+        make=lambda request: seen.update(sampling=request.sampling) or [],
         notes=lambda *_: [],
-        terms=Terms(),
+        bundle=SimpleNamespace(generator=SimpleNamespace(capabilities=Capabilities()), terms=Terms()),
     )
-    monkeypatch.setattr("motionloom.pipeline.inference.bundle.Bundle.open", lambda *_: watching)
+    monkeypatch.setattr("motionloom.pipeline.inference.model.MotionModel", lambda *_: watching)
     asked = {"sampler": "dpm++", "denoising_steps": 7, "cfg_scale": 3.0, "temperature": 0.0}
     words = [word for name, value in asked.items() for word in ("--set", f"{name}={value}")]
     words += ["--set", "guidance.audio=1.2"]
     assert call("generate", tmp_path, "a person walks", *words, "-o", tmp_path, "-f", "npz").code == 0
-    assert seen["strict"]
     assert seen["sampling"].model_dump(exclude_unset=True) == {**asked, "guidance": {"audio": 1.2}}
     for wrong in ("sampler=euler", "smapler=ddim", "top_p"):
         made = call("generate", "somewhere", "a person walks", "--set", wrong)
@@ -245,11 +246,11 @@ def test_the_stages_own_sampler_runs_unless_another_is_set() -> None:
 
 
 def test_a_protocol_names_the_settings_that_were_in_effect() -> None:
-    model = bundle(faces=("gpt", "diffusion"))
-    model.recommended = SamplingConfig(top_p=0.8, cfg_scale=2.0)
+    model = untrained(faces=("gpt", "diffusion"))
+    model.bundle.recommended = SamplingConfig(top_p=0.8, cfg_scale=2.0)
     tokens = {"temperature": 0.5, "top_k": 0, "top_p": 0.8, "cfg_scale": 2.0}
-    assert model.in_effect(SamplingConfig(temperature=0.5)) == tokens
-    assert model.in_effect(SamplingConfig(temperature=0.5, face_model="diffusion")) == {
+    assert model.bundle.in_effect(SamplingConfig(temperature=0.5)) == tokens
+    assert model.bundle.in_effect(SamplingConfig(temperature=0.5, face_model="diffusion")) == {
         **tokens, "face_sampler": "ddpm", "face_denoising_steps": 50,
     }  # fmt: skip
 
@@ -287,7 +288,7 @@ def test_kept_is_the_single_draw_of_the_greatest_cosine(model: MotionModel) -> N
 
     def conditions_of(rows: list[int]) -> Any:
         some = [prompts[row] for row in rows]
-        return bundle.encode(bundle.main, some, [prompt.text for prompt in some])
+        return encode(bundle, bundle.main, some, [prompt.text for prompt in some])
 
     def made(rows: list[int], frames: int | None, seeds: list[int], candidates: int) -> list[Any]:
         lengths = None if frames is None else [frames] * len(rows)
@@ -312,9 +313,9 @@ def same(one: np.ndarray, other: np.ndarray) -> bool:
 
 def test_a_model_without_such_a_tma_refuses(model: MotionModel, tmp_path: Path) -> None:
     sampling = SamplingConfig(candidates=2)
-    model.bundle.require_used(None, sampling)
+    model.bundle.require_used(sampling)
     faces = next(iter(model.bundle.faces.values()))
-    assert "candidates" not in model.bundle.of(faces).settings, "TMA reads no faces"
+    assert "candidates" not in model.bundle.generator_of(faces).settings, "TMA reads no faces"
     sentence = replace(model.bundle.generator, gpt=replace(model.bundle.generator.gpt, prior="sentence"))  # type: ignore[type-var,attr-defined]
     assert "candidates" not in sentence.settings
 

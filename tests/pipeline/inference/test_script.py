@@ -21,9 +21,9 @@ import soundfile
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.display_figure import shown
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import DrivenSegment, Script, sound_of
-from motionloom.pipeline.inference.shown import shown
 from motionloom.pipeline.store.yaml import read_yaml
 
 Write = Callable[..., Path]

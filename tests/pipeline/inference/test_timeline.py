@@ -25,8 +25,9 @@ from motionloom.models.utt.network import ConditionedUtt, UttConfig
 from motionloom.models.utt.sampling import draw_z, generate
 from motionloom.pipeline.contract.generation import Prompt, Stretch
 from motionloom.pipeline.contract.sampling import SamplingConfig
+from motionloom.pipeline.inference.generation import encode_prompts
 from motionloom.pipeline.inference.generators.timeline import TokenTimeline
-from motionloom.pipeline.inference.requests import encode_prompts, prompts_of
+from motionloom.pipeline.inference.request import Request
 
 PATTERN = ("body", "body", "hand")
 STREAMS = (Stream("body", 7, 2), Stream("hand", 5, 1))
@@ -264,9 +265,9 @@ def test_pieces_are_heard_once(song: Sound, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.slow
 def test_known_features_are_taken_as_they_are(song: Sound) -> None:
     rows = np.random.default_rng(0).normal(size=(30, 438)).astype(np.float32)
-    prompts = prompts_of(None, None, [song, song], {"audio": [rows, None]})
+    prompts = Request.of(sounds=[song, song], conditions={"audio": [rows, None]}).prompts
     found = encode_prompts(DANCER, prompts, ["", ""], FPS, torch.device("cpu"))
     assert found["audio"].mask.sum(1).tolist() == [30, round(song.seconds * FPS)]
     assert np.array_equal(found["audio"].features[0, :30].numpy(), rows)
     with pytest.raises(UserError, match="2 sounds but 1 audio"):
-        prompts_of(None, None, [song, song], {"audio": [rows]})
+        Request.of(sounds=[song, song], conditions={"audio": [rows]})

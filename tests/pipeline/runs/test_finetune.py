@@ -19,6 +19,7 @@ from safetensors.torch import load_file
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.lookup import BundleFile
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.runs.api import export_run, run_recipe
 from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
@@ -152,11 +153,11 @@ def test_a_run_is_gone_on_from_and_exported_with_the_stages_of_the_other(
     assert before.keys() == after.keys()
     for name, weights in before.items():  # one step of 1e-9
         torch.testing.assert_close(after[name], weights, rtol=0, atol=1e-7)
-    made = Bundle.open(run).generate(["a person waves"], seconds=2.0, seed=1)[0]
+    made = MotionModel(run).generate(["a person waves"], seconds=2.0, seed=1)[0]
     export_run(run, tmp_path / "exported", console=QUIET)
     assert {"tokenizer", "text", "tma"} <= {path.parent.name for path in tmp_path.glob("exported/*/*.json")}
     other.rename(tmp_path / "away")
-    again = Bundle.open(tmp_path / "exported").generate(["a person waves"], seconds=2.0, seed=1)[0]
+    again = MotionModel(tmp_path / "exported").generate(["a person waves"], seconds=2.0, seed=1)[0]
     np.testing.assert_array_equal(again.features, made.features)
     with pytest.raises(UserError, match=f"stage 'gpt' was made from {other}/stages/tma, where no"):
         Bundle.open(run)
@@ -175,7 +176,7 @@ def test_it_trains_every_weight_and_exports_the_models_face(mine: Mine, tmp_path
     export_run(trained, tmp_path / "out", console=QUIET)
     facts = BundleFile.load_json(tmp_path / "out/bundle.json")
     assert facts.generators == ("gpt", "face_gpt", "face_vae", "face_diffusion")
-    made = Bundle.open(tmp_path / "out").generate(["somebody sways"], seconds=2.0, seed=1)[0]
-    again = Bundle.open(trained).generate(["somebody sways"], seconds=2.0, seed=1)[0]
+    made = MotionModel(tmp_path / "out").generate(["somebody sways"], seconds=2.0, seed=1)[0]
+    again = MotionModel(trained).generate(["somebody sways"], seconds=2.0, seed=1)[0]
     np.testing.assert_array_equal(made.features, again.features)
     assert made.joints.shape == (40, 52, 3) and made.face is not None

@@ -7,7 +7,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -15,13 +15,12 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.pipeline.contract.editing import EditTask
-from motionloom.pipeline.contract.generation import Capabilities, Prompt
+from motionloom.pipeline.contract.generation import Capabilities
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.serve.app import Site
 from motionloom.pipeline.serve.requests import ServeConfig
 from motionloom.pipeline.serve.server import listen, server_of
@@ -44,7 +43,7 @@ class QuickGenerator:
 
     @property
     def capabilities(self) -> Capabilities:
-        return Capabilities(edit=self.edit)
+        return Capabilities(more={"edit": self.edit})
 
     def edit(self, frames: Any, words: Any, seeds: Any, sampling: Any) -> list[Any]:
         return [frames.features[:, LAYOUT.part("bodyhand")] for _ in seeds]
@@ -62,18 +61,24 @@ class QuickModel:
         self.open.set()
         self.asked: list[str] = []
         self.sampling: list[SamplingConfig] = []
-        self.edited: list[EditTask] = []
+        self.edited: list[Any] = []
         generator = QuickGenerator()
         self.bundle = SimpleNamespace(
             layout=LAYOUT, faces={"gpt": None}, generator=generator, main="body",
             recommended=SamplingConfig(cfg_scale=1.25, top_p=0.9), stages=(),
             terms=Terms(credits=("Motion of nobody.",)),
-            generate=self.generate, notes=self.notes, of=lambda stage: generator, encode=lambda *_: {},
+            generator_of=lambda stage: SimpleNamespace(modalities=()), device="cpu", notes=lambda *_: [],
             choose_face=lambda name: None, drawing=lambda sampling: sampling,
         )  # fmt: skip
 
-    def edit(self, clip: GeneratedMotion, task: EditTask, *, seed: int = 0) -> list[EditedMotion]:
-        """As a `MotionModel` does it."""
+    def ability(self, name: str) -> Any:
+        """As of a `MotionModel`."""
+        return MotionModel.ability(self, name)  # type: ignore[arg-type]
+
+    def threads(self, motions: int) -> Any:
+        return nullcontext()
+
+    def edit(self, clip: GeneratedMotion, task: Any, *, seed: int = 0) -> list[Any]:
         self.edited.append(task)
         assert self.open.wait(20)
         return MotionModel.edit(self, clip, task, seed=seed)  # type: ignore[arg-type]
@@ -81,35 +86,24 @@ class QuickModel:
     def examples(self) -> list[str]:
         return ["a person stretches"]
 
-    def notes(self, prompts: Sequence[Prompt], *_: object, **__: object) -> list[Any]:
+    def notes(self, request: Request, motions: Sequence[GeneratedMotion]) -> list[Any]:
         """All that is said of a violin, and remarks on sounds."""
         known = ("a person <b>claps</b>", "a person stretches")
-        words = [text for prompt in prompts for text in (prompt.text, prompt.face_text)]
+        words = [text for prompt in request.prompts for text in (prompt.text, prompt.face_text)]
         unknown = [Unknown(text, known) for text in words if "violin" in text]
-        return [*unknown, *(prompt.remark for prompt in prompts if prompt.remark)]
+        return [*unknown, *(prompt.remark for prompt in request.prompts if prompt.remark)]
 
-    def generate(
-        self,
-        captions: Sequence[str] | None = None,
-        *,
-        face: Sequence[str] | None = None,
-        sounds: Sequence[Sound] | None = None,
-        seconds: float | None = None,
-        seed: int = 0,
-        sampling: Any = None,
-        strict: bool = False,
-    ) -> list[GeneratedMotion]:
-        caption = (captions or [""])[0]
-        self.asked.append(caption)
-        self.sampling.append(sampling)
-        if caption == "break":
+    def make(self, request: Request) -> list[GeneratedMotion]:
+        [prompt], [seconds] = request.prompts, request.lengths
+        self.asked.append(prompt.text)
+        self.sampling.append(request.sampling)
+        if prompt.text == "break":
             raise ZeroDivisionError
         assert self.open.wait(20)
         joints = self.walk(round((seconds or 2.0) * LAYOUT.fps))
-        joints[..., 0] += seed / 1000 - joints[:1, :1, 0]
-        prompt = Prompt(caption, (face or [""])[0], (sounds or [None])[0])
+        joints[..., 0] += request.seed / 1000 - joints[:1, :1, 0]
         features = np.zeros((len(joints), 313), np.float32)
-        return [GeneratedMotion(prompt, features, joints, None, LAYOUT, seed=seed)]
+        return [GeneratedMotion(prompt, features, joints, None, LAYOUT, seed=request.seed)]
 
 
 @dataclass(frozen=True)

@@ -44,8 +44,8 @@ from motionloom.pipeline.evaluation.figures import (
 )
 from motionloom.pipeline.evaluation.movement import all_features, distances, movement_figures
 from motionloom.pipeline.evaluation.reference_baselines import mean_poses, nearest_dances, random_dances
-from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.ude import UdeGenerator
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.runs.api import evaluate_run, run_recipe
 
 FPS = 20.0
@@ -268,8 +268,8 @@ def test_the_same_tokens_are_decoded_with_other_noise(
     """`decodings`: tokens are drawn once, the diffusion decoder's noise changes."""
     codes, decode = [], UdeGenerator.decode
     monkeypatch.setattr(UdeGenerator, "decode", lambda *given: codes.append(given[1]) or decode(*given))
-    bundle = Bundle.open(run[0])
-    made = [bundle.generate(["a walk"], seconds=2.0, seed=3, noise_seed=noise) for noise in (1, 2, 1)]
+    model = MotionModel(run[0])
+    made = [model.generate(["a walk"], seconds=2.0, seed=3, noise_seed=noise) for noise in (1, 2, 1)]
     motions = [one[0].joints for one in made]
     assert len({id(code) for code in codes}) == 1
     np.testing.assert_array_equal(motions[0], motions[2])

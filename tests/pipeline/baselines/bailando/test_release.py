@@ -21,6 +21,8 @@ from motionloom.pipeline.baselines.bailando.network import ActorCritic, CrossGpt
 from motionloom.pipeline.baselines.bailando.release import release_of_codes, release_of_gpt
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.runs.api import run_recipe
 
 Weights = dict[str, Tensor]
@@ -252,6 +254,6 @@ def test_a_release_is_evaluated_and_dances_to_a_song(
     [only] = [one for one in Bundle.open(tmp_path / "model").stages if one.name == "actor_critic"]
     beats = (np.arange(8000 * 4) % 4000) < 800
     song = Sound((0.2 * beats * np.random.default_rng(0).normal(size=len(beats))).clip(-1, 1), 8000)
-    made = Bundle([only], StageCache()).generate(sounds=[song], seconds=3.0, seed=1)
+    made = generate(Bundle([only], StageCache()), Request.of(sounds=[song], seconds=3.0, seed=1))
     assert made[0].joints.shape == (60, 22 + FINGERS, 3) and np.isfinite(made[0].joints).all()
     assert [key[3] for key in song.analysed] == [7.5]

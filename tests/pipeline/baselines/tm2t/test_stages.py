@@ -21,7 +21,9 @@ from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.pipeline.evaluation.figures import COMMON_CAPTION, MODEL, NEAREST, OWN_CAPTION, FigureFile
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.captioning import CaptionedClip, captions
+from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.dry_run import estimate
 from motionloom.pipeline.runs.plan import Selection
@@ -141,7 +143,9 @@ def test_text_to_motion_is_trained_exported_and_asked(
         shutil.rmtree(trained / "stages" / stage)
     call("export", trained, "--out", tmp_path / "model")
     made = [
-        Bundle.open(place).generate(["a person waves", "a person walks"], seconds=seconds, seed=3)
+        generate(
+            Bundle.open(place), Request.of(["a person waves", "a person walks"], seconds=seconds, seed=3)
+        )
         for place in (trained, tmp_path / "model")
         for seconds in (None, 1.5)
     ]
@@ -165,7 +169,7 @@ def test_an_uncaptioned_folder_becomes_a_data_set(
     """BVH and npz in a folder of folders, with files that are none: captioned, and converted with that."""
     takes = tmp_path / "takes"
     (takes / "walks").mkdir(parents=True)
-    for number, motion in enumerate(Bundle.open(trained).generate(["a person walks"] * 3, seconds=2.0)):
+    for number, motion in enumerate(MotionModel(trained).generate(["a person walks"] * 3, seconds=2.0)):
         motion.save(takes / "walks" / f"w{number}.bvh")
     motion.save(takes / "last.npz")
     bare = fit_rigid(motion.joints[:, :22], Skeleton.named("smpl22"))
@@ -213,7 +217,7 @@ def test_an_export_that_only_captions(trained: Path, tmp_path: Path, call: Calla
     folders = {path.name for path in (tmp_path / "model").iterdir() if path.is_dir()}
     assert folders == {"captioner", "tokenizer", "stats"}
     with pytest.raises(UserError, match=r"stage .*body motion"):
-        bundle.generate(["a person walks"])
+        generate(bundle, Request.of(["a person walks"]))
 
 
 def test_a_model_without_one_says_so(small_run: Any) -> None:

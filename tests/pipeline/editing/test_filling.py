@@ -12,11 +12,11 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.conditions import Condition
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import LOWER, PIECES, MotionLayout
-from motionloom.models.diffusion.editing import Filling, KnownMotion
-from motionloom.models.diffusion.module import InBetweenModule
-from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
-from motionloom.models.diffusion.observed import Observations, Places, Recovery, known_columns
 from motionloom.models.training.stage_module import OptimConfig
+from motionloom.pipeline.editing.inbetween.filling import Filling, KnownMotion
+from motionloom.pipeline.editing.inbetween.module import InBetweenModule
+from motionloom.pipeline.editing.inbetween.network import InBetweenConfig, InBetweener
+from motionloom.pipeline.editing.inbetween.observed import Observations, Places, Recovery, known_columns
 
 LAYOUT = MotionLayout.named("body133")
 COLUMNS = LAYOUT.part("all")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from codecs import BOM_UTF8
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,22 +21,42 @@ from motionloom.datasets.motion.bvh.joint_map import metres
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.bvh.text import load_text
-from motionloom.datasets.motion.canonical import facing, ground, mirror, resample
 from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline.contract.editing import EditTask
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
 
 ENDINGS = (".bvh", ".npz", ".glb")
-_BLEND = 0.5
-"""Seconds in which a clip that comes again passes into its beginning [ours]."""
 _FIGURE = ("rotations", "offsets", "root")
 _SAME_MM = 0.1
 """Millimetres within which an npz's joints are those of its figure: both are rounded to float32."""
 Floats = NDArray[np.float64]
 LEAST_FRAMES = 4
 """Fewer have no motion in them."""
+
+
+@dataclass(frozen=True)
+class RecordedClip:
+    """A clip as it was recorded or made."""
+
+    name: str
+    joints: NDArray[np.float64]
+    """Metres, Y up: [T, 22, 3], or [T, 52, 3] where it has hands."""
+    fps: float
+    face: NDArray[np.float32] | None = None
+    """Expression [T, 50]."""
+    caption: str = ""
+    bvh: OwnBvh | None = None
+    """The file, where it is a BVH."""
+    figure: RigidMotion | None = None
+    """The figure whose joints these are, where a file of ours holds it."""
+
+    @property
+    def has_hands(self) -> bool:
+        return int(self.joints.shape[1]) > BODY_JOINTS
+
+    @property
+    def seconds(self) -> float:
+        return len(self.joints) / self.fps
 
 
 def read_clip(path: Path) -> RecordedClip:
@@ -67,26 +87,6 @@ def require_clip(clip: RecordedClip) -> RecordedClip:
     except UserError as error:
         raise UserError(f"{clip.name}: {error}") from None
     return clip
-
-
-def changed(clip: RecordedClip, task: EditTask) -> RecordedClip:
-    """The clip mirrored, at another speed and several times in a row, as a task says."""
-    joints, face, pace = clip.joints, clip.face, clip.fps * task.speed
-    if task.mirror:
-        joints = mirror(joints, Skeleton.named("smplx52" if clip.has_hands else "smpl22"))
-    joints = once = resample(joints, pace, clip.fps)
-    blend = np.clip(np.arange(len(once)) / (_BLEND * clip.fps), 0, 1)[:, None, None]
-    for _ in range(task.repeat - 1):
-        turn = facing(joints[-1:])[0] - facing(once[:1])[0]
-        plane = (ground(once) - ground(once[0, 0])) * np.exp(1j * turn) + ground(joints[-1, 0])
-        following = np.stack([plane.imag, once[..., 1], plane.real], axis=-1)
-        # The pose in which the clip ended gives way to the one in which it begins.
-        following += (joints[-1] - following[0]) * (1 - blend * blend * (3 - 2 * blend))
-        joints = np.concatenate([joints, following[1:]])
-    if face is not None:
-        face = resample(face, pace, clip.fps)
-        face = np.concatenate([face, *[face[1:]] * (task.repeat - 1)])
-    return replace(clip, joints=joints, face=face, figure=None)
 
 
 def read_seed_motion(path: Path, layout: MotionLayout) -> NDArray[np.float32]:

@@ -12,6 +12,7 @@ from motionloom.datasets.motion.bvh.joint_map import JointMap
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline.editing.own_file import with_made
 
 BODY = Skeleton.named("smpl22")
 FRAMES, FPS = 151, 60
@@ -57,7 +58,7 @@ def test_kept_rows_stay_text_and_made_rows_pose_the_joints(seed: int, up: str, a
     joints = own.joint_map.apply(other, unit=own.unit, up=own.up)[added::3]
     kept = np.ones((len(joints), 22), dtype=bool)
     kept[17:32] = False
-    made = own.edited(joints, 20.0, 0, kept, None)
+    made = with_made(own, joints, 20.0, 0, kept, None)
     before, after = (one.data.partition(b"MOTION") for one in (own, made))
     assert before[0] == after[0] and before[2].split(b"\n")[:3] == after[2].split(b"\n")[:3]
     same = [a == b for a, b in zip(*(part[2].split(b"\n")[3:] for part in (before, after)), strict=True)]
@@ -71,10 +72,11 @@ def test_kept_rows_stay_text_and_made_rows_pose_the_joints(seed: int, up: str, a
     assert np.abs(steps[-1] - 360 * np.round(steps[-1] / 360)).max() < 30, "a turn or none"
     # Kept legs keep their numbers in every row, where they are the file's.
     legs = kept | np.isin(np.arange(22), [0, 1, 2, 4, 5, 7, 8, 10, 11])
-    legs_made = own.edited(joints, 20.0, 0, legs, None).motion
+    legs_made = with_made(own, joints, 20.0, 0, legs, None).motion
     hips = [0, legs_made.joints.index("left_hip")]
     np.testing.assert_array_equal(legs_made.local_rotations(hips), own.motion.local_rotations(hips))
-    longer = own.edited(np.concatenate([joints, joints[-1:]]), 20.0, 0, np.vstack([kept, kept[17:18]]), 3.0)
+    more, kept_more = np.concatenate([joints, joints[-1:]]), np.vstack([kept, kept[17:18]])
+    longer = with_made(own, more, 20.0, 0, kept_more, 3.0)
     assert longer.motion.frames == added + 180
     with pytest.raises(UserError, match="no frame is kept"):
-        own.edited(joints, 20.0, 0, ~kept & False, None)
+        with_made(own, joints, 20.0, 0, ~kept & False, None)

@@ -1,35 +1,124 @@
-"""Check a user's request to a model, and encode it as networks take it."""
+"""`Request`: what is asked of a model, checked in one place.
+
+`Request.of` refuses what no model could take; the functions below refuse what one model cannot.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from numbers import Integral
-from typing import TYPE_CHECKING, SupportsFloat
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, SupportsFloat
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.conditions import Condition, Conditions
-from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.contract.stage import CompletedStage
-from motionloom.pipeline.store.weights import MODEL_FILES
+from motionloom.pipeline.inference.script import DrivenSegment, Script
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
 
+Columns = NDArray[np.float32]
+"""A layout's columns of a motion [T, D]."""
 
 _BEYOND = 0.5
 """Seconds that a motion may be longer than its music."""
 
 _OPTIONS = ("candidates", "face_cfg_scale", "guidance", "sampler", "denoising_steps")
 """Settings that only some generators take."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """Motions that are asked of a model, one a prompt; or one motion along the segments of a script, several
+    times.
+    """
+
+    prompts: tuple[Prompt, ...]
+    lengths: tuple[float | None, ...]
+    """Seconds of each; None where what its prompt brings, such as music, or else the model decides. A
+    script's segments have their own."""
+    seed: int = 0
+    """Equal requests give equal motions; the draws of one go by its place."""
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    """What is not set is as the model recommends."""
+    noise_seed: int | None = None
+    """Decodes the same tokens with other noise, where a diffusion model decodes."""
+    seed_motions: tuple[Path | Columns, ...] = ()
+    """Clips, or the layout's columns of motions, that a model with `seed_frames` goes on from: one for each
+    motion or one for all."""
+    segments: tuple[DrivenSegment, ...] = ()
+    """Those of a script, whose prompts these are."""
+    samples: int = 1
+    """Motions of a script."""
+
+    @classmethod
+    def of(
+        cls,
+        captions: Iterable[str] | None = None,
+        *,
+        face: Iterable[str] | None = None,
+        sounds: Iterable[Sound | None] | None = None,
+        conditions: Mapping[str, Sequence[object]] | None = None,
+        seconds: object = None,
+        seed: int = 0,
+        noise_seed: int | None = None,
+        sampling: SamplingConfig | Mapping[str, object] | None = None,
+        seed_motions: Path | str | Columns | Sequence[Columns] | None = None,
+    ) -> Request:
+        """The request that these arguments of `MotionModel.generate` make. `UserError` for what is none."""
+        require_seed(seed)
+        given: dict[str, Sequence[object] | None] = {
+            "captions": None if captions is None else caption_list(captions),
+            "sounds": None if sounds is None else _sound_list(sounds),
+            **(conditions or {}),
+        }
+        prompts = _prompts_of(given, None if face is None else caption_list(face, "face"))
+        lengths = _lengths_of(seconds)
+        if not isinstance(lengths, list):
+            lengths = [lengths] * len(prompts)
+        if len(lengths) != len(prompts):
+            raise UserError(f"{len(prompts)} captions but {len(lengths)} lengths in seconds")
+        begun: tuple[Path | Columns, ...] = ()
+        if isinstance(seed_motions, (str, Path)):
+            begun = (Path(seed_motions),)
+        elif seed_motions is not None:
+            # Columns of one motion are a matrix; of several a list, whose length is checked with the model.
+            begun = (seed_motions,) if isinstance(seed_motions, np.ndarray) else tuple(seed_motions)
+        return cls(prompts, tuple(lengths), seed, SamplingConfig.of(sampling), noise_seed, begun)
+
+    @classmethod
+    def of_script(
+        cls,
+        script: Path | str | Script,
+        *,
+        samples: int = 1,
+        seed: int = 0,
+        sampling: SamplingConfig | Mapping[str, object] | None = None,
+    ) -> Request:
+        """`samples` motions of a script: a file, or a `Script` whose sounds are seen from the current
+        folder."""
+        require_seed(seed)
+        require_samples(samples)
+        segments = tuple(script.open() if isinstance(script, Script) else Script.read(Path(script)))
+        prompts = tuple(segment.prompt for segment in segments)
+        return cls(prompts, (), seed, SamplingConfig.of(sampling), segments=segments, samples=samples)
+
+    @property
+    def count(self) -> int:
+        """How many motions it asks for."""
+        return self.samples if self.segments else len(self.prompts)
+
+    def alone(self, row: int) -> Request:
+        """The request for one of its motions."""
+        if self.segments:
+            return replace(self, samples=1)
+        return replace(self, prompts=self.prompts[row : row + 1], lengths=self.lengths[row : row + 1])
 
 
 def caption_list(given: Iterable[str], name: str = "captions") -> list[str]:
@@ -62,7 +151,7 @@ def require_samples(samples: int) -> None:
         raise UserError(f"samples {samples}: a whole number, 1 or more")
 
 
-def lengths_of(seconds: object) -> float | list[float | None] | None:
+def _lengths_of(seconds: object) -> float | list[float | None] | None:
     """Lengths in seconds as plain numbers: one, or one for each motion; None where the model decides."""
 
     def plain(value: object) -> float | None:
@@ -84,7 +173,7 @@ def lengths_of(seconds: object) -> float | list[float | None] | None:
         raise UserError(f"seconds {seconds!r:.60}: a number, or a list with one for each motion") from None
 
 
-def sound_list(given: object) -> list[Sound | None]:
+def _sound_list(given: object) -> list[Sound | None]:
     """The sounds as a list; refuses what are no sounds, such as names of files."""
     from motionloom.datasets.audio.sound import Sound
 
@@ -97,16 +186,12 @@ def sound_list(given: object) -> list[Sound | None]:
     return out
 
 
-def prompts_of(
-    captions: Sequence[str] | None,
-    faces: Sequence[str] | None,
-    sounds: Sequence[Sound | None] | None,
-    conditions: Mapping[str, Sequence[object]] | None = None,
-) -> list[Prompt]:
-    """Return a prompt for each motion; a single face caption is used for all, `conditions` by modality."""
-    more = conditions or {}
-    given: dict[str, Sequence[object] | None] = {"captions": captions, "sounds": sounds, **more}
-    counts = {name: len(values) for name, values in given.items() if values is not None}
+def _prompts_of(given: Mapping[str, Sequence[Any] | None], faces: Sequence[str] | None) -> tuple[Prompt, ...]:
+    """Return a prompt for each motion of captions, sounds and other conditions, by name; a single face
+    caption is used for all.
+    """
+    rows = {name: values for name, values in given.items() if values is not None}
+    counts = {name: len(values) for name, values in rows.items()}
     if not counts:
         raise UserError("nothing to generate from: give captions, sounds or both")
     if len(set(counts.values())) > 1:
@@ -114,15 +199,13 @@ def prompts_of(
     count = next(iter(counts.values()))
     if faces is not None and len(faces) not in (1, count):
         raise UserError(f"{count} captions but {len(faces)} face captions; give one, or one for each")
-    return [
-        Prompt(
-            text=captions[row] if captions else "",
-            face_text=faces[row if len(faces) > 1 else 0] if faces else "",
-            sound=sounds[row] if sounds else None,
-            conditions={name: values[row] for name, values in more.items()},
-        )
+    shared = [""] * count if not faces else [*faces] * (count if len(faces) == 1 else 1)
+    captions = rows.pop("captions", [""] * count)
+    sounds = rows.pop("sounds", [None] * count)
+    return tuple(
+        Prompt(captions[row], shared[row], sounds[row], {name: values[row] for name, values in rows.items()})
         for row in range(count)
-    ]
+    )
 
 
 def require_driven(generator: MotionGenerator, prompts: Iterable[Prompt]) -> None:
@@ -140,11 +223,13 @@ def require_used(
     body: MotionGenerator,
     faces: Mapping[str, MotionGenerator],
     face: MotionGenerator | None,
-    face_captions: Iterable[str] | None,
     sampling: SamplingConfig,
+    prompts: Iterable[Prompt] = (),
 ) -> None:
-    """Refuse given settings that neither the body's generator nor `face` uses; `faces`: for the fix."""
-    if face is None and face_captions is not None:
+    """Refuse face captions, and given settings, that neither the body's generator nor `face` uses; `faces`:
+    for the fix.
+    """
+    if face is None and any(prompt.face_text for prompt in prompts):
         raise UserError("this model makes no face: leave the face captions out")
     used = body.settings | (frozenset() if face is None else face.settings)
     given = {name for name in sampling.model_fields_set if getattr(sampling, name) not in (None, {})}
@@ -160,21 +245,12 @@ def require_used(
 
 
 def frames_of(
-    generator: MotionGenerator, seconds: float | Sequence[float | None] | None, prompts: Sequence[Prompt]
+    generator: MotionGenerator, lengths: Sequence[float | None], prompts: Sequence[Prompt]
 ) -> list[int | None]:
-    """Length of each motion in frames, in whole units of the generator; None where the model decides.
-
-    Args:
-        seconds: One length for all, one for each, or None: as long as what the prompt brings, such as music.
-    """
+    """Length of each motion in frames, in whole units of the generator; None where the model decides."""
     fps, unit, most = generator.layout.fps, generator.unit_frames, generator.max_frames
     seed_frames = generator.capabilities.seed_frames
-    if seconds is None:
-        wanted: list[float | None] = [prompt.seconds for prompt in prompts]
-    else:
-        wanted = list(seconds) if isinstance(seconds, Iterable) else [seconds] * len(prompts)
-    if len(wanted) != len(prompts):
-        raise UserError(f"{len(prompts)} captions but {len(wanted)} lengths in seconds")
+    wanted = [p.seconds if length is None else length for length, p in zip(lengths, prompts, strict=True)]
     out: list[int | None] = []
     for length, prompt in zip(wanted, prompts, strict=True):
         if length is None:
@@ -199,28 +275,26 @@ def frames_of(
     return out
 
 
-def alike(frames: Sequence[int | None], batch: int) -> list[list[int]]:
-    """Rows in batches, each all with a given length or all without."""
-    free = [row for row, count in enumerate(frames) if count is None]
-    given = [row for row, count in enumerate(frames) if count is not None]
-    return [rows[i : i + batch] for rows in (free, given) for i in range(0, len(rows), batch)]
-
-
-def seeds_of(
-    generator: MotionGenerator, given: Sequence[NDArray[np.float32]] | None, count: int
-) -> list[NDArray[np.float32]] | None:
-    """The last frames of motions [T, D] in the layout's columns, as a request has them; one may be for all.
+def seeds_of(generator: MotionGenerator, given: Sequence[Path | Columns], count: int) -> list[Columns] | None:
+    """The last frames of the motions that a generator goes on from, as it takes them: one for each of
+    `count`.
 
     Refuses those that are too short, or that nothing would go on from.
     """
-    if given is None:
+    if not given:
         return None
     layout, frames = generator.layout, generator.capabilities.seed_frames
     if not frames:
         raise UserError(f"this model ({generator.method}) goes on from no motion: leave the seed motion out")
     if len(given) not in (1, count):
         raise UserError(f"{count} motions but {len(given)} seed motions; give one, or one for each")
-    for motion in given:
+    own = []
+    for one in given:
+        motion = one
+        if isinstance(motion, Path):
+            from motionloom.pipeline.inference.clip_file import read_seed_motion
+
+            motion = read_seed_motion(motion, layout)
         if motion.ndim != 2 or motion.shape[1] != layout.dim or not np.isfinite(motion).all():
             raise UserError(
                 f"a seed motion is finite columns [T, {layout.dim}] of layout {layout.name}, not "
@@ -231,64 +305,5 @@ def seeds_of(
                 f"a seed motion of {len(motion)} frames: this model goes on from {frames} "
                 f"({frames / layout.fps:g} s); give a longer one"
             )
-    columns = layout.part(generator.part)
-    own = [np.asarray(motion[-frames:, columns], np.float32) for motion in given]
+        own.append(np.asarray(motion[-frames:, layout.part(generator.part)], np.float32))
     return own * count if len(own) == 1 else own
-
-
-def encode_prompts(
-    generator: MotionGenerator,
-    prompts: Sequence[Prompt],
-    words: Sequence[str],
-    fps: float,
-    device: torch.device,
-) -> Conditions:
-    """The conditions of a generator, by what it was trained with; those that no prompt has are left out.
-
-    `words` are the prompts' texts, about the body or the face; an empty one is no text.
-    """
-    rows = [replace(prompt, text=text).given for prompt, text in zip(prompts, words, strict=True)]
-    out: dict[str, Condition] = {}
-    for name, record in MODALITIES.items():
-        given = [row.get(name) for row in rows]
-        if name in generator.modalities and any(value is not None for value in given):
-            features, mask, pooled = record.encode(generator.prepared.get(name), given, fps)
-            pooled = None if pooled is None else pooled.to(device)
-            out[name] = Condition(features.to(device), mask.to(device), pooled)
-    return out
-
-
-def ticks_of(prompt: Prompt, conditions: Conditions, row: int, fps: float) -> tuple[float, ...]:
-    """Seconds worth marking on the time line of a row of encoded conditions: the beats of its music."""
-    found: list[float] = []
-    for name, (features, mask, _) in conditions.items():
-        values = np.asarray(features[row][mask[row]].cpu(), np.float32)
-        found += MODALITIES[name].ticks(prompt.given.get(name), values, fps)
-    return tuple(found)
-
-
-def repeated_rows(conditions: Conditions, count: int) -> Conditions:
-    """Conditions of one row, for `count` rows."""
-    return {
-        name: Condition(
-            features.expand(count, -1, -1),
-            mask.expand(count, -1),
-            None if pooled is None else pooled.expand(count, -1),
-        )
-        for name, (features, mask, pooled) in conditions.items()
-    }
-
-
-def weight_bytes(stages: Iterable[CompletedStage]) -> int:
-    """Size of the networks of some stages."""
-    files = (stage.folder / MODEL_FILES[0] for stage in stages)
-    return sum(path.stat().st_size for path in files if path.is_file())
-
-
-def split_columns(
-    motion: NDArray[np.float32], generator: MotionGenerator, layout: MotionLayout
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Body-hand features and, of a generator that makes all columns, the expression."""
-    if generator.part != "all" or not layout.has("face"):
-        return motion, None
-    return motion[:, layout.part("bodyhand")], motion[:, layout.part("face")]

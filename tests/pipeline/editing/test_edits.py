@@ -21,19 +21,17 @@ from motionloom.datasets.motion.canonical import canonicalize, ground, mirror
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.models.diffusion.editing import Filling
-from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
-from motionloom.pipeline.contract.editing import EditTask
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage, StageCache
+from motionloom.pipeline.editing.edit import EditedMotion, edit_clip, original_of
+from motionloom.pipeline.editing.finish import finish
+from motionloom.pipeline.editing.frames import edit_frames
+from motionloom.pipeline.editing.generator import InBetweenMotion
+from motionloom.pipeline.editing.inbetween.filling import Filling
+from motionloom.pipeline.editing.inbetween.network import InBetweenConfig, InBetweener
+from motionloom.pipeline.editing.task import EditTask
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.edits.clip_file import read_clip, require_clip
-from motionloom.pipeline.inference.edits.edit import finish
-from motionloom.pipeline.inference.edits.frames import edit_frames
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
-from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
-from motionloom.pipeline.inference.model import edit_clip, original_of
-from motionloom.pipeline.inference.motion import EditedMotion
+from motionloom.pipeline.inference.clip_file import RecordedClip, read_clip, require_clip
 from motionloom.pipeline.inference.shipped_models import shipped_models
 
 Walk = Callable[..., NDArray[np.float64]]
@@ -55,7 +53,7 @@ def editor(name: str = "wholebody363") -> Bundle:
     given = {"stats": stats, "text": SimpleNamespace(encoder=FixedEncoder())}
     config = InBetweenConfig(dim=16, ff=16, layers=1, heads=2)
     net = InBetweener(config, layout.dim, 8).eval()
-    return Bundle([stage(DiffusionMotion(layout, "all", given, net, window=40))], StageCache())
+    return Bundle([stage(InBetweenMotion(layout, "all", given, net, window=40))], StageCache())
 
 
 def clip(walk: Walk, seconds: float = 3.0, fps: float = 20.0) -> RecordedClip:
@@ -67,7 +65,7 @@ def clip(walk: Walk, seconds: float = 3.0, fps: float = 20.0) -> RecordedClip:
 
 
 def edit(model: Bundle, one: RecordedClip, **task: object) -> EditedMotion:
-    [made] = edit_clip(model, one, EditTask.parse(task, "task"), samples=1, seed=0, sampling=FEW)
+    [made] = edit_clip(model, one, EditTask.parse(task, "task"), 1, 0, FEW)
     return made
 
 
@@ -185,7 +183,7 @@ def test_a_figure_on_other_bones_stands_where_the_clip_does(walk: Walk) -> None:
     one = RecordedClip("long", long, 20.0)
     frames = edit_frames(EditTask.parse({"keep": ENDS}, "task"), one, layout)
     assert frames.scale != 1.0
-    joints = finish(frames, frames.features[:, layout.part("bodyhand")])[1].joints
+    joints = finish(frames, frames.known.features[:, layout.part("bodyhand")])[1].joints
     off = np.linalg.norm(joints[20:40] - original_of(frames, one).joints[20:40], axis=-1)
     assert off.max() < 0.02
 

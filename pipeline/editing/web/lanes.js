@@ -1,16 +1,10 @@
 /* The time line: a row a part of the body, marked by dragging, tapping or the keyboard. */
 
+import { element } from "./serve.js";
 import { runsOf, together } from "./task.js";
 
 const STAYS = "stays as it is", NEW = "made anew", PARTLY = "stays in part";
 const TAP = 4; // pixels that a finger may slip in a tap
-
-/* A node with properties and children. */
-export function element(tag, properties, ...children) {
-  const node = Object.assign(document.createElement(tag), properties);
-  node.append(...children);
-  return node;
-}
 
 /* `act` takes `seek(frame)`, `mark(names, from, to, keep, done)` and `cancel()`. */
 export function buildLanes(root, rows, fps, act) {

@@ -22,11 +22,11 @@ from torch import Tensor
 from torch.func import jvp
 
 from motionloom.datasets.motion.canonical import runs
-from motionloom.models.diffusion.network import InBetweener
-from motionloom.models.diffusion.observed import Places, Recovery, observed_columns, turned_back
 from motionloom.models.diffusion.sampling import blend_weights, window_starts
 from motionloom.models.diffusion.schedule import Sampler
 from motionloom.models.layers.frozen import evaluating
+from motionloom.pipeline.editing.inbetween.network import InBetweener
+from motionloom.pipeline.editing.inbetween.observed import Places, Recovery, observed_columns, turned_back
 
 HEADING_METRES = 0.5
 """Metres that a radian of heading counts as: how far it moves a hand [ours]."""

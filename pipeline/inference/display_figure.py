@@ -6,6 +6,7 @@ do: they read the features' own joints (`GeneratedMotion.joints`).
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.config import Config
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.feet import FeetReport, foot_contacts, plant_feet
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.features.joints import rotations_of
-from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.motion_data import MotionData
 
 FAR_MM = 20.0
 """A figure that is further from the generated joints, on average, is worth a word."""
@@ -33,12 +35,18 @@ class FigureOptions(Config):
     """Your two bases (.npz with `source` and `arkit`), which expressions become ARKit weights by; without,
     expressions are those of the synthetic face."""
 
+    def require_formats(self, formats: Container[str]) -> None:
+        """Refuse what only a format takes that is not written."""
+        for name, form in (("body_model", "smplx"), ("arkit_bases", "arkit")):
+            if getattr(self, name) is not None and form not in formats:
+                raise UserError(f"{name} is what --format {form} is made by: name that format too")
+
 
 @dataclass(frozen=True)
 class ShownMotion:
     """A generated motion and the figure that is shown of it."""
 
-    motion: GeneratedMotion
+    motion: MotionData
     figure: RigidMotion
     feet: FeetReport | None = None
 
@@ -73,7 +81,7 @@ class ShownMotion:
         return out
 
 
-def shown(motion: GeneratedMotion | ShownMotion, options: FigureOptions | None = None) -> ShownMotion:
+def shown(motion: MotionData | ShownMotion, options: FigureOptions | None = None) -> ShownMotion:
     """The figure of one motion; one that was made already stays what it is."""
     if isinstance(motion, ShownMotion):
         return motion

@@ -1,17 +1,17 @@
 /* Changing a motion: the panel below the figure, what it holds, and what it asks of the server. */
 
-import { buildLanes, element } from "./lanes.js";
+import { buildLanes } from "./lanes.js";
 import { figureTools } from "./figure.js";
+import { element } from "./serve.js";
 import { HANDLES, History, freshState, mark, missing, paceOf, pin, resize, rowsOf, taskOf, walk } from "./task.js";
 
 const one = (id) => document.getElementById(id);
 const panel = one("edit"), go = one("edit-go"), why = one("edit-why"), marks = one("edit-marks"), draw = one("edit-draw"), joints = one("edit-joint");
-const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }, PIXELS = 6;
+const CLIP = /\.(npz|bvh|glb)$/i, ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }, PIXELS = 6;
 
-/* The editor of a page. `page` gives `info`, `post(path, body, signal)` and `mount(viewerData, over)`; it is told what can be saved,
-   `savable({ path, body })`, and when the panel is shut, `closed(clip)`. */
-export function makeEditor(page) {
-  const { info } = page, fps = info.fps, rows = info.edit.possible ? rowsOf(info) : [];
+/* The part of a page (`serve.js`). */
+export function begin(page) {
+  const { info, say } = page, fps = info.fps, rows = info.edit.possible ? rowsOf(info) : [];
   let clip = null, history = null, draft = null, viewer = null, mounted = null, busy = null, turn = 0, seen = -1;
   let results = new Map(); // by the state that they are of
   const state = () => draft || history.now;
@@ -137,7 +137,7 @@ export function makeEditor(page) {
     document.body.classList.remove("serve-editing");
     history = viewer = null;
     stop();
-    page.closed(result ? changed(result, now.caption) : clip);
+    page.show(result ? changed(result, now.caption) : clip);
   }
   /* What was made, as a clip of its own. */
   function changed({ answer, saved }, caption) {
@@ -214,5 +214,28 @@ export function makeEditor(page) {
     event.preventDefault();
   });
 
-  return { open, tell, get opened() { return history !== null; } };
+  /* A motion file, to be changed. */
+  async function takeClip(file) {
+    const mine = page.next(), answer = await page.send("/api/clips", file, info.limits.clip_bytes, `Reading ${file.name}…`);
+    if (!answer || mine !== page.turn) return;
+    page.current = { ref: answer.clip, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, name: file.name };
+    page.note(answer.notes, []);
+    say(`${file.name}: ${answer.seconds.toFixed(1)} s of motion`);
+    open(page.current);
+  }
+  function take(file, alone) {
+    if (!CLIP.test(file.name) && !alone) return false;
+    if (!info.edit.possible) say(`${file.name}: ${info.edit.why}`, true);
+    else if (!CLIP.test(file.name)) say(`${file.name} is no motion that can be read here: drop a BVH, GLB or npz file`, true);
+    else takeClip(file);
+    return true;
+  }
+  const refresh = () => { one("change").hidden = history !== null || !info.edit.possible; };
+
+  one("change").addEventListener("click", () => { page.note([], []); open(page.current); });
+  one("clip").addEventListener("change", () => { if (one("clip").files.length) takeClip(one("clip").files[0]); });
+  for (const node of document.querySelectorAll(".edit-can")) node.hidden = !info.edit.possible;
+  one("change-not").hidden = info.edit.possible;
+  one("change-not").textContent = info.edit.why;
+  return { tell, take, refresh, able: info.edit.possible, get opened() { return history !== null; } };
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -15,7 +14,7 @@ from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.feet import foot_contacts, plant_feet
 from motionloom.datasets.motion.body.landing import landed, reached
 from motionloom.datasets.motion.body.rigid import RigidMotion, share_twist
-from motionloom.datasets.motion.bvh.own_file import OwnBvh, between_rows, own_rows
+from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.canonical import facing, ground, retarget
 from motionloom.datasets.motion.easing import eased
 from motionloom.datasets.motion.features.codec import encode, place
@@ -23,10 +22,11 @@ from motionloom.datasets.motion.features.torch_joints import torch_way
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.layout import PIECES, piece_joints
 from motionloom.models.metrics.dance import ANKLES_TOES
-from motionloom.pipeline.contract.editing import EditReport
-from motionloom.pipeline.contract.generation import Motion, MotionGenerator
-from motionloom.pipeline.inference.edits.frames import WALKS, EditFrames, RootPath
-from motionloom.pipeline.inference.edits.recorded import RecordedClip
+from motionloom.pipeline.editing.frames import WALKS, EditFrames
+from motionloom.pipeline.editing.own_file import between_rows, own_rows, with_made
+from motionloom.pipeline.editing.task import EditReport
+from motionloom.pipeline.editing.timed import RootPath
+from motionloom.pipeline.inference.clip_file import RecordedClip
 
 _REACH_SECONDS = 0.5
 """In which a figure goes to a pin and comes back [ours]."""
@@ -36,16 +36,6 @@ _SEAM_FRAMES = 2
 """Frames on either side of a seam that belong to it."""
 _TRUNK_AND_ARMS = (1, 2, 3)
 """Numbers of the `PIECES` that keep their direction where what carries them is made; fingers follow hands."""
-
-
-def require_editor(generator: MotionGenerator) -> Callable[..., list[Motion]]:
-    """The generator's `edit`; `UserError` where it cannot fill in what a clip leaves free."""
-    if generator.capabilities.edit is None:
-        raise UserError(
-            f"this model ({generator.method}) makes whole motions and edits none; take an in-betweener, such "
-            f"as the package's `inbetween`"
-        )
-    return generator.capabilities.edit
 
 
 def finish(
@@ -78,7 +68,7 @@ def finish(
     if layout.family != "exact":
         # These are made of steps between joints, so there is one frame more of joints.
         joints = np.concatenate([joints, 2 * joints[-1:] - joints[-2:-1]])
-    return encode(joints, layout), frames.to_world(figure), heading + frames.turn
+    return encode(joints, layout), frames.world.figure(figure), heading + frames.world.turn
 
 
 def own_bvh(bvh: OwnBvh, frames: EditFrames, figure: RigidMotion) -> OwnBvh:
@@ -86,7 +76,7 @@ def own_bvh(bvh: OwnBvh, frames: EditFrames, figure: RigidMotion) -> OwnBvh:
     if frames.task.changes_clip:
         raise UserError("the clip was mirrored, retimed or repeated")
     kept = frames.pieces[:, piece_joints(frames.layout)]
-    return bvh.edited(figure.joints, frames.layout.fps, frames.lead, kept, frames.task.seconds)
+    return with_made(bvh, figure.joints, frames.layout.fps, frames.lead, kept, frames.task.seconds)
 
 
 def own_figure(clip: RecordedClip, frames: EditFrames, made: RigidMotion) -> RigidMotion:
@@ -121,12 +111,13 @@ def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, 
     target, heading = root.place.copy(), root.heading.copy()
     target[inside] = np.where(rooted[inside], frames.clip_root.place, target[inside])
     heading[inside] = np.where(rooted[inside], frames.clip_root.heading, heading[inside])
-    on_path = ~np.isnan(frames.path)
+    on_path = frames.known.led
     target[on_path] = frames.path[on_path]
     # Whole turns of a path count for nothing; every half second is enough, so that hips may sway.
-    known = frames.places.heading_known[0].numpy()
+    places = frames.known.places
+    known = places.heading_known[0].numpy()
     asked = known & ~rooted
-    heading[asked] = (frames.places.heading[0].numpy() + frames.anchor.heading)[asked]
+    heading[asked] = (places.heading[0].numpy() + frames.anchor.heading)[asked]
     known &= rooted | (np.arange(len(known)) % max(1, round(layout.fps / 2)) == 0)
     wrapped = np.angle(np.exp(1j * (heading - root.heading)))
     shift, turn = eased(target - root.place, rooted | on_path), eased(wrapped, known)
@@ -147,8 +138,9 @@ def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMo
     kept, own = frames.pieces[inside][:, pieces], rotations[inside]
     own[kept] = clip.rotations[kept]
     root[inside][rooted] = clip.root[rooted]
-    on_path = ~np.isnan(frames.path)
-    root[on_path, 2], root[on_path, 0] = frames.path[on_path].real, frames.path[on_path].imag
+    on_path = frames.known.led
+    root[on_path, 2] = frames.path[on_path].real
+    root[on_path, 0] = frames.path[on_path].imag
     turn = Rotation.from_euler("y", (heading[inside] - frames.clip_root.heading)[:, None]).as_matrix()
     posing = (clip.skeleton.offsets, clip.skeleton.parents)
     _, was = forward_kinematics(clip.rotations, clip.root, *posing)
@@ -166,7 +158,7 @@ def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMo
 def _made_root(frames: EditFrames, made: NDArray[np.float32]) -> RootPath:
     """The root's path in what a model made, in the clip's size, seen from the clip's first frame."""
     heading, x, z = (one.numpy() for one in torch_way(torch.from_numpy(made).double(), frames.layout))
-    first, anchor = int(frames.places.anchor[0]), frames.anchor
+    first, anchor = int(frames.known.places.anchor[0]), frames.anchor
     place = (z + 1j * x) * np.exp(-1j * heading[first])
     away = (place - place[first]) * np.exp(1j * anchor.heading[0]) / frames.scale
     return RootPath(heading - heading[first] + anchor.heading[0], anchor.place[0] + away)
@@ -178,9 +170,13 @@ def report_of(
     """How near a result is to its task, by the joints [T, M, 3] of its file of some `rate`, and headings [T],
     in the clip's world.
     """
-    fps, inside, count = frames.layout.fps, frames.inside, min(joints.shape[1], frames.seen.shape[1])
+    fps, inside, count = (
+        frames.layout.fps,
+        frames.inside,
+        min(joints.shape[1], frames.written.joints.shape[1]),
+    )
     joints = joints[:, :count]
-    clip, rooted = frames.seen[:, :count], frames.rooted[inside][:, None]
+    clip, rooted = frames.written.joints[:, :count], frames.rooted[inside][:, None]
     pieces = piece_joints(frames.layout)[:count]
     names, parents = frames.layout.skeleton.joints, np.maximum(frames.layout.skeleton.parents[:count], 0)
     # Without the legs the figure goes elsewhere, so what is kept of it is compared bone by bone, as the
@@ -190,17 +186,17 @@ def report_of(
     kept = kept[:, pieces] & (rooted | kept[:, pieces][:, parents])
     # A frame that lies between two rows of the file is the clip's where the one before it is kept, too.
     kept[1:] &= kept[:-1] | (frames.rows(rate)[inside] % 1 == 0)[1:, None]
-    back = frames.clip_root.heading + frames.turn - heading[inside]
+    back = frames.clip_root.heading + frames.world.turn - heading[inside]
     back = Rotation.from_euler("y", back[:, None]).as_matrix()
     bones = np.einsum("tij,tnj->tni", back, joints[inside] - joints[inside][:, parents])
     away = np.where(rooted[..., None], joints[inside] - clip, bones - (clip - clip[:, parents]))
     # The way is looked at where the root walks; a figure that stands may face anywhere.
-    on_path, root = ~np.isnan(frames.path), ground(joints[:, 0])
-    path = frames.path * np.exp(1j * frames.turn) + frames.origin
+    on_path, root = frames.known.led, ground(joints[:, 0])
+    path = frames.world.places(frames.path)
     pins = {}
     for (frame, joint), pin in zip(frames.pins, frames.task.pins, strict=True):
         if joint < count:  # not fingers of a file that has none
-            miss = np.linalg.norm(joints[frame, joint] - pin.position - np.array([0, frames.base, 0]))
+            miss = np.linalg.norm(joints[frame, joint] - pin.position - np.array([0, frames.written.base, 0]))
             pins[f"{names[joint]} at {(frame - frames.lead) / fps:.2f} s"] = 100 * miss.item()
     way = np.gradient(root) * fps
     walks = on_path & (np.abs(way) > WALKS)
@@ -223,7 +219,7 @@ def report_of(
 
 
 def _largest(values: NDArray[np.float64]) -> float:
-    """NaN where there are none."""
+    """The largest value; NaN where there are none."""
     return float(values.max(initial=-np.inf)) if values.size else float("nan")
 
 

@@ -1,36 +1,36 @@
-"""Clips that a server changes: motions that it made, and files that are sent to it."""
+"""Editing on the page of `motionloom serve`: motions that it made, and files that are sent to it."""
 
 from __future__ import annotations
 
-import json
+import asyncio
 from dataclasses import asdict
+from importlib import resources
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
 
-from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import temporary_folder
-from motionloom.pipeline.contract.editing import EditTask
-from motionloom.pipeline.inference.edits.clip_file import read_clip
-from motionloom.pipeline.inference.edits.edit import require_editor
-from motionloom.pipeline.inference.edits.frames import edit_frames
-from motionloom.pipeline.inference.model import MotionModel, original_of
-from motionloom.pipeline.inference.motion import EditedMotion, GeneratedMotion
+from motionloom.datasets.base.register import register
+from motionloom.pipeline.editing.edit import ABILITY, EditedMotion, original_of
+from motionloom.pipeline.editing.frames import edit_frames
+from motionloom.pipeline.editing.task import MAX_SPEED, EditTask
+from motionloom.pipeline.inference.clip_file import read_clip
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.outputs import clip_of
 from motionloom.pipeline.inference.writers import cell_of
 from motionloom.pipeline.render.viewer import viewer_data
+from motionloom.pipeline.serve.part import Host, OpenPart, ServedPart
 from motionloom.pipeline.serve.requests import (
     Answer,
-    MotionRequest,
-    Recent,
+    Asked,
     ServeConfig,
     answer,
     known_answer,
-    motion_of,
     name_of,
-    notes_of,
+    name_of_facts,
 )
 
 CLIP = "the clip"
@@ -42,7 +42,7 @@ _HEAD = 4096
 """Bytes at the beginning of a BVH within which its first word stands."""
 
 
-class ChangeRequest(Config):
+class ChangeRequest(Asked):
     """A clip, and what is to change of it."""
 
     clip: str = Field(max_length=64)
@@ -53,17 +53,27 @@ class ChangeRequest(Config):
     """As of `MotionRequest`; the viewer's data hold the clip and the result."""
 
     def require_within(self, limits: ServeConfig, model: MotionModel) -> None:
-        """Refuse what is too much; `UserError` in one sentence."""
-        require_editor(model.bundle.generator)
+        model.ability(ABILITY)
         limits.require_small([self.task.caption], self.task.lead + (self.task.seconds or 0.0))
 
 
 class Clips:
-    """The clips used last, with what was made of them."""
+    """The clips of a server, among its motions, and what is made of them."""
 
-    def __init__(self, model: MotionModel, config: ServeConfig) -> None:
-        self._model, self._config = model, config
-        self.kept = Recent[GeneratedMotion](config.clips, CLIP)
+    def __init__(self, host: Host) -> None:
+        self._host, self._model, self._config = host, host.model, host.config
+        self.kept = host.motions.kept
+
+    async def post_clip(self, http: Request) -> Response:
+        """Keep the motion file that the body is, under a name for later requests."""
+        self._model.ability(ABILITY)
+        async with self._host.upload(http, CLIP, self._config.max_clip_mb) as data:
+            return JSONResponse(await asyncio.to_thread(self.add, data))
+
+    async def post_edit(self, http: Request) -> Response:
+        """A clip of which a part is made anew."""
+        request = await self._host.read(http, ChangeRequest)
+        return await self._host.respond(lambda: self.change(request))
 
     def add(self, data: bytes) -> dict[str, object]:
         """Read a file's bytes and keep the clip at the model's frame rate; the answer about it.
@@ -98,19 +108,11 @@ class Clips:
             "viewer": viewer_data([cell_of(clip_of(motion), CLIP)]),
         }
 
-    def generate(self, asked: MotionRequest, sound: Sound | None) -> Answer:
-        """The motion that is asked for. The same request is answered with the same motion, made once."""
-        name = _name_of(asked.model_dump(mode="json", exclude={"format"}, exclude_unset=True))
-        motion = self.kept.made(name, lambda: motion_of(self._model, asked, sound, self._config))
-        notes = notes_of(self._model, asked, sound, motion)
-        facts = {"clip": name, "seed": asked.seed, "face": asked.face, **notes}
-        return answer(motion, asked.format, facts, "\n".join(notes["notes"]), {"generated": motion})
-
     def change(self, asked: ChangeRequest) -> Answer:
         """The result that is asked for, made once too."""
         motion = self.kept.get(asked.clip)
         self._config.require_small([""], motion.seconds * asked.task.repeat / asked.task.speed)
-        name = _name_of({"clip": asked.clip, "task": asked.task.dump(), "seed": asked.seed})
+        name = name_of_facts({"clip": asked.clip, "task": asked.task.dump(), "seed": asked.seed})
         made = self.kept.made(name, lambda: self._model.edit(motion, asked.task, seed=asked.seed)[0])
         assert isinstance(made, EditedMotion)
         # JSON knows no NaN, which stands for what a task does not ask.
@@ -121,5 +123,15 @@ class Clips:
         return answer(made, asked.format, facts, "\n".join(lines), cells)
 
 
-def _name_of(facts: dict[str, object]) -> str:
-    return name_of(json.dumps(facts, sort_keys=True).encode())
+def _open(host: Host) -> OpenPart:
+    """Editing by a server's model; of one that cannot edit, why."""
+    clips, why = Clips(host), ""
+    try:
+        host.model.ability(ABILITY)
+    except UserError as error:
+        why = str(error)
+    posts = {"/api/clips": clips.post_clip, "/api/edit": clips.post_edit}
+    return OpenPart(posts, {"possible": not why, "why": why, "max_speed": MAX_SPEED})
+
+
+register(ServedPart(ABILITY, resources.files("motionloom.pipeline.editing") / "web", _open))

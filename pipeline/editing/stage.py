@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import torch
+
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.motion.layout import Part
-from motionloom.models.diffusion.network import InBetweenConfig, InBetweener
-from motionloom.models.diffusion.observed import Observations
-from motionloom.pipeline.contract.stage import register
+from motionloom.pipeline.contract.stage import CompletedStage, Inputs, register
+from motionloom.pipeline.editing.generator import InBetweenMotion
+from motionloom.pipeline.editing.inbetween.network import InBetweenConfig, InBetweener
+from motionloom.pipeline.editing.inbetween.observed import Observations
 from motionloom.pipeline.stages.networks.captions import (
     CaptionInputs,
     DenoiserStage,
     DenoiserStageConfig,
     part_columns,
+    part_of,
 )
+from motionloom.pipeline.store.weights import load_facts
 
 
 class InBetweenStageConfig(DenoiserStageConfig):
@@ -27,7 +32,7 @@ class InBetweenStage(DenoiserStage[InBetweenStageConfig, InBetweener]):
 
     name = "inbetween"
     summary = "motion in-betweening"
-    trainer = "motionloom.models.diffusion.module:InBetweenModule"
+    trainer = "motionloom.pipeline.editing.inbetween.module:InBetweenModule"
     config = InBetweenStageConfig
     denoiser = InBetweener
 
@@ -39,6 +44,10 @@ class InBetweenStage(DenoiserStage[InBetweenStageConfig, InBetweener]):
         stats = inputs.stats or FeatureStats.unit(inputs.data.layout)
         share = config.net.observed_share
         return {"observations": Observations(stats.layout, columns, stats.mean, stats.std, share)}
+
+    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> InBetweenMotion:
+        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
+        return InBetweenMotion(given["stats"].layout, part, given, net, stage.config.max_frames)
 
 
 register(InBetweenStage())

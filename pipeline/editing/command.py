@@ -8,8 +8,10 @@ from typing import Annotated
 import typer
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.register import register
 from motionloom.pipeline.cli.generate import formats_of, print_note, write_files
 from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
+from motionloom.pipeline.contract.command import Command
 from motionloom.pipeline.inference.writers import formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
@@ -43,11 +45,11 @@ def edit(
 
     Example: `motionloom edit inbetween walk.bvh --task task.yaml`  (paths, pinned joints)
     """
-    from motionloom.pipeline.contract.editing import EditTask
     from motionloom.pipeline.contract.sampling import SamplingConfig
+    from motionloom.pipeline.editing.task import EditTask
+    from motionloom.pipeline.inference.display_figure import FigureOptions
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.outputs import page_note
-    from motionloom.pipeline.inference.shown import FigureOptions
     from motionloom.pipeline.store.yaml import read_yaml
 
     sampling, figure, fields = settings_of(
@@ -83,3 +85,6 @@ def edit(
         figure=posing,
         made_from=clip,
     )
+
+
+register(Command("edit", edit))

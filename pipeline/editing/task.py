@@ -81,6 +81,8 @@ class EditTask(Config):
     """None: all of the clip if the result is longer or the clip is changed, else nothing."""
     path: tuple[PathPoint, ...] = ()
     """Points of the root's path, joined by a smooth curve that does not overshoot."""
+    backward: bool = False
+    """Walk the path backward, facing away from where it goes."""
     pins: tuple[Pin, ...] = ()
 
     @property

@@ -1,1 +1,0 @@
-"""Editing: a clip, what is asked of it in frames, and what comes of it."""
