@@ -7,13 +7,16 @@ shuffle touches every shard all the time, the streamed order finishes one group 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.randomness import permutation, words
-from motionloom.datasets.shards.clips import Source
+
+if TYPE_CHECKING:
+    from motionloom.datasets.shards.clips import Source
 
 # Last elements of keys. `BatchPlan` draws its pools by (seed, epoch, n >= 1), so a zero in the third place
 # keeps these apart from them; no key may end in zero (numpy pads keys with zeros).

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,9 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import number, read_plain
 from motionloom.datasets.modalities.modality import FrameStats, Modality, load_columns, save_columns
 from motionloom.datasets.motion.layout import ROOT, Family, MotionLayout
-from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.datasets.shards.tar import npy_from_bytes
+
+if TYPE_CHECKING:
+    from motionloom.datasets.shards.clips import ClipDataset
 
 STD_FLOOR = 1e-4
 """Columns that hardly move (a hand the source does not record) are divided by this, not by zero."""
@@ -93,6 +94,8 @@ class FeatureStats:
     @staticmethod
     def of_arrays(mean: Path, std: Path, layout: MotionLayout) -> FeatureStats:
         """Read a release's `.npy` files [D] of a layout's columns; `UserError` where a file is not that."""
+        from motionloom.datasets.shards.tar import npy_from_bytes
+
         arrays = []
         for path in (mean, std):
             try:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 import torch
 from pydantic import BaseModel, model_validator
@@ -26,7 +26,6 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import MOST
 from motionloom.datasets.base.register import VARIABLE, Table, discover
 from motionloom.datasets.base.register import register as register
-from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import MotionGenerator
 from motionloom.pipeline.contract.inputs import Every as Every
 from motionloom.pipeline.contract.inputs import Inputs as Inputs
@@ -37,6 +36,9 @@ from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
 from motionloom.pipeline.contract.units import WORK, Units
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.artifact import require_unchanged
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.contract.captioning import MotionCaptioner
 
 CPU = torch.device("cpu")
 

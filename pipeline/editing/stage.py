@@ -10,13 +10,8 @@ from motionloom.pipeline.contract.stage import CompletedStage, Inputs, register
 from motionloom.pipeline.editing.generator import InBetweenMotion
 from motionloom.pipeline.editing.inbetween.network import InBetweenConfig, InBetweener
 from motionloom.pipeline.editing.inbetween.observed import Observations
-from motionloom.pipeline.stages.networks.captions import (
-    CaptionInputs,
-    DenoiserStage,
-    DenoiserStageConfig,
-    part_columns,
-    part_of,
-)
+from motionloom.pipeline.stages.networks.captions import CaptionInputs, part_columns, part_of
+from motionloom.pipeline.stages.networks.denoiser import DenoiserStage, DenoiserStageConfig
 from motionloom.pipeline.store.weights import load_facts
 
 

@@ -7,26 +7,27 @@ itself (`contract/stage.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout
-from motionloom.pipeline.contract.captioning import MotionCaptioner
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.lookup import captioners_of, exported_sampling, generators_of, open_exported
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CAPTIONER, CPU, CompletedStage, StageCache
-from motionloom.pipeline.inference.checks import find_mismatches, rounded_lengths, standing, unknown_captions
-from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.request import require_used
 from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.store.artifact import Terms, require_consistent
-from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE, hint_at, owner_of
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.contract.captioning import MotionCaptioner
+    from motionloom.pipeline.inference.motion import GeneratedMotion
+    from motionloom.pipeline.store.known_captions import Unknown
 
 
 class NoBodyError(UserError):
@@ -44,28 +45,40 @@ class Bundle:
         stages: Sequence[CompletedStage],
         stage_cache: StageCache,
         recommended: SamplingConfig | None = None,
-        captioners: Sequence[CompletedStage] = (),
+        captioners: Callable[[], Sequence[CompletedStage]] = tuple,
     ) -> None:
-        self.stages, self.captioners = tuple(stages), tuple(captioners)
-        """The stages that generate, the default of each kind first; and those that caption motions."""
-        self.terms = Terms.of(stage.folder for stage in (*self.stages, *self.captioners))
-        """Licences and credits of all data that it was made from."""
+        self.stages = tuple(stages)
+        """The stages that generate, the default of each kind first."""
+        self._find_captioners = captioners
         self.stage_cache = stage_cache
         self.recommended = recommended or SamplingConfig()
         """Recommended sampling settings; fields that are not set have no recommendation."""
         self._generators: dict[Path, MotionGenerator] = {}
-        for stage in (*self.stages, *self.captioners):
+        for stage in self.stages:
             self._open(stage)
         if {self.generator_of(stage).part for stage in self.stages} <= {"face"} and not self.captioners:
             raise NoBodyError
+
+    @cached_property
+    def captioners(self) -> tuple[CompletedStage, ...]:
+        """The stages that caption motions, loaded when somebody asks for them."""
+        found = tuple(self._find_captioners())
+        for stage in found:
+            self._open(stage)
+        return found
+
+    @cached_property
+    def terms(self) -> Terms:
+        """Licences and credits of all data that it was made from."""
+        return Terms.of(stage.folder for stage in (*self.stages, *self.captioners))
 
     @staticmethod
     def open(name: Path | str, device: torch.device = CPU) -> Bundle:
         """Open a run folder, an exported folder, a model that comes with the package, or one of the hub."""
         folder = find_model(name)
         if (folder / BUNDLE_FILE).is_file():
-            stages, captioners = open_exported(folder), open_exported(folder, CAPTIONER)
-            return Bundle._in(folder, stages, device, exported_sampling(folder), captioners)
+            captioners = partial(open_exported, folder, CAPTIONER)
+            return Bundle._in(folder, open_exported(folder), device, exported_sampling(folder), captioners)
         if not (folder / "recipe.yaml").is_file():
             raise UserError(
                 f"{folder}: not a run folder (no recipe.yaml) and not an exported one (no {BUNDLE_FILE})"
@@ -74,10 +87,9 @@ class Bundle:
 
     @staticmethod
     def from_run(run: Path, device: torch.device = CPU) -> Bundle:
-        makers, captioners = generators_of(run), captioners_of(run)
-        for stage in (*makers, *captioners):
-            require_consistent(owner_of(stage.folder), [stage.folder.name])
-        return Bundle._in(run, makers, device, None, captioners)
+        return Bundle._in(
+            run, _consistent(generators_of(run)), device, None, lambda: _consistent(captioners_of(run))
+        )
 
     @staticmethod
     def _in(
@@ -85,7 +97,7 @@ class Bundle:
         stages: Sequence[CompletedStage],
         device: torch.device,
         recommended: SamplingConfig | None,
-        captioners: Sequence[CompletedStage],
+        captioners: Callable[[], Sequence[CompletedStage]],
     ) -> Bundle:
         """The bundle of a folder's stages; what is wrong with it names the folder."""
         try:
@@ -168,6 +180,8 @@ class Bundle:
 
     def require_used(self, sampling: SamplingConfig, prompts: Iterable[Prompt] = ()) -> None:
         """Refuse settings and face captions that were given, and that no generator in use takes notice of."""
+        from motionloom.pipeline.inference.request import require_used
+
         stage = self.choose_face(sampling.face_model)
         faces = {method: self.generator_of(one) for method, one in self.faces.items()}
         face = None if stage is None else self.generator_of(stage)
@@ -194,6 +208,8 @@ class Bundle:
         self, captions: Sequence[str], face: Sequence[str] = (), face_model: str | None = None
     ) -> list[Unknown]:
         """Return captions unlike all that were trained on; none where a model does not say what it knows."""
+        from motionloom.pipeline.inference.checks import unknown_captions
+
         out: list[Unknown] = []
         for stage, texts in ((self.main, captions), (self.choose_face(face_model), face)):
             source = None if stage is None else self.generator_of(stage).prepared.get("text")
@@ -208,6 +224,8 @@ class Bundle:
         lengths: Sequence[float | None] = (),
     ) -> list[Unknown | str]:
         """Return the notes on prompts, and on motions whose length is not the one asked for, in seconds."""
+        from motionloom.pipeline.inference.checks import rounded_lengths, standing
+
         texts, faces = [prompt.text for prompt in prompts], [prompt.face_text for prompt in prompts]
         remarks = dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark)
         shown = [*rounded_lengths(self.generator, lengths, motions), *standing(motions)]
@@ -216,6 +234,15 @@ class Bundle:
 
     def find_mismatches(self, motions: Iterable[GeneratedMotion]) -> list[str]:
         """Return a sentence for each caption, scripts apart, of which its motions show something else."""
+        from motionloom.pipeline.inference.checks import find_mismatches
+
         source = self.generator.prepared.get("text")
         single = ((motion.caption, motion.joints) for motion in motions if not motion.segments)
         return find_mismatches(source, single, self.layout.fps)
+
+
+def _consistent(stages: Sequence[CompletedStage]) -> Sequence[CompletedStage]:
+    """The stages, each made of what its run holds now."""
+    for stage in stages:
+        require_consistent(owner_of(stage.folder), [stage.folder.name])
+    return stages

@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from itertools import chain, count
 from pathlib import Path
 
-from huggingface_hub import ModelCardData
-
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.register import code_of, distribution_of
 from motionloom.pipeline.contract.lookup import FORMAT, BundleFile
@@ -56,6 +54,8 @@ def write_bundle(
 
 def _card(name: str, terms: Terms) -> str:
     """The card of a model: its licence, where it comes from, and who is to be named."""
+    from huggingface_hub import ModelCardData
+
     known = terms.licence.lower() if _HUB_LICENCE.fullmatch(terms.licence.lower()) else None
     facts = ModelCardData(
         license=known or "other",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,8 +21,9 @@ from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.generators.idle_pose import blend_to_idle
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.request import Request, frames_of, require_driven, seeds_of
-from motionloom.pipeline.inference.script import segment_frames, sound_of
-from motionloom.pipeline.render.sound import Segment
+
+if TYPE_CHECKING:
+    from motionloom.pipeline.render.sound import Segment
 
 AT_ONCE = 64
 """Motions sampled together."""
@@ -101,6 +103,8 @@ def _batch(
 
 def _along_script(bundle: Bundle, request: Request) -> list[GeneratedMotion]:
     """One motion driven by segments of text and music in turn, and other samples of it (`script.py`)."""
+    from motionloom.pipeline.inference.script import segment_frames, sound_of
+
     generator, fps, samples = bundle.generator, bundle.layout.fps, request.samples
     segments, sampling = request.segments, bundle.drawing(request.sampling)
     drive = generator.capabilities.drive

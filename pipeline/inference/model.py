@@ -16,46 +16,38 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import torch
-from huggingface_hub import ModelHubMixin
 
 from motionloom.pipeline.contract.ability import ability_of
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.exported import HUB_CONFIG, write_bundle
-from motionloom.pipeline.inference.generation import generate
-from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.request import Columns, Request, caption_list, require_words
-from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import find_model
 from motionloom.pipeline.launch.hardware import choose_device, threads_for
-from motionloom.pipeline.store.known_captions import Unknown
 from motionloom.pipeline.store.run_folder import BUNDLE_FILE
 from motionloom.pipeline.store.text import TextSource
 from motionloom.pipeline.store.weights import MODEL_FILES
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
+    from motionloom.pipeline.inference.motion import GeneratedMotion
+    from motionloom.pipeline.inference.request import Columns, Request
+    from motionloom.pipeline.inference.script import Script
+    from motionloom.pipeline.store.known_captions import Unknown
 
 Sampling = SamplingConfig | Mapping[str, object]
 """Settings, or a mapping like `{"top_p": 0.9}`."""
 
 
-class MotionModel(
-    ModelHubMixin,
-    library_name="motionloom",
-    pipeline_tag="text-to-3d",
-    tags=["human-motion", "text-to-motion", "whole-body"],
-):
+class MotionModel:
     """Captions, music or both to whole-body motions."""
 
     def __init__(self, folder: Path | str, device: str | torch.device = "auto") -> None:
         self.folder = find_model(folder)
-        self.bundle = Bundle.open(self.folder, choose_device(device))
-        # The mixin would write our argument, a local path, into the config.json that the hub wants.
-        self._hub_mixin_config = dict(HUB_CONFIG)
+        with threads_for(1):  # tensors by the hundred, none of which several threads read sooner
+            self.bundle = Bundle.open(self.folder, choose_device(device))
 
     def __repr__(self) -> str:
         stages = (*self.bundle.stages, *self.bundle.captioners)
@@ -99,6 +91,8 @@ class MotionModel(
         are known, such as those that a data set stores. `noise_seed` decodes the same tokens with other
         noise, where a diffusion model decodes.
         """
+        from motionloom.pipeline.inference.request import Request, require_words
+
         request = Request.of(
             captions, face=face, sounds=sounds, conditions=conditions, seconds=seconds, seed=seed,
             noise_seed=noise_seed, sampling=sampling, seed_motions=seed_motion,
@@ -118,6 +112,8 @@ class MotionModel(
 
         `script` is a file, or a `Script` whose sound files are seen from the current folder.
         """
+        from motionloom.pipeline.inference.request import Request
+
         return self._told(Request.of_script(script, samples=samples, seed=seed, sampling=sampling))
 
     def _told(self, request: Request) -> list[GeneratedMotion]:
@@ -129,6 +125,8 @@ class MotionModel(
 
     def make(self, request: Request) -> list[GeneratedMotion]:
         """The motions of a request, without a word about them; options without effect are refused."""
+        from motionloom.pipeline.inference.generation import generate
+
         self.bundle.require_used(request.sampling, request.prompts)
         with self.threads(request.count):
             return generate(self.bundle, request)
@@ -151,6 +149,8 @@ class MotionModel(
 
     def unknown(self, captions: Sequence[str], face: Sequence[str] = ()) -> list[Unknown]:
         """Captions that are far from all that it was trained on, and what it knows nearest to each."""
+        from motionloom.pipeline.inference.request import caption_list
+
         return self.bundle.unknown_captions(caption_list(captions), caption_list(face, "face"))
 
     def ability(self, name: str) -> Callable[..., Any]:
@@ -193,9 +193,26 @@ class MotionModel(
         """Its longest motion; infinite where there is no limit."""
         return self.bundle.max_seconds
 
-    def _save_pretrained(self, save_directory: Path) -> None:
-        """Copy all that `generate` needs into the folder."""
+    def save_pretrained(self, save_directory: Path | str) -> None:
+        """Copy all that `generate` needs into a folder, new or one that holds an earlier copy."""
+        from motionloom.pipeline.inference.exported import write_bundle
+
         if (self.folder / BUNDLE_FILE).is_file():
             shutil.copytree(self.folder, save_directory, dirs_exist_ok=True)
         else:
-            write_bundle(self.folder, save_directory)
+            write_bundle(self.folder, Path(save_directory))
+
+    def push_to_hub(
+        self, repo_id: str, *, private: bool | None = None, token: str | None = None, **options: Any
+    ) -> str:
+        """Save it as a model of the hub, `owner/name`; returns the commit's address.
+
+        `options` are of huggingface_hub's `upload_folder`: commit_message, revision, create_pr and more.
+        """
+        from huggingface_hub import HfApi
+
+        api = HfApi(token=token)
+        name = api.create_repo(repo_id, private=private, exist_ok=True).repo_id
+        with TemporaryDirectory(prefix="motionloom-") as folder:
+            self.save_pretrained(folder)
+            return str(api.upload_folder(repo_id=name, folder_path=folder, **options))

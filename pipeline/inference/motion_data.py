@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.motion.body.rigid import RigidMotion
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.render.sound import Segment
+
+if TYPE_CHECKING:
+    from motionloom.datasets.motion.body.rigid import RigidMotion
+    from motionloom.pipeline.render.sound import Segment
 
 
 class OwnFile(Protocol):

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.script import DrivenSegment, Script
 
 if TYPE_CHECKING:
     from motionloom.datasets.audio.sound import Sound
+    from motionloom.pipeline.inference.script import DrivenSegment, Script
 
 Columns = NDArray[np.float32]
 """A layout's columns of a motion [T, D]."""
@@ -103,6 +103,8 @@ class Request:
     ) -> Request:
         """`samples` motions of a script: a file, or a `Script` whose sounds are seen from the current
         folder."""
+        from motionloom.pipeline.inference.script import Script
+
         require_seed(seed)
         require_samples(samples)
         segments = tuple(script.open() if isinstance(script, Script) else Script.read(Path(script)))

@@ -28,7 +28,6 @@ from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_path, write_json
 from motionloom.datasets.base.json_doors import require_plain
-from motionloom.datasets.base.printable import printable
 
 KNOWN_FILES = ("known.json", "known.safetensors")
 
@@ -94,6 +93,8 @@ class Unknown:
     @property
     def what(self) -> str:
         """The note for people, without the nearest captions."""
+        from motionloom.datasets.base.printable import printable
+
         shown = shorten(printable(self.caption), 100, placeholder=" …")
         if not self.english:
             return f"this model reads English: of '{shown}' it may show anything"

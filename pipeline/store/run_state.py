@@ -23,7 +23,6 @@ from motionloom.pipeline.store.run_folder import (
     stage_folder,
     stages_of,
 )
-from motionloom.pipeline.store.training_log import read_training_log
 from motionloom.pipeline.store.yaml import read_yaml
 
 Progress = Literal["finished", "outdated", "started", "missing"]
@@ -191,6 +190,8 @@ def run_state(run: Path) -> RunState:
 def _stage(
     run: Path, name: str, entry: Mapping[str, object], changes: dict[Path, Changed | None]
 ) -> StageState:
+    from motionloom.pipeline.store.training_log import read_training_log
+
     folder = stage_folder(run, name)
     written = {key: value for key, value in entry.items() if key not in ("kind", "inputs")}
     artifact = Artifact.find(folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from motionloom.models.layers.transformer import name_in_torch
 from motionloom.pipeline.baselines.mdm.network import Mdm
 from motionloom.pipeline.contract.stage import register
-from motionloom.pipeline.stages.networks.captions import DenoiserStage, DenoiserStageConfig
+from motionloom.pipeline.stages.networks.denoiser import DenoiserStage, DenoiserStageConfig
 from motionloom.pipeline.store.weights import Release
 
 

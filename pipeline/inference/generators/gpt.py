@@ -13,11 +13,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.models.gpt.sampling import Drawing, generate, sample_seeds
 from motionloom.pipeline.contract.generation import GenerationRequest
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.inference.generators.base import OfTokens
-from motionloom.pipeline.store.evaluator import embed_motions
 from motionloom.pipeline.store.networks import LoadedGpt, LoadedTma, device_of
 
 T = TypeVar("T")
@@ -83,6 +81,8 @@ class GptGenerator(OfTokens):
         self, prior: Tensor, frames: Sequence[int] | None, seeds: Sequence[int], sampling: SamplingConfig
     ) -> list[NDArray[np.float32]]:
         """One motion for each row of the prior [B, E]."""
+        from motionloom.models.gpt.sampling import Drawing, generate
+
         codes = generate(
             self.gpt.net,
             prior,
@@ -96,6 +96,8 @@ class GptGenerator(OfTokens):
 
 def candidate_seeds(seeds: Sequence[int], count: int) -> list[int]:
     """`count` seeds for each of `seeds`, grouped by motion; the first is the motion's own."""
+    from motionloom.models.layers.seeds import sample_seeds
+
     return [one for seed in seeds for one in (seed, *sample_seeds(seed, count - 1))]
 
 
@@ -114,6 +116,8 @@ def nearest_candidates(
         text: The texts' latents, float [B, Z].
         motions: B * K motions, a text's K draws next to each other.
     """
+    from motionloom.pipeline.store.evaluator import embed_motions
+
     count = len(motions) // len(text)
     latents = F.normalize(embed_motions(reranker, motions).double(), dim=-1).view(len(text), count, -1)
     near = (latents * F.normalize(text.cpu().double(), dim=-1)[:, None]).sum(-1)

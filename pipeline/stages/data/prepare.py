@@ -8,12 +8,10 @@ from pathlib import Path
 import torch
 from pydantic import Field, model_validator
 
-from motionloom.datasets.actions.measure import actions_of
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.records import Split
 from motionloom.datasets.loading.statistics import FeatureStats, compute
-from motionloom.datasets.text.build import build_text_cache
 from motionloom.pipeline.contract.stage import (
     CPU,
     RUNTIME,
@@ -24,7 +22,6 @@ from motionloom.pipeline.contract.stage import (
     StageKind,
     register,
 )
-from motionloom.pipeline.store.data import captions_of
 from motionloom.pipeline.store.files import copy_files
 from motionloom.pipeline.store.known_captions import representatives, save_known
 from motionloom.pipeline.store.text import BUILT_IN, TextPreview, TextSource, keep_place
@@ -126,6 +123,10 @@ class TextStage(StageKind[TextConfig]):
     version = 3  # captions that are known without their words
 
     def run(self, context: StageContext) -> None:
+        from motionloom.datasets.actions.measure import actions_of
+        from motionloom.datasets.text.build import build_text_cache
+        from motionloom.pipeline.store.data import captions_of
+
         keep_place(context.config.encoder, context.folder)
         data, actions = context.given["data"], set[str]()
         said = defaultdict[tuple[Split, bool], set[str]](set)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar, cast, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args
 
 import numpy as np
 import torch
@@ -12,21 +12,19 @@ from torch import nn
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.loading.condition_batches import Captioned
 from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
 from motionloom.datasets.motion.layout import MotionLayout, Part
-from motionloom.models.diffusion.network import TextDenoiser, TextDenoiserConfig
-from motionloom.pipeline.contract.generation import MotionGenerator
-from motionloom.pipeline.contract.showing import Curve
-from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs
-from motionloom.pipeline.inference.generators.diffusion import DiffusionMotion
+from motionloom.pipeline.contract.stage import Inputs
 from motionloom.pipeline.stages.networks.clips import clip_batches, motion_example
-from motionloom.pipeline.store.data import Data
-from motionloom.pipeline.store.text import TextSource
-from motionloom.pipeline.store.weights import ModelFacts, load_facts
-from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
+from motionloom.pipeline.store.weights import ModelFacts
+from motionloom.pipeline.training.config import TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
+
+if TYPE_CHECKING:
+    from motionloom.datasets.loading.condition_batches import Captioned
+    from motionloom.pipeline.store.data import Data
+    from motionloom.pipeline.store.text import TextSource
 
 
 class CaptionStageConfig(TrainedStageConfig):
@@ -69,40 +67,6 @@ class CaptionStage(TrainedStage[C, I, N]):
         conditions = {"text": MODALITIES["text"].example(batch, frames, width)}
         similarity = torch.empty(batch, width)
         return Example(motion_example(batch, frames, dim, conditions=conditions, similarity=similarity))
-
-
-class DenoiserStageConfig(CaptionStageConfig):
-    """A denoiser conditioned on a sentence embedding; the defaults are MDM's but for the steps."""
-
-    net: TextDenoiserConfig = TextDenoiserConfig()
-    train: TrainConfig = TrainConfig(steps=200_000, batch_size=64)
-
-
-D = TypeVar("D", bound=DenoiserStageConfig)
-T = TypeVar("T", bound=TextDenoiser)
-
-
-class DenoiserStage(CaptionStage[D, CaptionInputs, T]):
-    """A stage of a `TextDenoiser`; subclasses name the network and build its module."""
-
-    denoiser: type[T]
-    offers = frozenset({GENERATOR})
-    inputs = CaptionInputs
-    curves = (Curve("loss"),)
-
-    def facts(self, config: D, inputs: CaptionInputs) -> ModelFacts:
-        layout = inputs.data.layout
-        width = len(part_columns(layout, config.part))
-        extra = {"motion_dim": width, "text_dim": inputs.text.dim, "part": config.part}
-        return ModelFacts.of(self.name, config.net, layout, extra)
-
-    def network(self, facts: ModelFacts, inputs: CaptionInputs) -> T:
-        config = type(self.config.model_fields["net"].default).parse(facts.config, facts.where)
-        return self.denoiser(config, facts.fact("motion_dim", int), facts.fact("text_dim", int))
-
-    def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
-        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
-        return DiffusionMotion(given["stats"].layout, part, given, net)
 
 
 def clips_of(config: CaptionStageConfig, layout: MotionLayout, captioned: Captioned | None) -> dict[str, Any]:

@@ -10,18 +10,17 @@ import torch
 from torch.utils.data import Dataset
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
-from motionloom.datasets.loading.crops import Crops
-from motionloom.datasets.loading.plan import Share
-from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.datasets.modalities.table import MODALITIES
-from motionloom.datasets.shards.clips import ClipDataset
-from motionloom.pipeline.store.data import Data
-from motionloom.pipeline.training.config import SizedBatches
 from motionloom.pipeline.training.trained_stage import Batches
 
 if TYPE_CHECKING:
+    from motionloom.datasets.loading.crops import Crops
+    from motionloom.datasets.loading.plan import Share
+    from motionloom.datasets.loading.statistics import FeatureStats
+    from motionloom.datasets.shards.clips import ClipDataset
     from motionloom.models.training.stage_module import Batch
+    from motionloom.pipeline.store.data import Data
+    from motionloom.pipeline.training.config import SizedBatches
 
 
 MUSIC = {"audio": 1.0}
@@ -47,6 +46,8 @@ def clip_batches(
         dataset: Trained on in place of the training split.
         draws: How clips are drawn in training alone.
     """
+    from motionloom.datasets.loading.condition_batches import ConditionBatches, EvalBatches
+
     dataset = data.split("train") if dataset is None else dataset
 
     def of(some: ClipDataset) -> FeatureStats | Crops:

@@ -19,7 +19,6 @@ from motionloom.pipeline.contract.stage import GENERATOR, CompletedStage, Inputs
 from motionloom.pipeline.inference.generators.gpt import GptGenerator
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.tokens import Tokens, token_batches, token_example
-from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import (
     LoadedGpt,
     LoadedTma,
@@ -28,7 +27,6 @@ from motionloom.pipeline.store.networks import (
     stream_facts,
 )
 from motionloom.pipeline.store.text import TextSource
-from motionloom.pipeline.store.tokens import GptClips, gpt_clips
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
@@ -36,6 +34,8 @@ from motionloom.pipeline.training.warm_start import require_same_start, require_
 
 if TYPE_CHECKING:
     from motionloom.models.training.stage_module import StageModule
+    from motionloom.pipeline.store.data import Data
+    from motionloom.pipeline.store.tokens import GptClips
 
 Prior = Literal["tma", "sentence"]
 
@@ -137,6 +137,8 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     def batches(
         self, config: GptStageConfig, net: InterleavedGPT, inputs: GptInputs, seed: int, log: Log
     ) -> Batches:
+        from motionloom.pipeline.store.tokens import gpt_clips
+
         data, text, tokenizer = inputs.data, inputs.text.cache, inputs.tokenizer.net
         # TMA's text latents are the prior, or the target of L_align, or both.
         tma = inputs.tma if config.prior == "tma" or config.aligned else None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,6 @@ from pydantic import Field, create_model
 from torch.utils.data import Dataset
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.loading.batches import WindowBatches
-from motionloom.datasets.loading.condition_batches import EvalBatches
-from motionloom.datasets.loading.plan import Share
-from motionloom.datasets.loading.statistics import FeatureStats
 from motionloom.models.tokenizer.base import GROUP_FRAMES, Tokenizer, TokenizerConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig, SeparateConfig
 from motionloom.models.tokenizer.single import FsqConfig, MqConfig, RvqConfig, VqConfig
@@ -22,12 +18,16 @@ from motionloom.pipeline.contract.showing import Curve
 from motionloom.pipeline.contract.stage import Inputs, Stage, filled_by, register
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.clips import motion_example
-from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.networks import TrainedTokenizer
 from motionloom.pipeline.store.weights import ModelFacts
 from motionloom.pipeline.training.config import TrainConfig, TrainedStageConfig
 from motionloom.pipeline.training.trained_stage import Batches, Example, Log, TrainedStage
 from motionloom.pipeline.training.warm_start import require_same_start, require_start_layout
+
+if TYPE_CHECKING:
+    from motionloom.datasets.loading.plan import Share
+    from motionloom.datasets.loading.statistics import FeatureStats
+    from motionloom.pipeline.store.data import Data
 
 _FREE = frozenset(
     {
@@ -144,6 +144,9 @@ def window_batches(
     config: WindowStageConfig, inputs: WindowInputs, columns: NDArray[np.int64], seed: int, **validation: Any
 ) -> Batches:
     """Windows of the training split; validation on held-out clips, as `EvalBatches` takes it."""
+    from motionloom.datasets.loading.batches import WindowBatches
+    from motionloom.datasets.loading.condition_batches import EvalBatches
+
     data, stats = inputs.data, inputs.stats
     dataset, window = data.split("train"), config.window
 

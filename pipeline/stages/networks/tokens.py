@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -14,10 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.loading.plan import ALONE, Share
-from motionloom.datasets.loading.statistics import FeatureStats
-from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.models.tokenizer.base import Stream, Tokenizer
 from motionloom.pipeline.contract.showing import Bars, Showing
 from motionloom.pipeline.contract.stage import (
@@ -31,9 +28,13 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.contract.units import Arrays
 from motionloom.pipeline.store.networks import device_of
-from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore
 from motionloom.pipeline.training.config import SizedBatches
 from motionloom.pipeline.training.trained_stage import Batches
+
+if TYPE_CHECKING:
+    from motionloom.datasets.loading.statistics import FeatureStats
+    from motionloom.datasets.shards.clips import ClipDataset
+    from motionloom.pipeline.store.tokens import GptClips, TokenBatches, TokenStore
 
 
 class TokensConfig(StageConfig):
@@ -51,6 +52,8 @@ class Tokens:
     streams: tuple[Stream, ...]
 
     def open(self, split: str) -> TokenStore:
+        from motionloom.pipeline.store.tokens import TokenStore
+
         return TokenStore.load(
             self.folder / f"tokens-{split}.safetensors", {s.name: s.per_group for s in self.streams}
         )
@@ -67,6 +70,8 @@ class TokensStage(StageKind[TokensConfig]):
     shares = True
 
     def share(self, context: StageContext) -> None:
+        from motionloom.datasets.base.progress import Meter
+
         for encoded in self._splits(context):
             sizes = [len(items) for items in encoded.batches]
             split, total = encoded.dataset.split, context.units.mine(sizes)
@@ -145,6 +150,8 @@ class EncodedSplit:
 
     def store(self, codes: Iterable[Arrays]) -> TokenStore:
         """All batches' codes, in order, as one store in the order of the clips."""
+        from motionloom.pipeline.store.tokens import TokenStore
+
         starts = np.concatenate([[0], np.cumsum(self.groups)]).astype(np.int64)
         per_group = {s.name: s.per_group for s in self.tokenizer.streams}
         flat = {name: torch.zeros(int(starts[-1]) * n, dtype=torch.int64) for name, n in per_group.items()}
@@ -182,6 +189,7 @@ def token_batches(
         tables: What captions are read as: `prior`, `similarity` and `latents` of `TokenBatches`.
         wrap: Makes other batches of these.
     """
+    from motionloom.pipeline.store.tokens import TokenBatches
 
     def batches(split: str, training: bool, batch: int, share: Share = ALONE) -> SizedBatches:
         clips = clips_of(split)
