@@ -9,7 +9,13 @@ import pytest
 from own_package import python
 
 ROOT = Path(__file__).resolve().parents[1]
-FENCE = ("pipeline/baselines", "pipeline/curation", "pipeline/editing", "datasets/convert/sets")
+FENCE = (
+    "pipeline/baselines",
+    "pipeline/curation",
+    "pipeline/editing",
+    "pipeline/songs",
+    "datasets/convert/sets",
+)
 
 USE = """
 import pkgutil, sys

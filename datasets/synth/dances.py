@@ -62,7 +62,7 @@ class DanceConfig(Config):
     """Slowest and fastest song, beats a minute."""
     music: Literal["even", "played"] = "even"
     """Metronomes of the built-in synthesiser, or songs that a band plays and a studio records: with a form,
-    breaks, drifting tempi and real instruments. Those need FluidSynth and a sound font (`music/band.py`)."""
+    breaks, drifting tempi and real instruments. Those need FluidSynth and a sound font (`pipeline/songs`)."""
     hold_out_tempi: list[tuple[int, int]] = Field(default_factory=list)
     """Ranges of beats a minute whose songs are kept for testing, for example `[[110, 119]]`."""
     share: float | None = Field(None, gt=0, le=1)

@@ -39,7 +39,7 @@ from motionloom.datasets.synth.captions import Wordings, body_captions, face_cap
 from motionloom.datasets.synth.choreography import choreograph, dancing_face, dancing_hands
 from motionloom.datasets.synth.dances import Dance, DanceConfig, DanceTruth, dance, plan_dance
 from motionloom.datasets.synth.hands_and_face import express, grip_hand, shape_hand
-from motionloom.datasets.synth.music.recording import render_song, song_features
+from motionloom.datasets.synth.music.recording import PLAYED, player, render_song, song_features
 
 CONVERTER_VERSION = 3  # runs in a circle, four jumps, who sits and then waves
 LICENCE = "CC0-1.0"
@@ -346,6 +346,8 @@ def synthesize(config: SynthConfig, out: Path, workers: int = 1, progress: bool 
     audio = None
     if config.dances is not None:
         options["audio_version"] = AUDIO_VERSION
+        if config.dances.music == PLAYED:
+            player(PLAYED).version()  # who lacks an instrument learns it before the first clip
         audio = settings_at(config.motion_layout.fps).dump()
     splits = [_split(index, config) for index in range(config.clips)]
     for combination in (*config.hold_out, *config.hold_out_val):

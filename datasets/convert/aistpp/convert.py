@@ -28,8 +28,7 @@ from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseCli
 from motionloom.datasets.convert.common.splits import read_ids
 from motionloom.datasets.motion.features.smpl75 import SMPL_JOINTS
 from motionloom.datasets.shards.sample import Sample
-from motionloom.datasets.synth.music.band import band_version
-from motionloom.datasets.synth.music.recording import render_song
+from motionloom.datasets.synth.music.recording import PLAYED, player, render_song
 
 FPS = 60.0
 MOTIONS = "motions"
@@ -173,7 +172,7 @@ class Aistpp(BodyRelease[AistppConfig]):
         return clip.id if self.config.has_band else str(clip.entry.facts["music"])
 
     def options(self) -> dict[str, object]:
-        return super().options() | ({"band": band_version()} if self.config.has_band else {})
+        return super().options() | ({"band": player(PLAYED).version()} if self.config.has_band else {})
 
     def convert(self, clip: ReleaseClip) -> Sample:
         sample, config = super().convert(clip), self.config

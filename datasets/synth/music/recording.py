@@ -1,10 +1,9 @@
-"""Recorded songs and their features: by the built-in synthesiser, or by a band, whose dry music goes through
-rooms, equalisers, compression, noise, gain and coding.
-"""
+"""Recorded songs and their features: even ones by the built-in synthesiser, played ones by a `SongPlayer`."""
 
 from __future__ import annotations
 
-import io
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -12,21 +11,44 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.audio.features import DIM, features_of
 from motionloom.datasets.audio.sound import Sound
-from motionloom.datasets.synth.actions.maths import Array
-from motionloom.datasets.synth.music.band import play_band
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.register import Table, discover
 from motionloom.datasets.synth.music.song import Song
-from motionloom.datasets.synth.music.synthesizer import equalize, synthesize
+from motionloom.datasets.synth.music.synthesizer import synthesize
 
-_CODECS = (("OGG", "VORBIS"), ("MP3", "MPEG_LAYER_III"))
+PLAYED = "played"
+"""Name of the player of songs that are not even."""
+
+
+@dataclass(frozen=True)
+class SongPlayer:
+    """Plays songs in another way than the built-in synthesiser; `register` adds one."""
+
+    name: str
+    play: Callable[[Song, int], NDArray[np.float32]]
+    """Song and sample rate -> mono samples [seconds * rate] in -1..1, the same bytes each time."""
+    version: Callable[[], str]
+    """What the sound depends on beside the song; `UserError` where nothing can play."""
+
+
+PLAYERS: Table[SongPlayer] = Table(SongPlayer, "player of songs")
+
+
+def player(name: str) -> SongPlayer:
+    """A player by name; `UserError` where nobody has registered one."""
+    discover()
+    if name not in PLAYERS:
+        raise UserError(
+            f"music '{name}': nothing installed plays such songs; install motionloom with its folder "
+            f"pipeline/songs, or take music: even"
+        )
+    return PLAYERS[name]
 
 
 @lru_cache(maxsize=64)
 def render_song(song: Song, rate: int) -> NDArray[np.float32]:
     """The whole song as mono samples [seconds * rate] in -1..1; read-only, the same bytes each time."""
-    if song.played:
-        samples = record(play_band(song, rate), rate, np.random.default_rng([song.seed, song.number, 257]))
-    else:
-        samples = synthesize(song, rate)
+    samples = player(PLAYED).play(song, rate) if song.played else synthesize(song, rate)
     samples.setflags(write=False)
     return samples
 
@@ -41,51 +63,3 @@ def song_features(song: Song, rate: int, fps: float, width: int = DIM) -> NDArra
     rows = np.ascontiguousarray(rows)
     rows.setflags(write=False)
     return rows
-
-
-def record(dry: NDArray[np.float32], rate: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Dry samples [n], loudest 1 -> a recording of them [n] in -1..1, at the same times.
-
-    Each step is drawn; none moves a beat by more than the room's first reflections.
-    """
-    out = np.asarray(dry, dtype=np.float64)
-    if rng.random() < 0.6:
-        out = _room(out, rate, rng)
-    if rng.random() < 0.7:
-        out = equalize(out, rate, tuple(rng.uniform(-9.0, 6.0, 3)))
-    if rng.random() < 0.6:  # a compressor, or the distortion of one that is driven hard
-        drive = float(np.exp(rng.uniform(0.0, 2.3)))
-        out = np.tanh(drive * out) / np.tanh(drive)
-    if rng.random() < 0.4:
-        out = out + 10 ** (rng.uniform(-60, -30) / 20) * rng.standard_normal(len(out))
-    gain = 10 ** (rng.uniform(-20.0, 0.0) / 20)
-    out = gain * out / max(1e-9, float(np.abs(out).max()))
-    samples = np.asarray(np.clip(out, -1.0, 1.0), dtype=np.float32)
-    return _coded(samples, rate, rng) if rng.random() < 0.5 else samples
-
-
-def _room(sound: Array, rate: int, rng: np.random.Generator) -> Array:
-    """Reverberation: noise that fades within 0.15 to 1.2 seconds, behind the direct sound."""
-    from scipy import signal
-
-    fades = rng.uniform(0.15, 1.2)
-    t = np.arange(int(fades * rate)) / rate
-    tail = rng.standard_normal(len(t)) * np.exp(-6.9 * t / fades)
-    tail *= rng.uniform(0.05, 0.5) / np.sqrt((tail**2).sum())
-    return np.asarray(sound + signal.oaconvolve(sound, tail)[: len(sound)])
-
-
-def _coded(samples: NDArray[np.float32], rate: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Through a lossy codec and back, with the delay that it adds taken off."""
-    import soundfile
-
-    kind, subtype = _CODECS[int(rng.integers(len(_CODECS)))]
-    file = io.BytesIO()
-    level = float(rng.uniform(0.3, 0.95))
-    soundfile.write(file, samples, rate, format=kind, subtype=subtype, compression_level=level)
-    file.seek(0)
-    decoded, _ = soundfile.read(file, dtype="float32")
-    out = np.zeros_like(samples)
-    kept = min(len(out), len(decoded))
-    out[:kept] = np.clip(decoded[:kept], -1.0, 1.0)
-    return out

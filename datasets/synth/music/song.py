@@ -3,7 +3,7 @@
 A song is a pure function of (seed, number, options). It has a grid of beats, numbered from 0, and bars that
 begin at every `meter`-th of them. *Even* songs, which the built-in synthesiser plays, are metronomes: their
 first beat is at 0, their bars have four beats, and sections of four bars alternate between two kinds, A and
-B. *Played* songs, which a band of real instruments plays (`band.py`), begin after a silence, drift in tempo,
+B. *Played* songs, for a band of real instruments (`pipeline/songs`), begin after a silence, drift in tempo,
 may have three beats a bar, and have a form: intros, quiet and loud sections and breaks.
 """
 

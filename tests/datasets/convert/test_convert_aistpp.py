@@ -28,7 +28,7 @@ from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.codec import decode
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.reader import ShardDataset
-from motionloom.datasets.synth.music.band import band_version
+from motionloom.datasets.synth.music.recording import PLAYED, player
 
 REAL = "gBR_sBM_cAll_d04_mBR0_ch01"
 IGNORED = "gBR_sBM_cAll_d04_mBR0_ch08"
@@ -209,7 +209,7 @@ def test_lengths_that_differ_are_cut_or_left_out(copy: Path) -> None:
 def test_a_band_plays_at_the_tempo_and_phase_of_the_dance(fixture: Path, tmp_path: Path) -> None:
     """The genuine dance: librosa hears its tempo in what plays, and beats where it stops; CC BY 4.0 alone."""
     try:
-        band_version()
+        player(PLAYED).version()
     except UserError as error:
         pytest.skip(str(error))
     config = AistppConfig(source=fixture, music="band", sound_rate=32_000)

@@ -10,11 +10,12 @@ import pytest
 from motionloom.datasets.actions.dances import longest_stand
 from motionloom.datasets.actions.measure import agrees
 from motionloom.datasets.audio.features import audio_features, settings_at
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.synth.choreography import choreograph
 from motionloom.datasets.synth.dances import DanceConditions, DanceConfig
 from motionloom.datasets.synth.generate import Clip, SynthConfig, dance_of, make_clip, make_sample, split_of
 from motionloom.datasets.synth.music.genres import GENRES
-from motionloom.datasets.synth.music.recording import render_song
+from motionloom.datasets.synth.music.recording import player, render_song
 from motionloom.datasets.synth.music.song import Song, draw_song
 from motionloom.models.metrics.dance import foot_skating
 from motionloom.models.metrics.dance_beats import beat_align
@@ -142,3 +143,8 @@ def test_size_follows_the_energy_and_a_break_is_held() -> None:
                 speeds["loud" if around[1] > 0.8 else "quiet" if around[1] < 0.45 else ""].append(value)
     assert np.mean(speeds["loud"]) > 1.7 * np.mean(speeds["quiet"])
     assert np.mean(speeds["break"]) < 0.3 * np.mean(speeds["quiet"])
+
+
+def test_songs_of_an_unknown_player_are_refused_in_one_sentence() -> None:
+    with pytest.raises(UserError, match="music 'nobody'"):
+        player("nobody")

@@ -12,7 +12,7 @@ unevenness of hands. In a break one chord rings. Beats are those of the song's g
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -30,7 +30,7 @@ DRUMS = 9
 """The channel of drums."""
 _DRUM_BANK = 128
 
-_KICK, _SNARE, _CLAP, _HAT, _OPEN_HAT, _CRASH, _RIDE, _SHAKER, _RIM = 36, 38, 39, 42, 46, 49, 51, 70, 37
+KICK, SNARE, _CLAP, HAT, OPEN_HAT, CRASH, RIDE, SHAKER, _RIM = 36, 38, 39, 42, 46, 49, 51, 70, 37
 _TOMS = (50, 48, 45, 43)
 _BASS, _CHORDS, _PAD, _LEAD = range(4)
 _PROGRAMS = {
@@ -148,21 +148,35 @@ def score(song: Song) -> list[Note]:
 
 def play_band(song: Song, rate: int) -> NDArray[np.float32]:
     """The song as dry mono samples [seconds * rate], loudest 1; `UserError` where there is no band."""
+    rng = np.random.default_rng([song.seed, song.number, 251])
+    programs = instruments(song, rng)
+    notes = [note._replace(at=note.at + _SOFT_HANDS * rng.standard_normal()) for note in score(song)]
+    sound = perform(notes, programs, song.seconds, rate)
+    return np.asarray(sound / max(1.0, float(np.abs(sound).max())), dtype=np.float32)
+
+
+def instruments(song: Song, rng: np.random.Generator) -> dict[int, int]:
+    """Programs of a song's band by channel; that of the drums is drawn by `rng`."""
+    line_up = LineUp.drawn(song, np.random.default_rng([song.seed, song.number, 241]))
+    return line_up.programs | {DRUMS: int(rng.choice([0, 8, 16, 24, 25, 32, 40]))}
+
+
+def perform(
+    notes: Iterable[Note], programs: Mapping[int, int], seconds: float, rate: int
+) -> NDArray[np.float32]:
+    """Notes played by instruments, by channel, as dry mono samples [seconds * rate]; 1 is usual, not most."""
     font = sound_font()
     dry = {"synth.reverb.active": 0, "synth.chorus.active": 0}
     synth = _fluidsynth().Synth(gain=0.5, samplerate=rate, channels=16, **dry)
     number = synth.sfload(str(font))
-    rng = np.random.default_rng([song.seed, song.number, 251])
-    line_up = LineUp.drawn(song, np.random.default_rng([song.seed, song.number, 241]))
-    for part, program in line_up.programs.items():
-        synth.program_select(part, number, 0, program)
-    synth.program_select(DRUMS, number, _DRUM_BANK, int(rng.choice([0, 8, 16, 24, 25, 32, 40])))
+    for channel, program in programs.items():
+        synth.program_select(channel, number, _DRUM_BANK if channel == DRUMS else 0, program)
     strokes: list[tuple[int, bool, Note]] = []
-    for note in score(song):
-        at = max(0.0, note.at + _SOFT_HANDS * rng.standard_normal())
+    for note in notes:
+        at = max(0.0, note.at)
         strokes.append((round(at * rate), True, note))
         strokes.append((round((at + note.seconds) * rate), False, note))
-    total, blocks, now = round(song.seconds * rate), [], 0
+    total, blocks, now = round(seconds * rate), [], 0
     # Of what is at one time, notes end before others begin.
     for at, begins, note in sorted(strokes, key=lambda stroke: stroke[:2]):
         if at >= total:
@@ -177,8 +191,7 @@ def play_band(song: Song, rate: int) -> NDArray[np.float32]:
     if now < total:
         blocks.append(synth.get_samples(total - now))
     synth.delete()
-    sound = np.concatenate(blocks).reshape(-1, 2).mean(axis=1)
-    return np.asarray(sound / max(1.0, float(np.abs(sound).max())), dtype=np.float32)
+    return np.asarray(np.concatenate(blocks).reshape(-1, 2).mean(axis=1), dtype=np.float32)
 
 
 # ---- who plays what
@@ -202,13 +215,13 @@ def _drums(
     quiet = section.energy < 0.45
     loud = 0.45 + 0.55 * section.energy
     if begins and section.energy > 0.6 and how.kit in ("full", "sparse"):
-        yield _stroke(song, bar, 0, how, _CRASH, 100 * loud)
+        yield _stroke(song, bar, 0, how, CRASH, 100 * loud)
     fill = ends and how.kit == "full" and rng.random() < 0.6
     every = 4 if section.energy < 0.35 else 2 if section.energy < 0.8 else int(rng.choice([1, 2]))
-    time_keeper = _RIDE if section.kind else _HAT
+    time_keeper = RIDE if section.kind else HAT
     for step in range(steps):
         if fill and step >= steps - 4:
-            yield _stroke(song, bar, step, how, _TOMS[step % 4] if rng.random() < 0.7 else _SNARE, 95 * loud)
+            yield _stroke(song, bar, step, how, _TOMS[step % 4] if rng.random() < 0.7 else SNARE, 95 * loud)
             continue
         if how.kit == "sparse" and rng.random() < 0.3:
             continue
@@ -217,15 +230,15 @@ def _drums(
             yield _stroke(song, bar, step, how, time_keeper, 75 * loud * accent * rng.uniform(0.8, 1.1))
         if how.kit == "hands":
             if step % 2 == 0:
-                yield _stroke(song, bar, step, how, _SHAKER, 80 * loud * accent)
+                yield _stroke(song, bar, step, how, SHAKER, 80 * loud * accent)
             if step in backbeat:
                 yield _stroke(song, bar, step, how, _CLAP, 95 * loud)
         if quiet or how.kit in ("hats", "hands"):
             continue
         if step in kicks:
-            yield _stroke(song, bar, step, how, _KICK, 105 * loud)
+            yield _stroke(song, bar, step, how, KICK, 105 * loud)
         if step in backbeat and how.kit != "kick":
-            yield _stroke(song, bar, step, how, _SNARE if section.energy > 0.5 else _RIM, 100 * loud)
+            yield _stroke(song, bar, step, how, SNARE if section.energy > 0.5 else _RIM, 100 * loud)
 
 
 def _harmony(song: Song, bar: int, section: Section, how: LineUp, rng: np.random.Generator) -> Iterator[Note]:
@@ -279,7 +292,7 @@ def _break(song: Song, bar: int, how: LineUp, begins: bool) -> Iterator[Note]:
         return
     genre = song.style
     if how.kit in ("full", "sparse"):
-        yield _stroke(song, bar, 0, how, _CRASH, 80)
+        yield _stroke(song, bar, 0, how, CRASH, 80)
     for pitch in _chord(song, genre.progressions[0][0]):
         yield _note(song, bar, 0, 4 * song.meter, how, _PAD if how.with_pad else _CHORDS, pitch, 70)
 

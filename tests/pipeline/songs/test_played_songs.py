@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.synth.music import band
-from motionloom.datasets.synth.music.band import band_version, sound_font
 from motionloom.datasets.synth.music.recording import render_song
 from motionloom.datasets.synth.music.song import Song, draw_song
+from motionloom.pipeline.songs import band
+from motionloom.pipeline.songs.band import band_version, sound_font
 
 RATE = 16_000
 
