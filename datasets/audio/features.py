@@ -14,7 +14,7 @@
 Notable choices:
 - The frame rate is what is chosen; the sound is resampled to 512 samples a frame, as published: 60 frames a
   second are 30720 Hz, 7.5 are 3840 Hz.
-- librosa computes everything, each spectrum once (`spectra`).
+- The numbers are those of librosa, whose parts that numba compiles are not used (`spectra`, `onsets`).
 - Frames of chroma 140 dB below the loudest one have no notes: what is there is rounding, which librosa scales
   up to 1.
 - A frame's number is time x frames a second; a sound of n samples has 1 + n // 512 frames.
@@ -34,8 +34,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
+from motionloom.datasets.audio.constant_q import chroma, constant_q, fitting_octaves
+from motionloom.datasets.audio.onsets import decibels, onset_strength, tempogram, track_beats
 from motionloom.datasets.audio.sound import Sound, resample_sound
-from motionloom.datasets.audio.spectra import HOP, load_librosa, separate, tuning
+from motionloom.datasets.audio.spectra import HOP, separate
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 
@@ -50,17 +52,8 @@ _MFCC = 20
 _SHORTEST = 3
 """Frames; fewer have no change of MFCC."""
 
-_BINS = 36
-"""Constant-Q bins an octave."""
-
 _SILENCE = 1e-7
 """-140 dB."""
-
-_BLOCK = 2048
-"""Frames of tempograms made at a time: librosa's take some 20 kB a frame, and its beat tracker makes one only
-to know its mean. Blocks give the same numbers."""
-_TEMPO_SECONDS = 8.0
-"""Length of the windows that the tempo is measured in, as in `librosa.feature.tempo`."""
 
 
 class AudioSettings(Config):
@@ -90,22 +83,24 @@ def audio_features(
     `UserError` for sound of fewer than three frames. Chroma has 7 octaves from C1 on, or as many as fit below
     half the sample rate (5 at 7.5 frames a second).
     """
+    from scipy.fft import dct
+    from scipy.signal import savgol_filter
+
     settings = settings or AudioSettings()
-    samples, octaves = _prepared(samples, rate, settings), fitting_octaves(settings.rate)
-    librosa = load_librosa()
+    samples = _prepared(samples, rate, settings)
+    octaves = fitting_octaves(settings.rate)
     with _no_remarks():
         spectra = separate(samples, settings.rate)
-        mfcc = librosa.feature.mfcc(S=librosa.power_to_db(spectra.mel, ref=np.max), n_mfcc=_MFCC)
-        notes = _constant_q(spectra.harmonic, settings.rate, octaves)
-        onsets = onset_strength(spectra.percussive_mel)
-        columns = [
-            mfcc,
-            librosa.feature.delta(mfcc, width=3),
-            librosa.feature.chroma_cqt(C=notes, n_octaves=octaves, bins_per_octave=_BINS),
-            onsets[None],
-            np.bincount(track_beats(onsets, settings.rate), minlength=len(onsets))[None],
-            tempogram(onsets, DIM - 54),
-        ]
+    mfcc = dct(decibels(spectra.mel, float(spectra.mel.max())), axis=0, norm="ortho")[:_MFCC]
+    onsets = onset_strength(spectra.percussive_mel)
+    columns = [
+        mfcc,
+        savgol_filter(mfcc, 3, polyorder=1, deriv=1, axis=1),
+        chroma(_audible(constant_q(spectra.harmonic, settings.rate, octaves))),
+        onsets[None],
+        np.bincount(track_beats(onsets, settings.rate), minlength=len(onsets))[None],
+        tempogram(onsets, DIM - 54),
+    ]
     return np.ascontiguousarray(np.concatenate(columns).T, dtype=np.float32)
 
 
@@ -115,7 +110,7 @@ def beats(samples: NDArray[np.float32], rate: int) -> NDArray[np.float64]:
     samples = _prepared(samples, rate, settings)
     with _no_remarks():
         onsets = onset_strength(separate(samples, settings.rate).percussive_mel)
-        return np.asarray(track_beats(onsets, settings.rate) / settings.fps)
+    return np.asarray(track_beats(onsets, settings.rate) / settings.fps)
 
 
 def features_of(sound: Sound, fps: float, width: int = DIM, rate: float | None = None) -> NDArray[np.float32]:
@@ -177,20 +172,6 @@ def rows_at(
     return out
 
 
-def fitting_octaves(rate: int) -> int:
-    """Return how many octaves above C1 fit below half the rate, at most 7; 0 where not even one does."""
-    librosa = load_librosa()
-    for octaves in range(7, 0, -1):
-        # Tuning moves the filters by less than half a bin.
-        frequencies = librosa.cqt_frequencies(
-            octaves * _BINS, fmin=librosa.note_to_hz("C1"), bins_per_octave=_BINS, tuning=0.5
-        )
-        _, highest = librosa.filters.wavelet_lengths(freqs=frequencies, sr=rate)
-        if highest <= rate / 2:
-            return octaves
-    return 0
-
-
 def _prepared(samples: NDArray[np.float32], rate: int, settings: AudioSettings) -> NDArray[np.float32]:
     """The sound at the settings' rate."""
     if samples.ndim != 1 or not np.isfinite(samples).all():
@@ -204,62 +185,16 @@ def _prepared(samples: NDArray[np.float32], rate: int, settings: AudioSettings) 
     return samples
 
 
-def _constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArray[np.float32]:
-    """Magnitudes [36 x octaves, T] from C1 up; frames of nothing but rounding are 0."""
-    spectrum = load_librosa().cqt(
-        samples,
-        sr=rate,
-        hop_length=HOP,
-        n_bins=_BINS * octaves,
-        bins_per_octave=_BINS,
-        tuning=tuning(samples, rate, _BINS),
-    )
+def _audible(notes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Magnitudes [N, T] of notes; frames of nothing but rounding are 0."""
     # Filters leak rounding into silence, and chroma would scale it up to full notes.
-    magnitude = np.abs(spectrum)
-    loudest = magnitude.max(axis=0)
-    magnitude[:, loudest < _SILENCE * loudest.max()] = 0
-    return np.asarray(magnitude)
-
-
-def onset_strength(mel: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Mel power [128, T] -> [T]: the median rise over the bands."""
-    librosa = load_librosa()
-    strength = librosa.onset.onset_strength(S=librosa.power_to_db(mel), aggregate=np.median)
-    return np.asarray(strength)
-
-
-def tempogram(onsets: NDArray[np.float32], width: int) -> NDArray[np.float32]:
-    """Onset strengths [T] -> [width, T]: autocorrelation around each frame, the largest value 1."""
-    return np.concatenate([block.astype(np.float32) for block in _tempograms(onsets, width)], axis=1)
-
-
-def track_beats(onsets: NDArray[np.float32], rate: int) -> NDArray[np.int64]:
-    """`librosa.beat.beat_track`: frames of the beats of onset strengths [T], ascending."""
-    librosa = load_librosa()
-    if not onsets.any():
-        return np.empty(0, dtype=np.int64)
-    width = int(librosa.time_to_frames(_TEMPO_SECONDS, sr=rate, hop_length=HOP))
-    mean = sum(block.sum(axis=1, keepdims=True) for block in _tempograms(onsets, width)) / len(onsets)
-    tempo = librosa.feature.tempo(tg=mean, sr=rate, hop_length=HOP)
-    with np.errstate(divide="ignore"):  # at 5 frames a second a beat can be a frame, and 0 a step it refuses
-        _, frames = librosa.beat.beat_track(onset_envelope=onsets, sr=rate, hop_length=HOP, bpm=tempo)
-    return np.asarray(frames)
-
-
-def _tempograms(onsets: NDArray[np.float32], width: int) -> Iterator[NDArray[np.float64]]:
-    """[width, frames] of block after block."""
-    # librosa's own padding of a centred tempogram, made once for all blocks.
-    padded = np.pad(onsets, width // 2, mode="linear_ramp", end_values=0)
-    for start in range(0, len(onsets), _BLOCK):
-        stop = min(start + _BLOCK, len(onsets))
-        around = padded[start : stop + width - 1]
-        yield load_librosa().feature.tempogram(onset_envelope=around, win_length=width, center=False)
+    loudest = notes.max(axis=0)
+    return np.asarray(np.where(loudest < _SILENCE * loudest.max(), np.float32(0), notes))
 
 
 @contextmanager
 def _no_remarks() -> Iterator[None]:
-    """Silence librosa's warnings of short sounds and of mel bands without a bin: both are as published."""
+    """Silence librosa's warning of mel bands without a bin: as published."""
     with warnings.catch_warnings():
-        for remark in ("n_fft=", "Empty filters", "Trying to estimate"):
-            warnings.filterwarnings("ignore", message=remark, category=UserWarning)
+        warnings.filterwarnings("ignore", message="Empty filters", category=UserWarning)
         yield

@@ -1,11 +1,6 @@
-"""Spectra of a sound: mel power, harmonic and percussive shares, tuning.
+"""Spectra of a sound: mel power, harmonic and percussive shares, tuning, with the numbers of librosa.
 
-Everything is librosa's; three things are arranged here:
-
-- librosa compiles parts of itself with numba: half a minute when it is first used in an environment, then
-  seconds in each process. Processes that fill one cache of numba's at once can mix their files and crash
-  (numba issue 10128), which the workers of a first conversion would do. So the first process compiles all
-  that audio features use behind a lock and leaves a mark; whoever finds the mark just imports.
+Of librosa only `filters` is imported: what numba compiles of it takes half a minute where it is first used.
 
 - The medians of harmonic-percussive separation run along rows of one long line. scipy does that ten times as
   fast as the two-dimensional filters that `librosa.effects.hpss` calls, with the same numbers. One transform
@@ -16,20 +11,14 @@ Everything is librosa's; three things are arranged here:
 
 from __future__ import annotations
 
-import fcntl
-import os
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import distribution, version
-from pathlib import Path
-from typing import Any
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float32]
 FFT = 2048
 HOP = 512
 MELS = 128
@@ -40,53 +29,22 @@ _MARGIN = 32
 
 _PIECE = 2048
 """Frames of a piece without its margins; some 100 MB are used at once."""
-
-
-@lru_cache(maxsize=1)
-def load_librosa() -> Any:
-    """The module, with what audio features use of it compiled."""
-    mark = _mark()
-    if mark.exists():
-        return _imported()
-    with mark.with_suffix(".lock").open("ab") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        module = _imported()
-        mark.touch()
-    return module
-
-
-def _mark() -> Path:
-    """The file whose existence means that numba's cache of this installation and processor is filled."""
-    package = distribution("librosa")
-    from llvmlite.binding import get_host_cpu_name  # numba's own name of it
-
-    source = Path(str(package.locate_file("librosa/__init__.py")))
-    about = f"{source} {source.stat().st_mtime_ns} {version('numba')} {get_host_cpu_name()}"
-    own = Path(tempfile.gettempdir()) / f"motionloom-{os.getuid()}"
-    folder = Path(os.environ.get("NUMBA_CACHE_DIR", own))
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder / f"motionloom-librosa-{crc32(about.encode()):08x}.compiled"
-
-
-def _imported() -> Any:
-    import librosa
-    import librosa.beat  # compiles on import, like most of librosa; the calls below do the rest
-
-    noise = np.random.default_rng(0).standard_normal(4096).astype(np.float32)
-    librosa.istft(librosa.stft(noise))
-    librosa.cqt(noise, sr=4096, n_bins=12, fmin=440.0)
-    return librosa
+_PITCHES = (150.0, 4000.0)
+"""Hz between which the tuning is heard."""
+_FAINT = 0.1
+"""Magnitude against a frame's loudest, below which a peak is no pitch."""
+_TINY = float(np.finfo(np.float32).tiny)
 
 
 @dataclass(frozen=True)
 class Spectra:
     """A sound of T frames, taken apart."""
 
-    mel: NDArray[np.float32]
+    mel: Array
     """Mel power [128, T]."""
-    percussive_mel: NDArray[np.float32]
+    percussive_mel: Array
     """Mel power of the percussive share [128, T]."""
-    harmonic: NDArray[np.float32]
+    harmonic: Array
     """The harmonic share, samples [n]."""
 
 
@@ -94,7 +52,7 @@ class Spectra:
 class _Piece:
     """Some frames of a sound and what lies around them."""
 
-    samples: NDArray[np.float32]
+    samples: Array
     """Margins included."""
     frames: slice
     """Frames of the sound, without margins."""
@@ -102,62 +60,130 @@ class _Piece:
     """The same frames, counted from the first of the piece."""
 
 
-def separate(samples: NDArray[np.float32], rate: int) -> Spectra:
+def stft(samples: Array, window: Array, hop: int) -> NDArray[np.complex64]:
+    """Samples [n] -> spectra [1 + width // 2, 1 + n // hop] of windows centred at multiples of `hop`."""
+    from scipy.fft import rfft
+
+    padded = np.pad(samples, len(window) // 2)
+    frames = np.lib.stride_tricks.sliding_window_view(padded, len(window))[::hop]
+    return np.asarray(rfft(frames * window, axis=1).T)
+
+
+def hann() -> Array:
+    """The periodic window of `FFT` samples."""
+    return np.hanning(FFT + 1)[:-1].astype(np.float32)
+
+
+def separate(samples: Array, rate: int) -> Spectra:
     """Mono samples [n] -> mel power and shares of T = 1 + n // 512 frames."""
-    librosa = load_librosa()
     count = 1 + len(samples) // HOP
     mel, percussive_mel = np.empty((2, MELS, count), dtype=np.float32)
     harmonic = np.empty(count * HOP, dtype=np.float32)
     for piece in _pieces(samples):
-        spectrum = librosa.stft(piece.samples, n_fft=FFT, hop_length=HOP)
+        spectrum = stft(piece.samples, hann(), HOP)
         magnitude = np.abs(spectrum)
         mel[:, piece.frames] = _mel(magnitude, rate)[:, piece.inside]
         # Notes are steady along time and percussion along frequency: medians each way tell them apart.
         steady, sudden = _row_medians(magnitude), _row_medians(magnitude.T).T
-        shares = []
-        for share, other in ((steady, sudden), (sudden, steady)):
-            mask = librosa.util.softmask(share, other, power=2, split_zeros=True)
-            shares.append(librosa.istft(spectrum * mask, hop_length=HOP, length=len(piece.samples)))
+        soft = _softmask(steady, sudden)
+        shares = [_istft(spectrum * mask, len(piece.samples)) for mask in (soft, 1 - soft)]
         own = shares[0][piece.inside.start * HOP : piece.inside.stop * HOP]
         harmonic[piece.frames.start * HOP :][: len(own)] = own
         percussive_mel[:, piece.frames] = _mel(_magnitude(shares[1]), rate)[:, piece.inside]
     return Spectra(mel, percussive_mel, harmonic[: len(samples)])
 
 
-def tuning(samples: NDArray[np.float32], rate: int, bins: int) -> float:
+def tuning(samples: Array, rate: int, bins: int) -> float:
     """`librosa.estimate_tuning`: how far the music is from A = 440 Hz, in bins (`bins` an octave)."""
-    librosa = load_librosa()
-    pitches, heights = [], []
-    for piece in _pieces(samples):
-        pitch, height = librosa.piptrack(S=_magnitude(piece.samples)[:, piece.inside], sr=rate)
-        pitches.append(pitch[pitch > 0])
-        heights.append(height[pitch > 0])
-    pitch, height = np.concatenate(pitches), np.concatenate(heights)
+    found = [_pitches(_magnitude(piece.samples)[:, piece.inside], rate) for piece in _pieces(samples)]
+    pitch, height = (np.concatenate(part) for part in zip(*found, strict=True))
     if not len(pitch):
         return 0.0
-    return float(librosa.pitch_tuning(pitch[height >= np.median(height)], bins_per_octave=bins))
+    octaves = np.log2(pitch[height >= np.median(height)] / 27.5)
+    away = np.mod(bins * octaves, 1.0)
+    away[away >= 0.5] -= 1.0
+    counts, edges = np.histogram(away, np.linspace(-0.5, 0.5, 101))
+    return float(edges[np.argmax(counts)])
 
 
-def _pieces(samples: NDArray[np.float32]) -> Iterator[_Piece]:
+def local_maxima(values: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """[N, ...]: whether each is above the one before it and not below the next; the first is none."""
+    out = np.zeros(values.shape, dtype=np.bool_)
+    out[1:] = values[1:] > values[:-1]
+    out[1:-1] &= values[1:-1] >= values[2:]
+    return out
+
+
+def _pitches(magnitude: Array, rate: int) -> tuple[Array, Array]:
+    """`librosa.piptrack`: pitches in Hz and magnitudes of the peaks of [F, T], each between its rows."""
+    shift = np.zeros_like(magnitude)
+    curve = magnitude[2:] + magnitude[:-2] - 2 * magnitude[1:-1]
+    slope = (magnitude[2:] - magnitude[:-2]) / 2
+    near = np.abs(slope) < np.abs(curve)
+    np.divide(-slope, curve, out=shift[1:-1], where=near)
+    hertz = np.arange(len(magnitude)) * (rate / FFT)
+    low, high = _PITCHES
+    heard = (low <= hertz) & (hertz < min(high, rate / 2))
+    loud = magnitude > _FAINT * magnitude.max(axis=0)
+    at = np.nonzero(heard[:, None] & local_maxima(magnitude * loud))
+    heights = magnitude[at] + 0.5 * np.gradient(magnitude, axis=0)[at] * shift[at]
+    pitches = ((at[0] + shift[at]) * float(rate) / FFT).astype(np.float32)
+    return pitches[pitches > 0], heights[pitches > 0]
+
+
+def _softmask(own: Array, other: Array) -> Array:
+    """Share of `own` in both by their squares; a half where both are 0."""
+    largest = np.maximum(own, other)
+    silent = largest < _TINY
+    largest[silent] = 1
+    power = np.square(own / largest)
+    mask = np.full_like(own, 0.5)
+    np.divide(power, power + np.square(other / largest), out=mask, where=~silent)
+    return mask
+
+
+def _istft(spectrum: NDArray[np.complex64], length: int) -> Array:
+    """Samples [length] of spectra [1025, T], each frame windowed again and weighted by all windows."""
+    from scipy.fft import irfft
+
+    window = hann()
+    frames = irfft(spectrum.T, FFT, axis=1) * window
+    total, weight = np.zeros((2, (len(frames) + FFT // HOP) * HOP), dtype=np.float32)
+    for start in range(0, FFT, HOP):
+        part = slice(start, start + len(frames) * HOP)
+        total[part] += frames[:, start : start + HOP].ravel()
+        weight[part] += np.tile(np.square(window[start : start + HOP]), len(frames))
+    np.divide(total, weight, out=total, where=weight > _TINY)
+    out = total[FFT // 2 : FFT // 2 + length]
+    return np.pad(out, (0, length - len(out)))
+
+
+def _pieces(samples: Array) -> Iterator[_Piece]:
     count = 1 + len(samples) // HOP
     for start in range(0, count, _PIECE):
         stop = min(start + _PIECE, count)
-        # The last piece takes the rest as it is: librosa reflects the end of the sound, no other edge.
+        # The last piece takes the rest as it is.
         first, last = max(0, start - _MARGIN), stop + _MARGIN
         around = samples[first * HOP :] if last >= count else samples[first * HOP : (last - 1) * HOP]
         yield _Piece(around, slice(start, stop), slice(start - first, stop - first))
 
 
-def _magnitude(samples: NDArray[np.float32]) -> NDArray[np.float32]:
-    return np.asarray(np.abs(load_librosa().stft(samples, n_fft=FFT, hop_length=HOP)))
+def _magnitude(samples: Array) -> Array:
+    return np.abs(stft(samples, hann(), HOP))
 
 
-def _mel(magnitude: NDArray[np.float32], rate: int) -> NDArray[np.float32]:
-    power = load_librosa().feature.melspectrogram(S=magnitude * magnitude, sr=rate, n_mels=MELS)
-    return np.asarray(power, dtype=np.float32)
+def _mel(magnitude: Array, rate: int) -> Array:
+    return np.asarray(_mel_filters(rate) @ np.square(magnitude), dtype=np.float32)
 
 
-def _row_medians(values: NDArray[np.float32]) -> NDArray[np.float32]:
+@lru_cache(maxsize=4)
+def _mel_filters(rate: int) -> Array:
+    from librosa.filters import mel
+
+    return np.asarray(mel(sr=rate, n_fft=FFT, n_mels=MELS))
+
+
+def _row_medians(values: Array) -> Array:
     """[N, M] -> [N, M]: running medians of 31 along each row, the ends continued by reflection."""
     from scipy.ndimage import median_filter
 
