@@ -51,7 +51,6 @@ from motionloom.models.metrics.dance_beats import alignment, motion_beats
 from motionloom.models.metrics.dance_features import kinetic_features, zero_start
 from motionloom.pipeline.evaluation.dances import dance_at, with_music
 from motionloom.pipeline.inference.model import MotionModel
-from motionloom.pipeline.inference.script import read_music
 
 Array = NDArray[np.float64]
 RATE = 60.0
@@ -89,7 +88,7 @@ def judged(path: Path, song: Sound, late: float) -> Array:
 
 def stretches(path: Path, most: int, seconds: float, late: float) -> list[Stretch]:
     """Parts of a song from its third second on, spread evenly; those without four beats are left out."""
-    song = read_music(path)
+    song = Sound.read(path)  # not `read_music`: beats beside the song are for judging alone
     times, heard = judged(path, song, late), track(song).times
     room = max(0.0, song.seconds - seconds - 3.0)
     count = min(most, 1 + int(room // seconds))

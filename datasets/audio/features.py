@@ -138,7 +138,13 @@ def _analyse(whole: Sound, fps: float, width: int, rate: float | None) -> NDArra
     frames = max(1, round(whole.seconds * fps))
     if width == DIM:
         settings = settings_at(fps) if rate is None else AudioSettings.parse({"fps": rate}, "audio features")
-        return rows_at(audio_features(whole.samples, whole.rate, settings), settings.fps, fps, frames)
+        rows = rows_at(audio_features(whole.samples, whole.rate, settings), settings.fps, fps, frames)
+        given = (whole.piece or whole).beats
+        if given is not None:
+            marked = np.floor((given - whole.begin) * fps + 0.5).astype(np.int64)
+            rows[:, BEAT] = 0
+            rows[marked[(marked >= 0) & (marked < frames)], BEAT] = 1
+        return rows
     from motionloom.datasets.audio.rhythm_features import RHYTHM_DIM, rhythm_features
 
     if width != RHYTHM_DIM:

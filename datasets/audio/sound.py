@@ -124,6 +124,8 @@ class Sound:
         default_factory=dict, repr=False
     )
     """Features of the piece from a second on, at frames a second, by width (`features.features_of`)."""
+    beats: NDArray[np.float64] | None = field(default=None, repr=False)
+    """Seconds of the piece's beats, where somebody gives them (`given_beats`); None = as heard."""
 
     def __post_init__(self) -> None:
         samples = np.asarray(self.samples, dtype=np.float32)

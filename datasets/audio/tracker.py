@@ -58,15 +58,30 @@ class Beats:
 NO_BEAT = 0.15
 """Confidence below which hardly a beat is heard: white noise has 0.07 to 0.14, three real songs 0.25, 0.45
 and 0.85. No test for music: a bare drum or a quiet stretch of a song may have less, speech up to 0.25."""
+UNSURE = 0.45
+"""Confidence below which the beats may be wrong."""
 _tracked: WeakKeyDictionary[Sound, Beats] = WeakKeyDictionary()
 
 
 def track(sound: Sound, power: NDArray[np.float32] | None = None) -> Beats:
-    """Return the beats of a piece, found once; none if it is too short. `power` [T, 64]: of its bands."""
+    """Return the beats of a piece, given or found once; none in one too short. `power` [T, 64]: its bands."""
     if sound not in _tracked:
         levels_in = levels(band_power(sound) if power is None else power)
-        _tracked[sound] = decode(activations(load_beat_net(), levels_in))
+        heard = activations(load_beat_net(), levels_in)
+        given = (sound.piece or sound).beats
+        _tracked[sound] = decode(heard) if given is None else _given(given - sound.begin, heard)
     return _tracked[sound]
+
+
+def _given(times: NDArray[np.float64], heard: NDArray[np.float32]) -> Beats:
+    """Beats at times that somebody gave: certain, and heard in bars as far as there are any."""
+    times = times[(times >= 0.0) & (times * ROWS < len(heard))]
+    rows = np.round(times * ROWS).astype(np.int64)
+    places, meter = bar_places(_peak(heard[:, 1], rows))
+    activation = np.zeros(len(heard), dtype=np.float32)
+    for away, level in ((-1, 0.5), (1, 0.5), (0, 1.0)):
+        activation[np.clip(rows + away, 0, len(heard) - 1)] = level
+    return Beats(times, places, meter, activation, 1.0)
 
 
 def decode(probabilities: NDArray[np.float32]) -> Beats:

@@ -34,6 +34,12 @@ def generate(
         list[Path] | None,
         typer.Option("--audio", help="A wav, flac, mp3 or ogg file to move to; beside a caption, both."),
     ] = None,
+    beats: Annotated[
+        str | None,
+        typer.Option(
+            help="Its beats: a file of seconds, tempo@first beat as 120@0.35, or half, double, shift."
+        ),
+    ] = None,
     samples: Annotated[int, typer.Option(min=1, help="Motions of each caption, sound or script.")] = 1,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the files.")] = Path("motions"),
     formats: Annotated[str | None, typer.Option("--format", "-f", help=formats_help())] = None,
@@ -55,8 +61,11 @@ def generate(
 
     Example: `motionloom generate runs/ude-tiny --audio song.ogg --samples 3 -o dances`
 
+    Example: `motionloom generate dance --audio song.ogg --beats 120@0.35`
+
     Example: `motionloom generate runs/humantomato-tiny "a person bows" --format glb,html`
     """
+    from motionloom.datasets.audio.given_beats import in_words
     from motionloom.datasets.audio.sound import Excerpt
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.inference.display_figure import FigureOptions
@@ -78,10 +87,13 @@ def generate(
     # All that needs no model is checked before one is opened.
     if not texts and not songs and file is None:
         raise UserError('give at least one caption, like: motionloom generate RUN "a person waves"')
+    if beats is not None and not songs:
+        raise UserError("--beats: they are those of a song; name one by --audio song.ogg")
     require_words(texts)
     require_words(faces or (), "face")
     drawn: dict[str, Any] = {"seed": seed, "sampling": SamplingConfig.parse(fields, "--set")}
     require_folder(out)
+    sounds = [read_music(path, beats) for path in songs]
     if file is not None:
         if texts or songs or seconds is not None or faces or begun:
             raise UserError(
@@ -93,7 +105,7 @@ def generate(
         request = Request.of(
             _each(texts, samples),
             face=faces if faces is None or len(faces) == 1 else _each(faces, samples),
-            sounds=_each([read_music(path) for path in songs], samples),
+            sounds=_each(sounds, samples),
             seconds=seconds,
             seed_motions=None if begun is None else str(begun),
             **drawn,
@@ -105,6 +117,8 @@ def generate(
         if begun is None and file is None and (start := model.bundle.generator.capabilities.seed_frames):
             lead = f"the first {start / model.fps:.2g} s are of a training dance"
             print_note(aside, f"{lead}; --set seed_motion=FILE takes yours")
+        for path, sound in zip(songs, sounds, strict=True):
+            say(aside, f"{path.name}: {in_words(sound)}")
         for note in model.notes(request, motions):
             print_note(aside, note)
         write_files(

@@ -81,10 +81,13 @@ class Prompt:
             return f"nothing is heard: {'the figure stands' if self.idle else 'its words drive the motion'}"
         if self.sound is None or self.sound.seconds < _JUDGED:
             return ""
-        from motionloom.datasets.audio.tracker import NO_BEAT, track
+        from motionloom.datasets.audio.given_beats import in_words
+        from motionloom.datasets.audio.tracker import NO_BEAT, UNSURE, track
 
-        piece = self.sound.piece or self.sound
-        return "hardly a beat is heard in the sound" if track(piece).confidence < NO_BEAT else ""
+        confidence = track(self.sound.piece or self.sound).confidence
+        if confidence < NO_BEAT:
+            return "hardly a beat is heard in the sound"
+        return f"the beat may be wrong: {in_words(self.sound)}; --beats says it" * (confidence < UNSURE)
 
     @property
     def words(self) -> str:

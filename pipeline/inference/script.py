@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from motionloom.datasets.audio.given_beats import take_beats
 from motionloom.datasets.audio.sound import Excerpt, Sound
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
@@ -37,6 +38,9 @@ class ScriptSegment(Config):
     """Describes the face; empty takes `text`."""
     music: str | None = None
     """A sound file, seen from the script's folder, or a part of one: `song.ogg@0:30-0:42`."""
+    beats: str | None = None
+    """The music's beats, where they are not heard right: a file beside the script, `120@0.35`, or `half`,
+    `double` or `shift` (`datasets.audio.given_beats`)."""
     seconds: float | None = Field(None, gt=0, le=3600)
     """Length of a segment of text alone."""
 
@@ -78,6 +82,10 @@ class Script(Config):
             if part.path not in sounds:
                 sounds[part.path] = read_music(part.path)
             whole = sounds[part.path]
+            if segment.beats is not None:
+                beside = folder / segment.beats
+                said = str(beside) if beside.is_file() else segment.beats
+                whole = take_beats(whole, part.path, said)
             sound = whole.slice(*part.within(whole.seconds, f"{where}: {segment.music}"))
             label = " + ".join(filter(None, (segment.text, part.path.stem)))
             out.append(DrivenSegment(Prompt(segment.text, segment.face, sound), sound.seconds, label))
@@ -110,11 +118,13 @@ def segment_frames(generator: MotionGenerator, segment: DrivenSegment, number: i
     return units * unit
 
 
-def read_music(path: Path) -> Sound:
-    """A sound file to drive by, or a part of one (`song.mp3@0:30-1:00`)."""
+def read_music(path: Path, beats: str | None = None) -> Sound:
+    """A sound file to drive by, or a part of one (`song.mp3@0:30-1:00`), with beats: those that are said, or
+    of a file `song.beats` beside it, or none.
+    """
     if not is_file(file := Excerpt.named(path).path):
         raise UserError(f"{file}: no such sound file")
-    return Sound.read(path)
+    return take_beats(Sound.read(path), path, beats)
 
 
 def sound_of(segments: list[tuple[DrivenSegment, int]], fps: float) -> Sound | None:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from motionloom.datasets.audio.given_beats import in_words, with_beats
 from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
@@ -100,6 +101,8 @@ class MotionRequest(Asked):
     """Describes the face; empty takes `caption`."""
     sound: str | None = Field(None, max_length=64)
     """Name of a sound that was sent before."""
+    beats: str = Field("", max_length=65_536)
+    """The sound's beats, if they are not heard right: seconds, `120@0.35`, or `half`, `double`, `shift`."""
     seconds: float | None = Field(None, gt=0, le=3600)
     """Length; without it the model decides, or the sound, or it is four seconds."""
     seed: int = Field(0, ge=0, lt=2**63)
@@ -154,6 +157,8 @@ class Motions:
         """The motion that is asked for. The same request is answered with the same motion, made once."""
         model = self._model
         name = name_of_facts(asked.model_dump(mode="json", exclude={"format"}, exclude_unset=True))
+        if sound is not None and asked.beats:
+            sound = with_beats(sound, asked.beats)
         request = asked.of_model(model, sound, self._config)
         motion = self.kept.made(name, lambda: model.make(request)[0])
         found = model.notes(request, [motion])
@@ -162,6 +167,8 @@ class Motions:
         unknown = (one for one in found if isinstance(one, Unknown) and one.caption == asked.caption)
         nearest = [text for one in unknown for text in one.nearest]
         facts = {"clip": name, "seed": asked.seed, "face": asked.face, "notes": notes, "nearest": nearest}
+        if sound is not None:
+            facts["heard"] = in_words(sound)
         return answer(motion, asked.format, facts, "\n".join(notes), {"generated": motion})
 
 

@@ -55,6 +55,7 @@ function wanted() {
   if (guidance && guidance !== usualGuidance()) body.cfg_scale = guidance;
   if (info.face && one("face").value.trim()) body.face = one("face").value.trim();
   if (music) body.sound = music.sound;
+  if (music && one("beats").value) body.beats = one("beats").value;
   return body;
 }
 
@@ -92,7 +93,7 @@ function show(answer, body) {
   const saved = { path: "/api/generate", body };
   savable(saved);
   current = { ref: answer.clip, saved, viewer: answer.viewer, frames: answer.frames, caption: answer.caption, name: answer.caption || "a dance" };
-  note(answer.notes, answer.nearest);
+  note(answer.heard ? [`Music: ${answer.heard}`, ...answer.notes] : answer.notes, answer.nearest);
 }
 
 /* What the buttons save; nothing hides them. */
@@ -145,11 +146,14 @@ async function send(path, file, most, words) {
 
 async function take(file) {
   music = file ? await send("/api/sounds", file, info.limits.sound_bytes, `Sending ${file.name}…`) : null;
+  one("beats").value = "";
+  one("beats-field").hidden = !music;
   if (music) say(`${file.name}: ${music.seconds.toFixed(1)} s of music`);
 }
 
 form.addEventListener("submit", (event) => { event.preventDefault(); generate(); });
 for (const button of save.querySelectorAll("[data-format]")) button.addEventListener("click", () => keep(button.dataset.format));
+one("beats").addEventListener("change", generate); // the same dance to other beats
 one("sound").addEventListener("change", () => take(one("sound").files[0]));
 for (const name of ["dragover", "drop", "dragleave"]) {
   document.addEventListener(name, (event) => {

@@ -234,7 +234,10 @@ def test_music_is_sent_and_driven_by(served: Any, monkeypatch: pytest.MonkeyPatc
     assert served.ask("POST", "/api/sounds", tone(3.0)).json == name
     said = served.post("/api/generate", {"sound": name["sound"], "format": "viewer"}).json
     assert said["frames"] == 60 and said["viewer"]["sounds"][0]["mime"] == "audio/mpeg"
-    assert said["viewer"]["scores"][0]["beats"] == [0.5]
+    assert said["viewer"]["scores"][0]["beats"] == [0.5] and "beat" in said["heard"]
+    given = served.post("/api/generate", {"sound": name["sound"], "format": "viewer", "beats": "120@0.2"})
+    assert given.json["heard"].startswith("120 beats a minute") and given.json["clip"] != said["clip"]
+    assert served.post("/api/generate", {"sound": name["sound"], "beats": "/etc/passwd"}).status == 400
     said = served.post("/api/generate", {**WAVE, "sound": name["sound"]}).json
     assert said["frames"] == 20 and said["caption"] == "a person waves"
     long = served.ask("POST", "/api/sounds", tone(8.0, kind="OGG")).json["sound"]
