@@ -118,9 +118,10 @@ class Dropped(Config):
 
     source: _Written
     reason: _Written
-    kind: Literal["rejected", "unreadable", "missing"] = "rejected"
+    kind: Literal["rejected", "unreadable", "missing", "not ours"] = "rejected"
     """`rejected`: it is in the source, but cannot or must not become a sample. `unreadable`: a file, of
-    motion or of texts, that is damaged. `missing`: listed somewhere, but not in the source."""
+    motion or of texts, that is damaged. `missing`: listed somewhere, but not in the source.
+    `not ours`: in the source, but not read (in the list beside the shards alone)."""
 
 
 class Manifest(Config):

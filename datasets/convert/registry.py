@@ -11,6 +11,7 @@ from motionloom.datasets.base.register import declare, discover
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.conversion import Conversion, moved_clips
 from motionloom.datasets.convert.common.converter import CONVERTERS, AnyConverter, PlanSettings
+from motionloom.datasets.convert.common.files import walk
 from motionloom.datasets.convert.common.removed import Removed
 
 declare(
@@ -58,6 +59,8 @@ def prepare(
         raise UserError(f"no converter takes a {type(config).__name__}; register its converter, or name it")
     converter = kind(config)
     plan = converter.plan(settings := PlanSettings(workers, progress, out))
+    if config.source.is_dir():
+        plan.account(walk(config.source, skip=out), converter.beside)
     if out is None:
         return Conversion(converter, plan, settings)
     plan.leave_removed(Removed.of(out).has, REMOVED_FILE)

@@ -12,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+from pydantic import Field
+
 from motionloom.datasets.base.config import Config, require_local
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import remove_temporaries, sync_folder, write_json
@@ -46,6 +48,8 @@ class Planned(Config):
     """Fingerprint of every shard of all parts by its name, in the manifest's order."""
     items: int
     """Items of all shards."""
+    not_ours: list[Dropped] = Field(default_factory=list)
+    """As in `DatasetFacts`."""
     lost: list[Dropped]
     most_lost: float
     """As in `DatasetFacts`."""
@@ -145,7 +149,7 @@ def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
     manifest = planned.with_results(results)
     manifest = manifest.model_copy(update={"excluded": Decisions.of(out).left_out})
     failed = manifest.dropped[len(planned.manifest.dropped) :]
-    write_left_out(out, manifest.dropped)
+    write_left_out(out, [*manifest.dropped, *planned.not_ours])
     if not manifest.shards:
         groups = grouped([*failed, *planned.manifest.dropped])
         some = "; ".join(map(str, groups[:3])) or "there was none"

@@ -29,7 +29,7 @@ def drop(label: str, error: Exception) -> Dropped:
     text = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
     if isinstance(error, OSError) and error.strerror:  # whose own words name a path of this machine
         text = f"cannot be read ({error.strerror.lower()})"
-    return Dropped(source=label, reason=text.removeprefix(f"{label}: "))
+    return Dropped(source=label, reason=text.removeprefix(str(UserError(f"{label}: "))))
 
 
 @dataclass(frozen=True)

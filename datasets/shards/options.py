@@ -65,6 +65,8 @@ class DatasetFacts:
     """Settings of the audio features."""
     dropped: Sequence[Dropped] = ()
     """Clips that the plan has left out already."""
+    not_ours: Sequence[Dropped] = ()
+    """What else of the source and its lists became no clip, for `left-out.txt` alone."""
     lost: Sequence[Dropped] = ()
     """Clips among `dropped` that were meant to become samples."""
     most_lost: float = 1.0

@@ -222,6 +222,7 @@ def _planned(tasks: Sequence[ShardTask[T]], facts: DatasetFacts) -> Planned:
         manifest=manifest,
         fingerprints={task.path.name: task.fingerprint for task in tasks},
         items=sum(len(task.items) for task in tasks),
+        not_ours=list(facts.not_ours),
         lost=list(facts.lost),
         most_lost=facts.most_lost,
     )

@@ -215,6 +215,8 @@ def convert_command(
         return
     require_folder(out)
     conversion = prepare(config, kind=converter, out=out, workers=workers, progress=shown)
+    for line in conversion.plan.sums:
+        say(console, line)
     for note in conversion.plan.notes:
         say(console, f"note: {note}")
     manifest = run_conversion(
@@ -232,8 +234,8 @@ def convert_command(
     for note in manifest.notes:
         if note not in conversion.plan.notes:  # said before
             say(console, f"note: {note}")
-    if conversion.plan.captions:
-        say(console, conversion.plan.captions)
+    if conversion.plan.words.summary:
+        say(console, conversion.plan.words.summary)
 
 
 def proposed(

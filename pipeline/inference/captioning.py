@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import temporary_folder
 from motionloom.datasets.base.records import HANDS, PRESENT_ALL, Dropped
-from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.bvh.config import BvhConfig
 from motionloom.datasets.convert.registry import prepare
 from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.shards.left_out import drop

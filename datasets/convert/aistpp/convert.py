@@ -23,6 +23,7 @@ from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.aistpp.accompaniment import GENRES, TEMPI, song_for
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.common.body import SOUND_SUFFIXES, BodyConfig, BodyRelease, analyse, cut_of
+from motionloom.datasets.convert.common.files import files_in
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import read_ids
@@ -107,11 +108,10 @@ class Aistpp(BodyRelease[AistppConfig]):
                 f"{self.config.source}: no {MOTIONS}/ in it; give the folder of the AIST++ annotations"
             )
         music = self._music()
-        here = sorted(path.stem for path in folder.glob("*.pkl") if path.name[0] != ".")
-        for name in here:
+        for name in (file.removesuffix(".pkl") for file in files_in(folder, ".pkl")):
             match, file = _SEQUENCE.fullmatch(name), f"{MOTIONS}/{name}.pkl"
             if match is None:
-                draft.fail(file, UserError("not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01"))
+                draft.mark_unreadable(file, UserError("not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01"))
                 continue
             facts = match.groupdict()
             problem = "on the ignore list" if name in self.ignored else ""
@@ -130,11 +130,13 @@ class Aistpp(BodyRelease[AistppConfig]):
     def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
         """Return the splits, without the sequences of `ignore_list.txt`."""
         listed, path = super().split_lists(draft), self.config.source / "ignore_list.txt"
-        ids, notes = (
-            read_ids(path) if path.is_file() else ({}, ["no ignore_list.txt: bad sequences are not left out"])
-        )
-        draft.notes += notes
-        self.ignored = set(ids)
+        if path.is_file():
+            ids, repeated = read_ids(path)
+            self.ignored = set(ids)
+            draft.notes += [f"{line.place}: {line.reason}" for line in repeated]
+            draft.known.beside.add(path.name)
+        else:
+            draft.notes.append("no ignore_list.txt: bad sequences are not left out")
         if both := sorted(self.ignored & (listed or {}).keys()):
             some = ", ".join(both[:3])
             draft.notes.append(f"{len(both)} sequences of the split files are on the ignore list: {some}")
@@ -151,8 +153,8 @@ class Aistpp(BodyRelease[AistppConfig]):
                     f"{folder}: no such folder of music; --set music_folder=FOLDER, or --set sound=none"
                 )
             return {}
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SOUND_SUFFIXES)
-        return {path.stem: path.name for path in reversed(files) if path.name[0] != "."}
+        names = [Path(name) for name in files_in(folder, "") if name.lower().endswith(SOUND_SUFFIXES)]
+        return {name.stem: str(name) for name in reversed(names)}
 
     def with_sound(self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         if self.config.has_band:

@@ -96,6 +96,7 @@ class Amass(Release[AmassConfig]):
     summary = "AMASS: SMPL-H and SMPL-X .npz files to shards."
     example = "AMASS shards"
     config_class = AmassConfig
+    beside = ("shape.npz", "_stagei.npz")
     terms = LICENCE
 
     def __init__(self, config: AmassConfig) -> None:
@@ -123,7 +124,7 @@ class Amass(Release[AmassConfig]):
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterator[Entry]:
         labels = list_files(self.config.source, draft)
-        draft.found = len(labels)
+        draft.totals.found = len(labels)
         if self.config.humanml_index is not None:
             yield from self._index_entries(self.config.humanml_index, labels, draft)
             return
@@ -143,17 +144,17 @@ class Amass(Release[AmassConfig]):
         for label in labels:
             first = by_key.setdefault(clip_key(label), label)
             if first is not label:
-                draft.leave_out(label, f"the same clip as {first}")
+                draft.skip(label, f"the same clip as {first}")
         bad: BadRows = {}
         found = [(row, by_key.get(clip_key(row.source))) for row in read_index(index, bad)]
-        draft.fail_rows(bad)
+        draft.mark_rows_unreadable(bad)
         for one in index_clips(self.config, found, self.listed):
             self.rows[one.id] = one.row
             yield Entry(one.id, one.file or one.row.source, split=one.split, mirror_of=one.mirror_of)
         used = {file for _, file in found}
         for label in by_key.values():
             if label not in used:
-                draft.leave_out(label, "in no row of the index")
+                draft.skip(label, "in no row of the index")
 
     def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
         """Return the splits of the index's clips; those of whole files go with the captions."""

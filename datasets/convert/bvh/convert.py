@@ -11,7 +11,9 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.licences import credits_of, strictest
 from motionloom.datasets.base.register import register
-from motionloom.datasets.convert.bvh.plan import BvhClip, BvhConfig, JointMaps, load_maps, plan_bvh
+from motionloom.datasets.convert.bvh.config import BvhClip, BvhConfig
+from motionloom.datasets.convert.bvh.maps import JointMaps, load_maps
+from motionloom.datasets.convert.bvh.plan import plan_bvh
 from motionloom.datasets.convert.bvh.settle import added_frames
 from motionloom.datasets.convert.captions.humanml_index import CREDITS, WORDS_CREDIT
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
@@ -34,6 +36,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     summary = "BVH (and ASF/AMC) files of any skeleton to shards."
     example = "mocap shards --captions captions.jsonl --licence CC-BY-4.0"
     config_class = BvhConfig
+    beside = (".asf",)
 
     def __init__(self, config: BvhConfig) -> None:
         super().__init__(config)
@@ -56,7 +59,9 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         return sha256_of_json(made_from if cut == slice(None) else [*made_from, cut.start, cut.stop])
 
     def licence(self, plan: ConversionPlan[BvhClip]) -> str:
-        return self.config.licence or ("" if self.config.humanml_index is None else strictest(plan.licences))
+        return self.config.licence or (
+            "" if self.config.humanml_index is None else strictest(plan.totals.licences)
+        )
 
     def credits(self, plan: ConversionPlan[BvhClip]) -> list[str]:
         if self.config.humanml_index is None:
@@ -64,7 +69,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         subsets = {str(clip.about["subset"]) for _, clip in plan.items}
         own = [CREDITS[subset] for subset in sorted(subsets) if subset in CREDITS]
         words = [WORDS_CREDIT] if self.config.humanml_texts else []
-        return [*credits_of(plan.licences, self.config.name, own), *words]
+        return [*credits_of(plan.totals.licences, self.config.name, own), *words]
 
     def convert(self, clip: BvhClip) -> Sample:
         motion = self.encode(clip)

@@ -18,6 +18,7 @@ from motionloom.datasets.convert.captions.read import (
     text_records,
 )
 from motionloom.datasets.convert.common.files import walk_files
+from motionloom.datasets.convert.common.splits import ListLine
 
 TABLES = (".csv", ".tsv", ".tab", ".jsonl", ".json")
 
@@ -81,7 +82,9 @@ class Captions:
     def _add_record(self, where: str, values: dict[str, object], origin: str, named: dict[str, str]) -> None:
         catalogue = bool(values.pop(CATALOGUE, False))
         row, is_list = row_of(where, values)
-        row = replace(row, catalogue=catalogue, origin=origin)
+        words = frozenset(text.text for text in row.texts)
+        line = ListLine(where.rsplit("/", 1)[-1], row.id, "", words, catalogue)
+        row = replace(row, catalogue=catalogue, origin=origin, lines=(line,))
         if row.file and named.get(row.file, row.id) != row.id:
             raise UserError(f"{where}: file '{row.file}' has a record already ('{named[row.file]}')")
         before = self.rows.get(row.id)

@@ -24,7 +24,7 @@ from motionloom.datasets.base.licences import CMU
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.captions.options import CaptionConfig
-from motionloom.datasets.convert.common.files import check_id
+from motionloom.datasets.convert.common.files import check_id, is_there
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.convert.common.splits import (
     hash_split,
@@ -185,7 +185,7 @@ class HumanmlConfig(CaptionConfig):
         folder = self.splits or next(filter(split_files, near), None)
         if folder is None:
             return None, ["no split files beside HumanML3D's texts or index: split 80/5/15 by recording"]
-        listed, notes = read_split_files(folder)
+        listed, notes, _ = read_split_files(folder)
         keep_mirrors_together(listed, folder)
         return {key: split for key, split in listed.items() if self.mirror or not original_of(key)}, notes
 
@@ -193,7 +193,7 @@ class HumanmlConfig(CaptionConfig):
         self, clip_id: str, seconds: float | None, notes: list[str]
     ) -> tuple[tuple[Caption, ...], str]:
         """Captions of a clip of the index, and why it must be left out."""
-        if self.humanml_texts is None or not (path := self.humanml_texts / f"{clip_id}.txt").is_file():
+        if self.humanml_texts is None or not is_there(path := self.humanml_texts / f"{clip_id}.txt"):
             return (), ""
         try:
             captions, wrong = read_humanml_captions(path, seconds=seconds, name=path.name)
@@ -256,7 +256,7 @@ def find_originals(
     for row in read_index(index, bad):
         if row.subset in ORIGINALS:
             rows[row.subset].append((row, *_original_of(row, by_end)))
-    draft.fail_rows(bad)
+    draft.mark_rows_unreadable(bad)
     known = sorted(set(ORIGINALS.values()))
     if config.licence not in (None, *known):
         raise UserError(
@@ -276,12 +276,14 @@ def find_originals(
         else:
             for row, file, why in mine:
                 if file is None:
-                    draft.miss(row.source, f"clip '{row.id}': {why or 'its file is not in the source'}")
+                    draft.mark_missing(
+                        row.source, f"clip '{row.id}': {why or 'its file is not in the source'}"
+                    )
                 else:
                     found.append((row, file))
     for path in paths:
         if path not in used:
-            draft.leave_out(path, "in no row of the index")
+            draft.skip(path, "in no row of the index")
     return found
 
 
@@ -291,10 +293,12 @@ def settle_index(config: HumanmlConfig, draft: ConversionPlan[C], apart: Sequenc
     """
     if config.uncaptioned != "stop":
         return
-    bare, decide = draft.bare_clips, "get the originals and HumanML3D's texts, or leave them out: --set "
+    bare, decide = draft.words.bare, "get the originals and HumanML3D's texts, or leave them out: --set "
     if apart or (bare and config.has_captions):
         reason = f"{len(apart)} clips do not agree with their recordings ({apart[0]})" if apart else ""
-        reason = reason or f"no words for {len(bare)} of {draft.captioned + len(bare)} clips ({bare[0]})"
+        reason = (
+            reason or f"no words for {len(bare)} of {draft.words.captioned + len(bare)} clips ({bare[0]})"
+        )
         draft.stop = f"{config.humanml_index}: {reason}; {decide}uncaptioned=drop"
 
 

@@ -62,7 +62,8 @@ def parse_caption(line: str, *, seconds: float | None, source: str = "humanml3d"
         raise UserError(f"the segment ends at {end:g} s, not after its start at {start:g} s")
     if seconds is not None:
         if start >= seconds or end > seconds + END_TOLERANCE:
-            raise UserError(f"the segment {start:g}..{end:g} s reaches beyond the clip of {seconds:.2f} s")
+            what = f"starts at {start:g} s" if start >= seconds else f"ends at {end:g} s"
+            raise UserError(f"the segment {what}, beyond the clip of {seconds:.2f} s")
         end = min(end, seconds)
     return Caption(text=cleaned, start=start, end=end, source=source, tokens=tokens)
 

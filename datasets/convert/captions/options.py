@@ -1,15 +1,18 @@
 """Captions and split files of your own in a conversion: the options, which file a name means, what is left.
 
 A name in captions and in split files means the same: the file at that path (its suffix does not matter), else
-the only file whose path ends with it (`walk` means `walks/walk.bvh`), else the file whose whole path it ends
-with (`/data/mocap/walks/walk.bvh`). A name that two files fit is an error.
+the only file whose path ends with it (`walk` means `walks/walk.bvh`). It never means a file by its own end
+alone: `s2/walk` is another's clip than `walk.bvh`. Only where all names begin in one folder that the source
+does not have (`/data/mocap/walks/walk.bvh`), the source is taken for it, and that is said.
 """
 
 from __future__ import annotations
 
 import difflib
+import re
+import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -22,32 +25,63 @@ from motionloom.datasets.convert.captions.collect import Captions, caption_files
 from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, place_of
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
-from motionloom.datasets.convert.common.splits import SplitRule, hash_split, read_split_files
+from motionloom.datasets.convert.common.splits import (
+    ListLine,
+    SplitLists,
+    SplitRule,
+    hash_split,
+    read_split_files,
+)
 
 
 class FileNames:
     """The files of a source, found by the names that people give them."""
 
     def __init__(self, paths: Iterable[str]) -> None:
-        self._whole = {bare(path): path for path in paths}
+        self._whole = {path_name(path): path for path in paths}
         self._by_end: dict[str, list[str]] = {}
         for name, path in self._whole.items():
             for end in _ends(name)[1:]:
                 self._by_end.setdefault(end, []).append(path)
+        # Letters with accents have two spellings, of which a disk and a table may have one each.
+        for name, path in list(self._whole.items()):
+            self._whole.setdefault(composed(name), path)
 
     def call(self, name: str, path: str) -> None:
         """Give a file a further name."""
         self._whole.setdefault(name, path)
 
-    def find(self, name: str, where: str) -> str | None:
-        """The file that a name means, or None; `UserError` beginning with `where` when two fit."""
+    def find(self, name: str, prefix: str = "") -> tuple[str | None, str]:
+        """The file that a name means, with the folder `prefix` for the source; and why it is none, although
+        several fit.
+        """
         name = bare(name)
-        if name in self._whole:
-            return self._whole[name]
-        fits = self._by_end.get(name, [])
+        if prefix:
+            return self._at(name.removeprefix(prefix)), ""
+        whole = self._at(name)
+        fits = [whole] if whole else self._by_end.get(name, [])
         if len(fits) > 1:
-            raise UserError(f"{where}: '{name}' may mean {' or '.join(fits[:_SHOWN])}; write the folder too")
-        return fits[0] if fits else next((self._whole[e] for e in _ends(name) if e in self._whole), None)
+            return None, f"'{name}' may mean {' or '.join(fits[:_SHOWN])}; write the folder too"
+        return (fits[0] if fits else None), ""
+
+    def _at(self, name: str) -> str | None:
+        return self._whole.get(name) or self._whole.get(composed(name))
+
+    def prefix_of(self, names: Sequence[str]) -> str:
+        """The folder, with a slash behind it, that all names begin in and that stands for the source, because
+        none of them is found otherwise; empty when there is none.
+        """
+        known = [bare(name) for name in names]
+        if not known or any(self.find(name) != (None, "") for name in known):
+            return ""
+        pieces = known[0].split("/")[:-1]
+        for count in range(1, len(pieces) + 1):
+            prefix = "".join(f"{piece}/" for piece in pieces[:count])
+            if not all(name.startswith(prefix) for name in known):
+                break
+            if any(self._at(name.removeprefix(prefix)) for name in known):
+                return prefix
+        return ""
 
     def find_end(self, name: str) -> str | None:
         """The only file whose path ends as a name of another collection's does, by as much of it as fits."""
@@ -56,6 +90,16 @@ class FileNames:
             if fits:
                 return fits.pop() if len(fits) == 1 else None
         return None
+
+
+def path_name(path: str) -> str:
+    """The name of a file in the source: its path without the suffix of a motion file."""
+    return path if "\\" in path else bare(path)
+
+
+def composed(name: str) -> str:
+    """A name in the usual one of the spellings that look alike."""
+    return unicodedata.normalize("NFC", name)
 
 
 def _ends(name: str) -> list[str]:
@@ -77,11 +121,13 @@ class Listing:
     free: tuple[str, ...]
     """Files without captions."""
     notes: list[str]
+    lines: list[ListLine] = field(default_factory=list)
+    """What every line of captions and split files says of which file."""
     rule: SplitRule | None = None
     """The rule that the user has named in place of split files."""
 
     def id_of(self, path: str) -> str:
-        return self.rows[path].id if path in self.rows else bare(path)
+        return self.rows[path].id if path in self.rows else path_name(path)
 
     def split_of(self, path: str) -> Split:
         """By the user's rule or split files, else the captions, else a hash of the id."""
@@ -107,37 +153,82 @@ class Listing:
         return "in no split file" if self.splits is not None and path not in self.splits else ""
 
 
+@dataclass
+class _Matches:
+    """The file of each caption row, as they are found."""
+
+    names: FileNames
+    found: dict[str, CaptionRow] = field(default_factory=dict)
+    missing: dict[str, str] = field(default_factory=dict)
+    unused: list[CaptionRow] = field(default_factory=list)
+    files: dict[str, str] = field(default_factory=dict)
+    """File of every row by its id."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Why a row, by its id, is not used although a file fits."""
+
+    def match(self, row: CaptionRow, prefix: str) -> None:
+        """Find the file of a row."""
+        refused = ""
+        if row.catalogue:
+            path = self.names.find_end(row.file or row.id) or self.names.find_end(row.id)
+        else:
+            path, refused = self.names.find(row.file or row.id, prefix)
+            if path is None and row.file is not None and not refused:
+                path, refused = self.names.find(row.id, prefix)
+        before = None if path is None else self.found.get(path)
+        if path is not None and before is not None:
+            # Of two rows in one file, that which names the whole path counts.
+            if row.catalogue or row.origin != before.origin:
+                self.found[path] = joined(before, replace(row, id=before.id, file=None))
+            elif bare(row.file or row.id) == path_name(path) != bare(before.file or before.id):
+                self.found[path] = row
+                self.refused[before.id] = f"'{before.id}' and '{row.id}' both mean {path}; the latter counts"
+            else:
+                refused = f"'{row.id}' and '{before.id}' both mean {path}; the latter counts"
+        elif path is not None:
+            self.found[path] = row
+        if refused:
+            self.refused[row.id] = refused
+        elif path is not None:
+            self.files[row.id] = path
+        else:
+            self.unused.append(row)
+            if not row.catalogue:
+                self.missing[row.file or row.id] = row.id
+
+
 def list_clips(
-    paths: Sequence[str], rows: Iterable[CaptionRow], listed: dict[str, Split] | None, notes: list[str]
+    paths: Sequence[str], rows: Iterable[CaptionRow], listed: SplitLists | None, notes: list[str]
 ) -> Listing:
     """Find the file of every caption row and of every name in the split files (`listed`)."""
     names = FileNames(paths)
-    found: dict[str, CaptionRow] = {}
-    missing: dict[str, str] = {}
-    unused: list[CaptionRow] = []
+    matches, rows = _Matches(names), list(rows)
     # A catalogue lists a whole collection under other folders, so only the ends of its paths can fit, and
     # clips that are not here are no mistake.
+    own = [row for row in rows if not row.catalogue]
+    prefix = names.prefix_of([row.file or row.id for row in own])
     for row in rows:
-        if row.catalogue:
-            path = names.find_end(row.file or row.id) or names.find_end(row.id)
-        else:
-            path = (names.find(row.file, row.where) if row.file else None) or names.find(row.id, row.where)
-        if path is None:
-            unused.append(row)
-            if not row.catalogue:
-                missing[row.file or row.id] = row.id
-        elif path in found and (row.catalogue or row.origin != found[path].origin):
-            found[path] = joined(found[path], replace(row, id=found[path].id, file=None))
-        elif path in found:
-            raise UserError(f"{row.where}: '{row.id}' and '{found[path].id}' both mean {path}")
-        else:
-            found[path] = row
+        matches.match(row, prefix)
+    if prefix:
+        notes.append(
+            f"captions name files in '{prefix}', which the source does not have: it is taken for that"
+        )
+    notes += [f"{row.where}: {matches.refused[row.id]}" for row in own if row.id in matches.refused]
+    found, missing = matches.found, matches.missing
     # Split files may use the ids that the captions give to files.
     for path, row in found.items():
         names.call(row.id, path)
     splits: dict[str, Split] = {}
-    for name, split in (listed or {}).items():
-        path = names.find(name, f"{split}.txt")
+    prefix = names.prefix_of(list(listed.splits)) if listed else ""
+    if prefix:
+        notes.append(
+            f"split files name files in '{prefix}', which the source does not have: it is taken for that"
+        )
+    for name, split in listed.splits.items() if listed else ():
+        path, refused = names.find(name, prefix)
+        if refused:
+            raise UserError(f"{split}.txt: {refused}")
+        matches.files.setdefault(name, path or "")
         if path is None:
             missing.setdefault(name, bare(name))
         elif splits.setdefault(path, split) != split:
@@ -145,11 +236,19 @@ def list_clips(
                 f"'{name}' in {split}.txt means {path}, which is in {splits[path]}.txt too; that leaks"
             )
     # An empty split would train, or test, on nothing without a word.
-    for split in dict.fromkeys((listed or {}).values()):
+    for split in dict.fromkeys(listed.splits.values() if listed else ()):
         if split not in splits.values():
             raise UserError(f"{split}.txt: none of its clips is in the source, so the split would be empty")
     free = tuple(path for path in paths if path not in found)
-    return Listing(found, None if listed is None else splits, missing, unused, free, notes)
+    lines = [replace_line(line, matches) for row in rows for line in row.lines]
+    lines += [replace_line(line, matches) for line in (listed.lines if listed else ())]
+    return Listing(found, None if listed is None else splits, missing, matches.unused, free, notes, lines)
+
+
+def replace_line(line: ListLine, matches: _Matches) -> ListLine:
+    """The line with the file of its clip for the clip's name, and why it says nothing of one."""
+    reason = line.reason or matches.refused.get(line.key, "")
+    return line._replace(key=matches.files.get(line.key) or line.key, reason=reason)
 
 
 def _stem(name: str) -> str:
@@ -197,9 +296,18 @@ class CaptionConfig(ConvertConfig):
         """Return the captions and splits of motion files, by their paths in the source."""
         captions = Captions.read(self.captions)
         rule = None if self.splits is None or self.splits.exists() else SplitRule.parse(str(self.splits))
-        listed, notes = read_split_files(self.splits) if self.splits and not rule else (None, [])
-        notes += unused_files(self.source, paths, captions)
-        return replace(list_clips(paths, captions.rows.values(), listed, notes), rule=rule)
+        listed = read_split_files(self.splits) if self.splits and not rule else None
+        notes = [*(listed.notes if listed else ()), *unused_files(self.source, paths, captions)]
+        found = list_clips(paths, captions.rows.values(), listed, notes)
+        bad = [bad_line(sentence) for sentence in captions.bad]
+        return replace(found, rule=rule, lines=[*found.lines, *bad])
+
+
+def bad_line(sentence: str) -> ListLine:
+    """The line that a sentence, which begins with its place, refuses."""
+    found = re.match(r"(.*?:\d+):? (.*)", sentence)
+    place, reason = (found[1], found[2]) if found else (sentence.partition(": ")[0], sentence)
+    return ListLine(place.rsplit("/", 1)[-1], "", reason)
 
 
 def unused_files(source: Path, paths: Sequence[str], captions: Captions) -> list[str]:
@@ -237,11 +345,13 @@ def digest_of(given: Path) -> str:
 def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: Listing) -> None:
     """Note in the plan how captions and clips fit; `draft.stop` says why conversion must not start."""
     for name, clip_id in found.missing.items():
-        draft.miss(name, f"clip '{clip_id}' is listed, but its file is not in the source")
+        reason = f"clip '{clip_id}' is listed, but its file is not in the source"
+        draft.mark_missing(name, reason, clip_id)
+    draft.known.lines += found.lines
     draft.notes += found.empty_splits({clip.label(): split for split, clip in draft.items})
     if not config.captions:
         return
-    bare_clips, captioned = draft.bare_clips, draft.captioned
+    bare_clips, captioned = draft.words.bare, draft.words.captioned
     places = [place_of(place)[0] for place in config.captions]
     file, total = ", ".join(place.name for place in places), captioned + len(bare_clips)
     become = {"stop": "", "drop": " and are left out", "keep": " and are kept"}[config.uncaptioned]
@@ -250,8 +360,8 @@ def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: List
         sentences.append(f"{len(bare_clips)} have none{become} ({_some(bare_clips)})")
     if found.unused:
         sentences.append(f"captions for {_unused(found)}")
-    draft.captions = "; ".join(sentences)
-    draft.notes.append(draft.captions)
+    draft.words.summary = "; ".join(sentences)
+    draft.notes.append(draft.words.summary)
     if bare_clips and config.uncaptioned == "stop":
         draft.stop = (
             f"{', '.join(map(str, places))}: no captions for {len(bare_clips)} of {total} clips "

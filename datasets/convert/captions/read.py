@@ -24,7 +24,7 @@ from motionloom.datasets.base.json_doors import parse_json
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.files import check_id, read_text_file
-from motionloom.datasets.convert.common.splits import split_named
+from motionloom.datasets.convert.common.splits import ListLine, split_named
 from motionloom.datasets.convert.common.tables import DELIMITERS, table_rows
 
 T = TypeVar("T")
@@ -59,6 +59,8 @@ class CaptionRow:
     """Whether it is from a list of a whole collection, of which a source need not have every clip."""
     origin: str = ""
     """The file, or the folder of .txt files, that it is from."""
+    lines: tuple[ListLine, ...] = ()
+    """Its records."""
 
 
 class _Given(Config):
@@ -158,6 +160,7 @@ def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
         file=before.file or row.file,
         split=before.split or row.split,
         catalogue=before.catalogue and row.catalogue,
+        lines=before.lines + row.lines,
     )
 
 
@@ -282,6 +285,10 @@ def _of_table(path: Path, text: str, columns: dict[str, str]) -> Records:
     """The rows by the names of the header, in lower case."""
     lines = text.split("\n")
     first = next(number for number, line in enumerate(lines) if line.strip())
+    if re.fullmatch(r"sep=.\s*", lines[first]) and first + 1 < len(
+        lines
+    ):  # Excel's, which says how it goes on
+        first += 1
     delimiter, names = _header(path, lines[first], first + 1, columns)
     for place, row in table_rows(lines[first + 1 :], first + 2, names, delimiter, str(path)):
         yield place, row if isinstance(row, UserError) else {**row}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import operator
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -62,10 +61,11 @@ class Conversion(Generic[C]):
             converter_version=self.converter.version,
             options=self.options,
             motion_type=self.config.motion_type,
-            licences=self.plan.licences,
+            licences=self.plan.totals.licences,
             credits=self.converter.credits(self.plan),
             audio=self.converter.audio(),
             dropped=self.plan.left_out(),
+            not_ours=self.plan.not_ours,
             lost=lost,
             most_lost=self.config.most_rejected,
             notes=self.plan.notes,
@@ -92,7 +92,7 @@ class Conversion(Generic[C]):
         plan = self.plan
         plan.look = self.look()
         width = self.config.motion_layout().dim * (2 if self.config.motion_type == "float16" else 4)
-        plan.bytes_needed = sum(plan.frames.values()) * width + len(plan.items) * 4096
+        plan.totals.bytes_needed = sum(plan.totals.frames.values()) * width + len(plan.items) * 4096
         return self
 
 
@@ -136,11 +136,15 @@ def run_conversion(
 def moved_clips(folder: Path, plan: ConversionPlan[C]) -> str:
     """Return how many clips of a finished set would change their split, by both splits; empty if none."""
     before: dict[str, Split] = {}
-    with suppress(UserError):  # none, or unfinished
+    try:
         shards = load_manifest(folder).shards
-        for split in SPLITS:
-            index = load_index(folder, split, [shard for shard in shards if shard.split == split])
-            before |= {index.id(clip): split for clip in range(len(index))}
+        indices = {
+            split: load_index(folder, split, [s for s in shards if s.split == split]) for split in SPLITS
+        }
+    except UserError:  # none, or unfinished
+        return ""
+    for split, index in indices.items():
+        before |= {index.id(clip): split for clip in range(len(index))}
     pairs = Counter(
         f"{before[clip.id]} -> {split}" for split, clip in plan.items if before.get(clip.id, split) != split
     )

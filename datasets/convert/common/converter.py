@@ -54,6 +54,8 @@ class Converter(ABC, Generic[Cfg, C]):
     """Numbers that the makers of a set state, and where; a note of the plan says what is found of them."""
     credit: ClassVar[str] = ""
     """The sentence that names the makers of a set, where its licence asks for one."""
+    beside: ClassVar[tuple[str, ...]] = ()
+    """Endings of files without motion that motion files are read with."""
     version: ClassVar[int] = 1
     """Raised when the same source gives other samples: finished shards are then made again."""
 
@@ -69,7 +71,7 @@ class Converter(ABC, Generic[Cfg, C]):
     def plan(self, settings: PlanSettings) -> ConversionPlan[C]:
         """Look at the whole source and decide what becomes of every file, without converting anything.
 
-        `ConversionPlan.take` or `leave_out` each, then `finish`. `UserError` for a source of another kind.
+        `ConversionPlan.add` or `skip` each, then `finish`. `UserError` for a source of another kind.
         """
 
     @abstractmethod
@@ -93,11 +95,11 @@ class Converter(ABC, Generic[Cfg, C]):
 
     def licence(self, plan: ConversionPlan[C]) -> str:
         """The licence of the whole data set."""
-        return self.config.licence or next(iter(plan.licences), "")
+        return self.config.licence or next(iter(plan.totals.licences), "")
 
     def credits(self, plan: ConversionPlan[C]) -> list[str]:
         """Return the sentences that the licences of the planned clips ask for."""
-        return credits_of(plan.licences, self.config.name, [self.credit] if self.credit else [])
+        return credits_of(plan.totals.licences, self.config.name, [self.credit] if self.credit else [])
 
     def options(self) -> dict[str, object]:
         """Return all that samples depend on beside the source: options, and facts of the files they name."""

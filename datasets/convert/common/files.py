@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -85,27 +87,92 @@ def inside(root: Path, relative: str, name: str | None = None) -> Path:
     return path
 
 
-def walk_files(root: Path) -> list[str]:
-    """Return the names of all files under a folder, relative to it and sorted. Folders behind links are
-    followed, each folder once: by its own name where it lies under `root` itself, else by the first link.
+@dataclass(frozen=True)
+class Walk:
+    """Every entry of a folder and of the folders below it, by its name from there. Folders are no entries."""
+
+    files: list[str] = field(default_factory=list)
+    """Sorted."""
+    unread: dict[str, str] = field(default_factory=dict)
+    """Entries that are not there or may not be read, folders with a slash behind them, and why."""
+    others: dict[str, str] = field(default_factory=dict)
+    """Entries that are no files, and links to folders that have another name here, and what they are."""
+
+
+def walk(root: Path, skip: Path | None = None) -> Walk:
+    """Return all entries under a folder, whatever is wrong with any of them, but for those of folder `skip`.
+
+    Folders behind links are followed, each folder once: by its own name where it lies under `root` itself,
+    else by the first link.
     """
-    names: list[str] = []
-    seen: set[tuple[int, int]] = set()
+    found, seen = Walk(), set[tuple[int, int]]()
+    left = None if skip is None or not skip.is_dir() else _identity(skip)
     folders, links = [""], list[str]()
     while folders or links:
         folder = folders.pop() if folders else links.pop(links.index(min(links)))
-        with suppress(OSError):  # one that cannot be read holds nothing that can
-            about = (root / folder).stat()
-            if (about.st_dev, about.st_ino) in seen:
+        try:
+            identity, entries = _identity(root / folder), list(os.scandir(root / folder))
+        except OSError as error:
+            found.unread[f"{folder}/"] = _reason(error)
+            continue
+        if identity == left:
+            continue
+        if identity in seen:
+            found.others[f"{folder}/"] = "a folder that is read by another name"
+            continue
+        seen.add(identity)
+        for entry in entries:
+            name = f"{folder}/{entry.name}" if folder else entry.name
+            if entry.name == "__MACOSX" or entry.name.startswith("._"):
+                found.others[name] = "what a Mac puts into archives"
                 continue
-            seen.add((about.st_dev, about.st_ino))
-            for entry in os.scandir(root / folder):
-                name = f"{folder}/{entry.name}" if folder else entry.name
-                if entry.is_dir():
-                    (links if entry.is_symlink() else folders).append(name)
-                elif entry.is_file():
-                    names.append(name)
-    return sorted(names)
+            try:
+                mode = entry.stat().st_mode
+            except OSError as error:
+                found.unread[name] = _reason(error)
+                continue
+            if stat.S_ISDIR(mode):
+                (links if entry.is_symlink() else folders).append(name)
+            elif stat.S_ISREG(mode):
+                found.files.append(name)
+            else:
+                found.others[name] = "a pipe, socket or device"
+    found.files.sort()
+    return found
+
+
+def _identity(folder: Path) -> tuple[int, int]:
+    about = folder.stat()
+    return about.st_dev, about.st_ino
+
+
+def _reason(error: OSError) -> str:
+    known = {errno.ENOENT: "a link that leads nowhere", errno.ELOOP: "a link that leads in a circle"}
+    return known.get(error.errno or 0, f"may not be read ({error.strerror})")
+
+
+def walk_files(root: Path) -> list[str]:
+    """Return the names of all files under a folder, relative to it and sorted."""
+    return walk(root).files
+
+
+def is_there(path: Path) -> bool:
+    """Whether a file can be found, also where its folder may not be read."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def files_in(folder: Path, suffix: str) -> list[str]:
+    """Return the sorted names of a folder's own entries that end so, whether or not they can be read, without
+    hidden ones. `UserError` for a folder that may not be read.
+    """
+    try:
+        names = [path.name for path in folder.iterdir()]
+    except OSError as error:
+        raise UserError(f"{folder}: cannot read ({error.strerror})") from None
+    return sorted(name for name in names if name.endswith(suffix) and name[0] != ".")
 
 
 def read_in_threads(

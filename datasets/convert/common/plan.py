@@ -1,16 +1,18 @@
 """The plan of a conversion.
 
 A converter plans before it converts: the plan lists what was found, what is missing and what will be left out
-and why, so nothing is skipped silently (`convert ... --plan` prints it and stops).
+and why, so nothing is skipped silently (`convert ... --plan` prints it and stops). Every entry of the source
+and every line of its lists ends in one bin (`account`).
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from pathlib import Path, PurePosixPath
+from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
 
 from rich.markup import escape
 from rich.table import Table
@@ -22,12 +24,16 @@ from motionloom.datasets.base.printable import printable
 from motionloom.datasets.base.records import SPLITS, Dropped, Split
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.facts import Facts, parse_where, require_known
+from motionloom.datasets.convert.common.files import Walk
 from motionloom.datasets.convert.common.look import Look
+from motionloom.datasets.convert.common.splits import ListLine
 from motionloom.datasets.shards.left_out import drop, grouped, grouped_notes
 
 
 class PlannedClip(Protocol):
-    """A clip of a plan: what a converter hands to its function from clip to sample."""
+    """A clip of a plan: what a converter hands to its function from clip to sample. One whose label is not
+    the name of its motion file in the source says that as `file`.
+    """
 
     @property
     def id(self) -> str:
@@ -44,6 +50,69 @@ class PlannedClip(Protocol):
 
 C = TypeVar("C", bound=PlannedClip)
 
+Fate = Literal["skipped", "rejected", "unreadable", "missing"]
+"""What becomes of one that is no clip; those that a conversion was to read, rejected or not, are lost."""
+_BINS = {"clip": "of clips", "beside": "read with them", "left out": "left out", "missing": "missing",
+         "not ours": "not ours"}  # fmt: skip
+"""Where entries and lines end, and the words of the sums."""
+
+
+class NotTaken(NamedTuple):
+    """One that becomes no clip."""
+
+    record: Dropped
+    fate: Fate
+    names: tuple[str, ...]
+    """Its file and id."""
+
+
+@dataclass
+class Words:
+    """Clips with and without captions, where captions are wanted; by their labels."""
+
+    captioned: int = 0
+    """Clips that have them, and nothing against them."""
+    uncaptioned: list[str] = field(default_factory=list)
+    bare: list[str] = field(default_factory=list)
+    """Clips that lack nothing but captions."""
+    summary: str = ""
+    """Number of clips with captions, and those without, where the user brought captions."""
+
+
+@dataclass
+class Totals:
+    """Numbers of a finished plan."""
+
+    found: int = 0
+    """Motion files in the source."""
+    clips: int = 0
+    """Clips found, taken or not, and their hours."""
+    hours: float = 0.0
+    frames: dict[Split, int] = field(default_factory=dict)
+    """Expected frames a split, at the target frame rate."""
+    licences: dict[str, int] = field(default_factory=dict)
+    """Clips to convert under each licence."""
+    bytes_needed: int | None = None
+    """Disk that the shards will take; None when unknown."""
+    count: Callable[[], None] = lambda: None
+    """Counts frames and licences again."""
+
+
+@dataclass
+class Known:
+    """What the draft has seen of the source so far."""
+
+    ids: dict[str, str] = field(default_factory=dict)
+    """Label of the first clip with each id."""
+    facts: set[str] = field(default_factory=set)
+    """Names of the facts that `config.where` may ask for."""
+    beside: set[str] = field(default_factory=set)
+    """Files of the source, without motion, that clips are made with: words, sound, lists."""
+    limited: set[str] = field(default_factory=set)
+    """Files and ids of clips that `config.limit` leaves out."""
+    lines: list[ListLine] = field(default_factory=list)
+    """Lines of caption tables and split lists."""
+
 
 @dataclass
 class ConversionPlan(Generic[C]):
@@ -54,109 +123,118 @@ class ConversionPlan(Generic[C]):
 
     config: ConvertConfig
     items: list[tuple[Split, C]] = field(default_factory=list)
-    frames: dict[Split, int] = field(default_factory=dict)
-    """Expected frames a split, at the target frame rate."""
-    found: int = 0
-    """Motion files in the source."""
-    missing: list[Dropped] = field(default_factory=list)
-    """Listed by captions or split files, but not in the source."""
-    uncaptioned: list[str] = field(default_factory=list)
-    """In the source, without captions."""
-    bare_clips: list[str] = field(default_factory=list)
-    """Clips that lack nothing but captions."""
-    captioned: int = 0
-    """Clips that have them, and nothing against them."""
-    dropped: list[Dropped] = field(default_factory=list)
-    """In the source and readable, but left out."""
-    rejected: list[Dropped] = field(default_factory=list)
-    """In the source and readable, but nothing says how they are to be read as a person's motion."""
-    broken: list[Dropped] = field(default_factory=list)
-    """In the source, but cannot be read."""
+    not_taken: list[NotTaken] = field(default_factory=list)
+    not_ours: list[Dropped] = field(default_factory=list)
+    """Entries that are not read and lines that say nothing of a clip: for the list of what is left out."""
     notes: list[str] = field(default_factory=list)
-    licences: dict[str, int] = field(default_factory=dict)
-    """Clips to convert under each licence."""
-    bytes_needed: int | None = None
-    """Disk that the shards will take; None when unknown."""
-    captions: str = ""
-    """Number of clips with captions, and those without, where the user brought captions."""
+    sums: list[str] = field(default_factory=list)
+    """Entries of the source, and lines of each list, by what became of them."""
+    stated: str = ""
+    """Numbers that the makers of the source state, and where."""
+    base: str = ""
+    """Folder of the source, with a slash behind it, that the names of motion files begin in."""
+    known: Known = field(default_factory=Known)
+    words: Words = field(default_factory=Words)
+    totals: Totals = field(default_factory=Totals)
     stop: str = ""
     """Decision that the user must take before it is carried out; empty when nothing is open."""
     look: Look | None = None
     """Measurements of a few clips; None when none was read."""
-    stated: str = ""
-    """Numbers that the makers of the source state, and where."""
-    clips: int = 0
-    """Clips found, taken or not, and their hours."""
-    hours: float = 0.0
-    ids: dict[str, str] = field(default_factory=dict)
-    """Label of the first clip with each id."""
-    known: set[str] = field(default_factory=set)
-    """Names of the facts that `config.where` may ask for."""
     removed: list[tuple[Split, C]] = field(default_factory=list)
     """Clips that `data remove` took out of the set: no sample is made of them, nor are they named."""
-    totals: Callable[[], None] = lambda: None
-    """Counts frames and licences of `items`, once it is finished."""
 
     @property
     def name(self) -> str:
         return f"{self.config.source.name} -> {self.config.name}"
 
-    def take(
+    @property
+    def missing(self) -> list[Dropped]:
+        """Listed by captions or split files, but not in the source; and entries that lead nowhere."""
+        return self._of("missing")
+
+    @property
+    def dropped(self) -> list[Dropped]:
+        """In the source and readable, but left out."""
+        return self._of("skipped")
+
+    @property
+    def rejected(self) -> list[Dropped]:
+        """In the source and readable, but nothing says how they are to be read as a person's motion."""
+        return self._of("rejected")
+
+    @property
+    def broken(self) -> list[Dropped]:
+        """In the source, but cannot be read."""
+        return self._of("unreadable")
+
+    def _of(self, fate: Fate) -> list[Dropped]:
+        return [one.record for one in self.not_taken if one.fate == fate]
+
+    def add(
         self, clip: C, reason: str = "", *, captioned: bool = False, wanted: bool = False, keep: bool = True
     ) -> None:
-        """Take a clip, or leave it out: for `reason`, because another has its id, because `config.where` asks
+        """Add a clip, or skip it: for `reason`, because another has its id, because `config.where` asks
         for others, or, where captions are `wanted` and those without any not to `keep`, for want of them.
         """
-        if clip.id in self.ids:
-            reason = f"second file for clip id '{clip.id}'; the first is {self.ids[clip.id]}"
+        ids, words = self.known.ids, self.words
+        if clip.id in ids:
+            reason = f"second file for clip id '{clip.id}'; the first is {ids[clip.id]}"
         else:
-            self.ids[clip.id] = clip.label()
+            ids[clip.id] = clip.label()
         if wanted and not captioned:
-            self.uncaptioned.append(clip.label())
+            words.uncaptioned.append(clip.label())
             if not reason:
-                self.bare_clips.append(clip.label())
+                words.bare.append(clip.label())
                 reason = "" if keep else "no usable caption"
         elif captioned and not reason:
-            self.captioned += 1
+            words.captioned += 1
         facts = facts_of(clip)
-        self.known.update(facts)
-        self.clips += 1
-        self.hours += number(facts.get("seconds", 0.0), "seconds") / 3600
+        self.known.facts.update(facts)
+        self.totals.clips += 1
+        self.totals.hours += number(facts.get("seconds", 0.0), "seconds") / 3600
         if not reason and not all(one.holds(facts) for one in parse_where(self.config.where)):
             reason = f"not where {self.config.where.strip()}"
         if reason:
-            self.leave_out(clip.label(), reason)
+            self._leave(clip.label(), reason, "skipped", file_of(clip), clip.id)
         else:
             self.items.append((clip.split, clip))
 
-    def leave_out(self, source: str, reason: str) -> None:
-        """This one could become a sample, but does not."""
-        self.dropped.append(Dropped(source=source, reason=reason))
+    def skip(self, source: str, reason: str) -> None:
+        """Leave out what could become a sample."""
+        self._leave(source, reason, "skipped")
 
-    def miss(self, source: str, reason: str) -> None:
-        """This one is listed somewhere, but not in the source."""
-        self.missing.append(Dropped(source=source, reason=reason))
+    def mark_missing(self, source: str, reason: str, *names: str) -> None:
+        """Leave out what is listed somewhere, by these further names, but not in the source."""
+        self._leave(source, reason, "missing", *names)
 
-    def reject(self, source: str, reason: str) -> None:
-        """This one was meant to become a sample, and cannot."""
-        self.rejected.append(Dropped(source=source, reason=reason))
+    def mark_rejected(self, clip: C, reason: str) -> None:
+        """Leave out a clip that was meant to become a sample, and cannot."""
+        self._leave(clip.label(), reason, "rejected", file_of(clip), clip.id)
 
-    def fail(self, source: str, error: Exception) -> None:
-        """This one cannot be read."""
-        self.broken.append(drop(source, error))
+    def mark_unreadable(self, source: str, error: Exception) -> None:
+        """Leave out what cannot be read."""
+        self._leave(source, drop(source, error).reason, "unreadable")
 
-    def fail_rows(self, bad: Mapping[str, str]) -> None:
-        """These rows of the source's tables cannot be read."""
+    def _leave(self, source: str, reason: str, fate: Fate, *names: str) -> None:
+        kind = fate if fate == "unreadable" or fate == "missing" else "rejected"
+        record = Dropped(source=source, reason=reason, kind=kind)
+        self.not_taken.append(NotTaken(record, fate, (source, *names)))
+
+    def mark_rows_unreadable(self, bad: Mapping[str, str]) -> None:
+        """Leave out rows of the source's tables that cannot be read, by their places."""
         for place, reason in bad.items():
-            self.fail(place, UserError(reason))
+            self.mark_unreadable(place, UserError(reason))
 
     @contextmanager
     def reading(self, source: str) -> Iterator[None]:
-        """Note `source` as broken, and why, if what is read within fails; the plan goes on without it."""
+        """Note that clips are made with the file `source`; or that it is broken, and why, if what is read
+        within fails. The plan goes on without it.
+        """
+        self.known.beside.add(source)
         try:
             yield
         except Exception as error:  # whatever a bad file, name or number makes of the libraries below
-            self.fail(source, error)
+            self.mark_unreadable(source, error)
 
     def limit(self, key: Callable[[C], str]) -> None:
         """Keep `config.limit` clips at most, chosen by a hash of their key, with a note of the choice."""
@@ -164,27 +242,96 @@ class ConversionPlan(Generic[C]):
         if most is not None and most < len(self.items):
             self.notes.append(f"limited to {most} of {len(self.items)} clips")
             kept = set(sorted(sha256_of_json(key(clip)) for _, clip in self.items)[:most])
+            for _, clip in self.items:
+                if sha256_of_json(key(clip)) not in kept:
+                    record = Dropped(source=clip.label(), reason=f"not among the {most} clips of the limit")
+                    self.not_ours.append(record)
+                    self.known.limited |= {clip.id, file_of(clip)}
             self.items = [item for item in self.items if sha256_of_json(key(item[1])) in kept]
 
     def finish(
         self, *, found: int, frames: Callable[[C], int], licence: Callable[[C], str]
     ) -> ConversionPlan[C]:
         """Itself, with its totals; `frames` (at the target rate) and `licence` are asked about every clip."""
-        if self.known:
-            require_known(self.config.where, self.known)
+        totals = self.totals
+        if self.known.facts:
+            require_known(self.config.where, self.known.facts)
         if self.stated:
-            self.notes.append(f"{self.stated}; found here: {self.clips:,} clips, {self.hours:,.1f} hours")
-        self.found, self.notes = found, grouped_notes(self.notes)
+            hours = f"{totals.clips:,} clips, {totals.hours:,.1f} hours"
+            self.notes.append(f"{self.stated}; found here: {hours}")
+        self.totals.found = found
+        self.notes = grouped_notes(self.notes)
 
-        def totals() -> None:
-            self.frames = dict.fromkeys(SPLITS, 0)
+        def count() -> None:
+            totals.frames = dict.fromkeys(SPLITS, 0)
             for split, clip in self.items:
-                self.frames[split] += frames(clip)
-            self.licences = dict(sorted(Counter(licence(clip) for _, clip in self.items).items()))
+                totals.frames[split] += frames(clip)
+            totals.licences = dict(sorted(Counter(licence(clip) for _, clip in self.items).items()))
 
-        self.totals = totals
-        totals()
+        totals.count = count
+        count()
         return self
+
+    def account(self, walked: Walk, beside: tuple[str, ...] = ()) -> None:
+        """Put every entry of the source and every line of its lists into one bin, and sum them up.
+
+        `walked` are the entries, and `beside` endings of files that motion files are read with. What could
+        not be read and no clip has named is missing; a motion file that nothing has named is left out.
+        """
+        base = self.base
+        clips = {base + file_of(clip) for _, clip in self.items}
+        fates = {base + name: one.fate for one in self.not_taken for name in one.names}
+        limited = {base + name for name in self.known.limited}
+        # A file beside the clips that is of no use to any of them is still a file that was read.
+        read = self.known.beside | _given(self.config, walked)
+        homes = {_home(name) for name in (*clips, *fates, *limited)}
+        bins: Counter[str] = Counter()
+        entries = dict.fromkeys(walked.files, "") | walked.unread | walked.others
+        for name, reason in entries.items():
+            if name in clips:
+                bins["clip"] += 1
+            elif name in fates or name in limited:
+                bins["missing" if fates.get(name) == "missing" else "left out"] += 1
+            elif name in walked.unread:
+                bins["missing"] += 1
+                self.mark_missing(name, reason)
+            elif not reason and (name in read or name.lower().endswith(beside or ("\0",))):
+                bins["beside"] += 1
+            elif not reason and _home(name) in homes and not PurePosixPath(name).name.startswith("."):
+                bins["left out"] += 1
+                self.skip(name.removeprefix(base), "nothing in the lists of the source names it")
+            else:
+                bins["not ours"] += 1
+                self.not_ours.append(Dropped(source=name, reason=reason or "not read", kind="not ours"))
+        self._say("entries of the source", bins)
+        self._account_lines()
+
+    def _account_lines(self) -> None:
+        """Put every line of the lists into one bin: that of its clip, unless it says nothing of one."""
+        clips = {name: clip for _, clip in self.items for name in (clip.id, file_of(clip))}
+        fates = {name: one.fate for one in self.not_taken for name in one.names}
+        bins: dict[str, Counter[str]] = {}
+        for line in self.known.lines:
+            counts = bins.setdefault(line.place.rpartition(":")[0], Counter())
+            clip, reason = clips.get(line.key), line.reason
+            if clip is not None and line.words and not reason and not line.words & words_of(clip):
+                reason = "none of its captions is of the clip's time"
+            if reason:
+                counts["left out"] += 1
+                self.not_ours.append(Dropped(source=line.place, reason=reason))
+            elif clip is not None:
+                counts["clip"] += 1
+            elif line.is_catalogue:
+                counts["not ours"] += 1
+            else:
+                known = line.key in self.known.limited or fates.get(line.key, "missing") != "missing"
+                counts["left out" if known else "missing"] += 1
+        for name, counts in bins.items():
+            self._say(f"lines of {name}", counts)
+
+    def _say(self, what: str, bins: Counter[str]) -> None:
+        parts = ", ".join(f"{bins[key]:,} {words}" for key, words in _BINS.items() if bins[key])
+        self.sums.append(f"{bins.total():,} {what}: {parts or 'none'}")
 
     def leave_removed(self, gone: Callable[[str, str], bool], record: str) -> None:
         """Take out what is removed, by id and label, and all that names it; `record` is named in the note."""
@@ -193,24 +340,24 @@ class ConversionPlan(Generic[C]):
             self.notes.append(f"{len(self.removed):,} clips stay out, as they were removed ({record})")
         names = {clip.label() for _, clip in self.removed}
         self.items = [item for item in self.items if item[1].label() not in names]
-        for drops in (self.missing, self.dropped, self.rejected, self.broken):
-            names.update(one.source for one in drops if gone("", one.source))
-            drops[:] = [one for one in drops if one.source not in names]
+        left_out = [one.record for one in self.not_taken] + self.not_ours
+        names.update(one.source for one in left_out if gone("", one.source))
+        self.not_taken = [one for one in self.not_taken if one.record.source not in names]
+        self.not_ours = [one for one in self.not_ours if one.source not in names]
         self.notes = [note for note in self.notes if not any(name in note for name in names)]
-        self.totals()
+        self.totals.count()
 
     def counts(self) -> dict[Split, int]:
         return {split: sum(s == split for s, _ in self.items) for split in SPLITS}
 
     def table(self) -> Table:
         table = Table("what", "clips", "frames", "detail", title=escape(f"plan: {self.name}"))
-        counts = self.counts()
-        table.add_row("found in the source", str(self.found), "", "")
+        counts, totals, uncaptioned = self.counts(), self.totals, self.words.uncaptioned
+        table.add_row("found in the source", str(totals.found), "", "")
         for split in SPLITS:
-            table.add_row(split, str(counts[split]), str(self.frames.get(split, 0)), "")
-        if self.uncaptioned:
-            some = escape(_some(self.uncaptioned))
-            table.add_row("without captions", str(len(self.uncaptioned)), "", some)
+            table.add_row(split, str(counts[split]), str(totals.frames.get(split, 0)), "")
+        if uncaptioned:
+            table.add_row("without captions", str(len(uncaptioned)), "", escape(_some(uncaptioned)))
         kinds = (
             ("missing files", self.missing),
             ("left out", [*self.rejected, *self.dropped]),
@@ -218,10 +365,12 @@ class ConversionPlan(Generic[C]):
         )
         for title, drops in kinds:
             table.add_row(title, str(len(drops)), "", escape(_some(grouped(drops))))
-        for licence, count in sorted(self.licences.items()):
+        for licence, count in sorted(totals.licences.items()):
             table.add_row("licence", str(count), "", escape(licence))
-        if self.bytes_needed is not None:
-            table.add_row("disk", "", "", f"{self.bytes_needed / 2**20:,.1f} MiB")
+        if totals.bytes_needed is not None:
+            table.add_row("disk", "", "", f"{totals.bytes_needed / 2**20:,.1f} MiB")
+        for line in self.sums:
+            table.add_row("accounted", "", "", escape(printable(line)))
         for note in self.notes:
             table.add_row("note", "", "", escape(printable(note)))
         if self.stop:
@@ -229,12 +378,7 @@ class ConversionPlan(Generic[C]):
         return table
 
     def left_out(self) -> list[Dropped]:
-        return [
-            *(drop.model_copy(update={"kind": "missing"}) for drop in self.missing),
-            *(drop.model_copy(update={"kind": "unreadable"}) for drop in self.broken),
-            *self.rejected,
-            *self.dropped,
-        ]
+        return [*self.missing, *self.broken, *self.rejected, *self.dropped]
 
     def require_settled(self) -> None:
         if self.stop:
@@ -245,6 +389,37 @@ def facts_of(clip: PlannedClip) -> Facts:
     """Facts of a clip by name, for `where`: id, split, and the clip's own `facts`."""
     facts: Facts = getattr(clip, "facts", {})
     return {"id": clip.id, "split": clip.split, **facts}
+
+
+def file_of(clip: PlannedClip) -> str:
+    """The name of a clip's motion file in the source."""
+    return str(getattr(clip, "file", clip.label()))
+
+
+def words_of(clip: PlannedClip) -> frozenset[str]:
+    """The sentences of a clip."""
+    return frozenset(text.text for text in getattr(clip, "texts", ()))
+
+
+def _given(config: ConvertConfig, walked: Walk) -> set[str]:
+    """The entries that options name: a file, or all files of a folder."""
+    values = [value for key in type(config).model_fields for value in _each(getattr(config, key))]
+    paths = {value.absolute() for value in values if isinstance(value, Path) and value != config.source}
+    source = config.source.absolute()
+    within = {path.relative_to(source).as_posix() for path in paths if path.is_relative_to(source)}
+    return {
+        name for name in walked.files if not within.isdisjoint([name, *map(str, PurePosixPath(name).parents)])
+    }
+
+
+def _each(value: object) -> Iterable[object]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def _home(name: str) -> tuple[str, str]:
+    """Folder and ending of a file, by which motion files are told from others."""
+    path = PurePosixPath(name)
+    return str(path.parent), path.suffix.lower()
 
 
 def _some(lines: Sequence[object], limit: int = 5) -> str:

@@ -95,6 +95,14 @@ class ReleaseClip:
         return self.entry.id
 
     @property
+    def file(self) -> str:
+        return self.entry.file
+
+    @property
+    def texts(self) -> tuple[Caption, ...]:
+        return self.entry.texts
+
+    @property
     def seconds(self) -> float:
         return (self.last - self.first) / self.fps
 
@@ -178,23 +186,24 @@ class Release(Converter[Cfg, ReleaseClip]):
         scanned = dict(zip(files, found, strict=True))
         for file, state in scanned.items():
             if isinstance(state, Exception):
-                draft.fail(file, state)
+                draft.mark_unreadable(file, state)
         named = {entry.id for entry in entries}
         for clip_id, split in (self.listed or {}).items():
             if clip_id not in named:
-                draft.miss(clip_id, f"listed in {split}.txt, but not in the source")
+                draft.mark_missing(clip_id, f"listed in {split}.txt, but not in the source")
         for entry in self.with_sound(entries, draft):
             state = scanned[entry.file]
             if state is None:
-                draft.miss(entry.file, f"clip '{entry.id}' is listed, but its file is not in the source")
+                reason = f"clip '{entry.id}' is listed, but its file is not in the source"
+                draft.mark_missing(entry.file, reason, entry.id)
             elif not isinstance(state, Exception):
                 clip, problem = self._clip(entry, state, draft)
                 reason = clip.entry.problem or problem
                 captioned, keep = bool(clip.entry.texts), config.uncaptioned == "keep"
-                draft.take(clip, reason, captioned=captioned, wanted=config.has_captions, keep=keep)
+                draft.add(clip, reason, captioned=captioned, wanted=config.has_captions, keep=keep)
         draft.limit(lambda clip: clip.id)
         return draft.finish(
-            found=draft.found or repeated + sum(state is not None for state in scanned.values()),
+            found=draft.totals.found or repeated + sum(state is not None for state in scanned.values()),
             frames=self.frames,
             licence=lambda clip: clip.licence,
         )
@@ -218,10 +227,12 @@ class Release(Converter[Cfg, ReleaseClip]):
         folder = self.config.splits or next(iter(here), None)
         if folder is None:
             return None
-        splits, notes = read_split_files(folder)
-        keep_mirrors_together(splits, folder)
-        draft.notes += notes
-        return splits
+        lists = read_split_files(folder)
+        keep_mirrors_together(lists.splits, folder)
+        draft.notes += lists.notes
+        draft.known.lines += lists.lines
+        draft.known.beside.update(_below(source, [path for _, path in split_files(folder)]))
+        return lists.splits
 
     def with_sound(self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         """The entries as their sound allows; sets without sound have none."""
@@ -270,7 +281,7 @@ class Release(Converter[Cfg, ReleaseClip]):
         return [clip.id, entry.file, content, clip.first, clip.last, texts, clip.licence]
 
     def licence(self, plan: ConversionPlan[ReleaseClip]) -> str:
-        alone = next(iter(plan.licences), self.terms) if len(plan.licences) <= 1 else self.terms
+        alone = next(iter(plan.totals.licences), self.terms) if len(plan.totals.licences) <= 1 else self.terms
         return self.config.licence or alone
 
     def read(self, clip: ReleaseClip) -> Figure:
@@ -299,3 +310,8 @@ class Release(Converter[Cfg, ReleaseClip]):
         return self.meta(
             clip, motion, source=clip.label(), licence=clip.licence, mirror_of=clip.entry.mirror_of, **facts
         )
+
+
+def _below(source: Path, paths: Iterable[Path]) -> list[str]:
+    """The names of files in the source."""
+    return [path.relative_to(source).as_posix() for path in paths if path.is_relative_to(source)]

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal, NamedTuple, cast
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import whole
@@ -66,8 +66,33 @@ def hash_share(clip_id: str) -> float:
     return int.from_bytes(hashlib.sha256(name).digest()[:8], "big") / 2**64
 
 
-def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
-    """`train.txt`, `val.txt`, `test.txt` (one id a line) -> split of every id, and notes on repeated lines.
+class ListLine(NamedTuple):
+    """One line of a list or of a table of captions."""
+
+    place: str
+    """`FILE:LINE`."""
+    key: str
+    """Id or file of the clip that it names."""
+    reason: str = ""
+    """Why it says nothing of a clip; empty where it does."""
+    words: frozenset[str] = frozenset()
+    """Its captions."""
+    is_catalogue: bool = False
+    """Whether it is from a list of a whole collection, of which a source need not have every clip."""
+
+
+class SplitLists(NamedTuple):
+    """The split files of a folder."""
+
+    splits: dict[str, Split]
+    """Split of every id."""
+    notes: list[str]
+    """On repeated lines."""
+    lines: list[ListLine]
+
+
+def read_split_files(folder: Path) -> SplitLists:
+    """`train.txt`, `val.txt`, `test.txt` (one id a line).
 
     Files may also have the usual other names (`valid.txt`, `dev.txt`). An id in two splits is a leak and an
     error; blank lines, CRLF and suffixes of files behind the ids are fine.
@@ -78,9 +103,11 @@ def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
     splits: dict[str, Split] = {}
     origin: dict[str, str] = {}
     notes: list[str] = []
+    lines: list[ListLine] = []
     for split, path in files:
         ids, repeated = read_ids(path)
-        notes += repeated
+        notes += [f"{line.place}: {line.reason}" for line in repeated]
+        lines += [*(ListLine(f"{path.name}:{number}", clip_id) for clip_id, number in ids.items()), *repeated]
         if not ids:
             raise UserError(f"{path}: no ids in it; delete the file if there is to be no split '{split}'")
         for clip_id, number in ids.items():
@@ -90,13 +117,13 @@ def read_split_files(folder: Path) -> tuple[dict[str, Split], list[str]]:
                     f"{where}: '{clip_id}' is also in {origin[clip_id]}; a clip in two splits leaks"
                 )
             origin.setdefault(clip_id, path.name)
-    return splits, notes
+    return SplitLists(splits, notes, lines)
 
 
-def read_ids(path: Path) -> tuple[dict[str, int], list[str]]:
-    """The ids of a list, one a line, and the line of each; and notes on repeated lines."""
+def read_ids(path: Path) -> tuple[dict[str, int], list[ListLine]]:
+    """The ids of a list, one a line, and the line of each; and the repeated lines."""
     lines: dict[str, int] = {}
-    notes: list[str] = []
+    repeated: list[ListLine] = []
     for number, line in enumerate(read_text_file(path).split("\n"), start=1):
         clip_id = _FILE.sub("", line.strip())
         if not clip_id:
@@ -107,9 +134,10 @@ def read_ids(path: Path) -> tuple[dict[str, int], list[str]]:
             notes.append(f"{error}; the line is left out")
             continue
         if clip_id in lines:
-            notes.append(f"{path.name}:{number}: '{clip_id}' is listed twice; line {lines[clip_id]} counts")
+            reason = f"'{clip_id}' is listed twice; line {lines[clip_id]} counts"
+            repeated.append(ListLine(f"{path.name}:{number}", clip_id, reason))
         lines.setdefault(clip_id, number)
-    return lines, notes
+    return lines, repeated
 
 
 def original_of(clip_id: str) -> str | None:

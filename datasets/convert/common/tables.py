@@ -15,6 +15,8 @@ from motionloom.datasets.convert.common.files import read_text_file
 from motionloom.datasets.text.clean import clean_caption
 
 DELIMITERS = {",": "a ','", "\t": "a tab", ";": "a ';'"}
+_LONGEST_ROW = 100
+"""Lines of a row, whose text may hold newlines in quotes; beyond that a quote was not closed."""
 
 
 def read_json(path: Path, name: str) -> object:
@@ -82,26 +84,30 @@ def table_rows(
 ) -> Iterator[tuple[str, dict[str, str] | UserError]]:
     """(place, row) of the lines below a header, which begin at line `first`; blank rows say nothing.
 
-    In place of a row that is cut stands a `UserError` with its line; a quote that is not closed, behind which
-    no row is known, is the last.
+    In place of a row that is cut stands a `UserError` with its line, and the line after it is read as a row
+    again: a quote that is not closed takes no other row with it.
     """
-    # The reader wants the newlines back: those inside quotes belong to the text.
-    reader = csv.reader((f"{line}\n" for line in lines), delimiter=delimiter, strict=True)
-    while True:
-        place = f"{name}:{first + reader.line_num}"
+    at = 0
+    while at < len(lines):
+        place, begin = f"{name}:{first + at}", at
+        # The reader wants the newlines back: those inside quotes belong to the text.
+        reader = csv.reader(
+            (f"{line}\n" for line in lines[at : at + _LONGEST_ROW]), delimiter=delimiter, strict=True
+        )
         try:
             row = next(reader)
-        except StopIteration:
-            return
+            at += reader.line_num
         except csv.Error as error:
+            at += 1
             reason = "a quote is not closed before the next column"
             if "field larger" in str(error):
                 reason = f"a column of more than {csv.field_size_limit():,} letters"
             yield place, UserError(f"{place}: {reason}")
-            return
+            continue
         if not any(field.strip() for field in row):
             continue
         if len(row) != len(header):
+            at = begin + 1
             problem = (
                 f"{place}: {len(row)} columns, the header has {len(header)} ({', '.join(header[:12])}); put "
                 f"text that holds {DELIMITERS[delimiter]} in quotes"
@@ -122,7 +128,8 @@ def captions_within(
             end = None if text.end is None else min(text.end, seconds)
             kept.append(text.model_copy(update={"end": end}))
         else:
-            notes.append(f"{clip}: a caption at {text.start:g} s is beyond its {seconds:.1f} s")
+            what = f"starts at {text.start:g} s" if text.start >= seconds else f"ends at {text.end:g} s"
+            notes.append(f"{clip}: a caption {what}, beyond its {seconds:.1f} s")
     return tuple(kept)
 
 

@@ -28,7 +28,7 @@ from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import features_of, require_human
-from motionloom.datasets.convert.common.files import check_id, inside
+from motionloom.datasets.convert.common.files import check_id, files_in, inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
@@ -84,7 +84,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
         files, folder = self._motion(draft), self._texts()
-        listed = {path.stem for path in (self.config.source / folder).glob("*.txt") if path.name[0] != "."}
+        texts_here = files_in(self.config.source / folder, ".txt") if folder else []
+        listed = {name.removesuffix(".txt") for name in texts_here}
         if folder and (strays := len(listed - files.keys())):
             draft.notes.append(f"{strays} caption files in {folder}/ belong to no motion file here")
         for clip_id, file in sorted(files.items()):
@@ -110,7 +111,7 @@ class HumanMl3d(Release[HumanMl3dConfig]):
             )
         found: dict[str, str] = {}
         for folder in wanted:
-            for name in sorted(path.name for path in (source / folder).glob("*.npy") if path.name[0] != "."):
+            for name in files_in(source / folder, ".npy") if (source / folder).is_dir() else ():
                 label = f"{folder}/{name}"
                 with draft.reading(label):
                     found.setdefault(check_id(name.removesuffix(".npy"), label), label)

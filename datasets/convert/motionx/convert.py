@@ -142,8 +142,13 @@ class MotionX(Release[MotionXConfig]):
         entries = [entry for entry, _ in made]
         unwanted = len(motion) - len(ids)
         texts_alone = [clip_id for clip_id in files.by_kind["captions"] if clip_id not in motion]
-        draft.dropped += files.repeated
-        draft.broken += [*files.broken, *(one for _, said in made for one in said.broken)]
+        for one in files.repeated:
+            draft.skip(one.source, one.reason)
+        for one in files.broken:
+            draft.mark_unreadable(one.source, UserError(one.reason))
+        for _, said in made:
+            draft.not_taken += said.not_taken
+            draft.known.beside |= said.known.beside
         draft.notes += [
             *files.notes(),
             *([f"{unwanted} clips of other subsets are not asked for"] if unwanted else []),

@@ -20,7 +20,7 @@ from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.convert.common.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
-from motionloom.datasets.convert.common.files import read_text_file
+from motionloom.datasets.convert.common.files import files_in, is_there, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.tables import BadRows, captions_of, read_csv
@@ -72,15 +72,16 @@ class Beat2(BodyRelease[Beat2Config]):
         for folder in folders:
             below = "" if folder == source else f"{folder.name}/"
             listed = {}
-            if (folder / LISTS).is_file():
+            if is_there(folder / LISTS):
+                draft.known.beside.add(f"{below}{LISTS}")
                 bad: BadRows = {}
                 rows = read_csv(folder / LISTS, ("id", "type"), bad)
                 listed = {row["id"].strip(): row["type"].strip() for _, row in rows}
-                draft.fail_rows({f"{below}{place}": reason for place, reason in bad.items()})
+                draft.mark_rows_unreadable({f"{below}{place}": reason for place, reason in bad.items()})
             else:
                 draft.notes.append(f"no {below}{LISTS}: split 80/5/15 by hash of the name")
             language = folder.name.removeprefix("beat_").split("_v")[0]
-            here = {path.stem for path in (folder / MOTION).glob("*.npz")}
+            here = {name.removesuffix(".npz") for name in files_in(folder / MOTION, ".npz")}
             for name in sorted({*here, *listed}):
                 yield self._entry(below, name, language, listed.get(name), bool(listed), draft)
 
@@ -104,14 +105,14 @@ class Beat2(BodyRelease[Beat2Config]):
         sound, texts = f"{below}{SPEECH}/{name}.wav", tuple(self._words(below, name, draft))
         return Entry(
             f"{below}{name}", f"{below}{MOTION}/{name}.npz", texts, split, name, facts,
-            sound if (self.config.source / sound).is_file() else None, problem=problem,
+            sound if is_there(self.config.source / sound) else None, problem=problem,
         )  # fmt: skip
 
     def _words(self, below: str, name: str, draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:
         """Yield the transcript, a caption for each phrase between two pauses."""
         file = f"{below}{WORDS}/{name}.TextGrid"
         path = self.config.source / file
-        if not path.is_file():
+        if not is_there(path):
             return
         words: list[tuple[float, float, str]] = []
         with draft.reading(file):

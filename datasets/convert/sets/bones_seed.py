@@ -124,6 +124,7 @@ class BonesSeed(Bvh):
     summary = "BONES-SEED: SOMA motion capture with descriptions and timelines to shards."
     example = "bones-seed shards"
     config_class = BonesSeedConfig
+    beside = (".csv", "temporal_labels.jsonl")
     published = "card, 2026-03: 142,220 clips (half of them mirrored), 288 hours, 522 actors"
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Caption
-from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.bvh.config import BvhConfig
 from motionloom.datasets.convert.captions.options import Listing, list_clips
 from motionloom.datasets.convert.captions.read import CaptionRow
 from motionloom.datasets.convert.common.facts import Facts
@@ -64,8 +64,7 @@ class BvhSetConfig(BvhConfig):
             for name, row in known.items()
             if name in here
         ]
-        listed, notes = read_split_files(self.splits) if self.splits else (None, [])
-        found = list_clips(paths, rows, listed, notes)
+        found = list_clips(paths, rows, read_split_files(self.splits) if self.splits else None, [])
         found.missing.update({name: name for name in known if name not in here})
         return found
 

@@ -18,6 +18,7 @@ from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.body import SOURCE_FPS, BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
+from motionloom.datasets.convert.common.files import files_in, is_there
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
@@ -68,12 +69,12 @@ class FineDance(BodyRelease[FineDanceConfig]):
         source = self.config.source
         if not (source / MOTION).is_dir():
             raise UserError(f"{source}: no {MOTION}/ in it; give the folder data/ of the release")
-        for path in sorted((source / MOTION).glob("*.npy")):
-            number = path.stem
+        for name in files_in(source / MOTION, ".npy"):
+            number = name.removesuffix(".npy")
             facts: dict[str, Fact] = {}
             label = f"{LABELS}/{number}.json"
             with draft.reading(label):
-                if (source / label).is_file():
+                if is_there(source / label):
                     stated = require_record(read_json(source / label, label), label)
                     facts = {
                         key: str(value) for key, value in stated.items() if not isinstance(value, dict | list)
@@ -84,7 +85,7 @@ class FineDance(BodyRelease[FineDanceConfig]):
             sound = f"{MUSIC}/{number}.wav"
             yield Entry(
                 number,
-                f"{MOTION}/{path.name}",
+                f"{MOTION}/{name}",
                 tuple(
                     captions_of(f"a dancer performs {genre}", "genre")
                     if genre and self.config.caption_genre
@@ -92,7 +93,7 @@ class FineDance(BodyRelease[FineDanceConfig]):
                 ),
                 self._split(number),
                 facts=facts,
-                sound=sound if (source / sound).is_file() else None,
+                sound=sound if is_there(source / sound) else None,
                 problem="on the authors' list of unusable dances" if _is(number, _UNPAIRED) else "",
             )
 

@@ -29,7 +29,7 @@ from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.facts import Fact
-from motionloom.datasets.convert.common.files import read_text_file
+from motionloom.datasets.convert.common.files import files_in, is_there, read_text_file, walk_files
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
@@ -72,7 +72,7 @@ class Motion272(Release[Motion272Config]):
         streams = [split for split in SPLITS if (source / f"{split}_stream").is_dir()]
         if streams:
             for split in streams:
-                names = sorted(path.stem for path in (source / f"{split}_stream").glob("*.npy"))
+                names = [name.removesuffix(".npy") for name in files_in(source / f"{split}_stream", ".npy")]
                 yield from (
                     self._entry(f"{split}_stream", f"{split}_stream_text", n, split, draft) for n in names
                 )
@@ -80,8 +80,7 @@ class Motion272(Release[Motion272Config]):
         motion = next((name for name in _MOTION if (source / name).is_dir()), None)
         if motion is None:
             raise UserError(f"{source}: no {_MOTION[-1]}/ in it; unpack motion_data.zip, or give its folder")
-        root = source / motion
-        here = (path.relative_to(root).as_posix().removesuffix(".npy") for path in root.rglob("*.npy"))
+        here = (name.removesuffix(".npy") for name in walk_files(source / motion) if name.endswith(".npy"))
         for name in sorted(here):
             yield self._entry(motion, "texts", name, None, draft)
 
@@ -103,7 +102,7 @@ class Motion272(Release[Motion272Config]):
     def _texts(self, file: str, draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:
         """Captions in HumanML3D's grammar, two in a row of BABEL's stream, or plain lines."""
         path = self.config.source / file
-        if not path.is_file():
+        if not is_there(path):
             return
         with draft.reading(file):
             lines = [line for line in read_text_file(path, file).split("\n") if line.strip()]

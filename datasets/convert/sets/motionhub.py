@@ -18,7 +18,7 @@ from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.common.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
-from motionloom.datasets.convert.common.files import inside, read_text_file
+from motionloom.datasets.convert.common.files import inside, is_there, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
@@ -100,9 +100,10 @@ class MotionHub(BodyRelease[MotionHubConfig]):
         for task, split in lists:
             name = f"annotations/{task}/{split}.json"
             path = self.config.source / name
-            if not path.is_file():
+            if not is_there(path):
                 draft.notes.append(f"no {name}")
                 continue
+            draft.known.beside.add(name)
             here += 1
             listed = require_record(read_json(path, name), name).get("data_list")
             rows = enumerate(listed) if isinstance(listed, list) else require_record(listed, name).items()
@@ -110,7 +111,9 @@ class MotionHub(BodyRelease[MotionHubConfig]):
                 if isinstance(row, dict):
                     yield task, split, str(key), row
                 else:
-                    draft.fail(f"{name}: '{key}'", UserError(f"no JSON object, but {type(row).__name__}"))
+                    draft.mark_unreadable(
+                        f"{name}: '{key}'", UserError(f"no JSON object, but {type(row).__name__}")
+                    )
         if not here:
             raise UserError(
                 f"{self.config.source}: no annotations/{self.config.tasks[0]}/train.json in it; give the "

@@ -65,6 +65,7 @@ class SnapMoGen(Release[SnapMoGenConfig]):
         if not (source / FEATURES).is_dir():
             raise UserError(f"{source}: no {FEATURES}/ in it; give the folder of the release")
         records = require_record(read_json(source / CAPTIONS, CAPTIONS), CAPTIONS)
+        draft.known.beside.add(CAPTIONS)
         for key in dict.fromkeys([*records, *(self.listed or {})]):
             entries = list[Entry]()
             with draft.reading(f"{CAPTIONS}: '{key}'"):

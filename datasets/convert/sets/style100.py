@@ -75,6 +75,7 @@ class Style100(Bvh):
     summary = "100STYLE: walks and runs in a hundred styles (BVH) to shards."
     example = "100STYLE shards"
     config_class = Style100Config
+    beside = (CUTS.lower(), STYLES.lower())
     credit = "Motion of 100STYLE (Mason, Starke and Komura, 2022), CC BY 4.0."
     published = "paper, 2022, and the list of files: 810 clips, 100 styles, 18.5 hours"
 

@@ -51,7 +51,7 @@ class Arrays(Converter[ArraysConfig, ArraysClip]):
         """Every file, without reading it."""
         draft = ConversionPlan[ArraysClip](self.config)
         for path in sorted(self.config.source.glob("*.npy")):
-            draft.take(ArraysClip(path.stem, "test" if path.stem.startswith("test") else "train", path))
+            draft.add(ArraysClip(path.stem, "test" if path.stem.startswith("test") else "train", path))
         return draft.finish(found=len(draft.items), frames=self._frames, licence=lambda clip: "CC0")
 
     def _frames(self, clip: ArraysClip) -> int:

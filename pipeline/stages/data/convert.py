@@ -57,9 +57,9 @@ class ConvertStage(DataStage):
             say=lambda line: context.console.print(f"    {line}", markup=False, soft_wrap=True),
         )
         say_shards(context, manifest)
-        if conversion.plan.captions:
+        if conversion.plan.words.summary:
             context.console.print(
-                f"    {conversion.plan.captions}", markup=False, highlight=False, soft_wrap=True
+                f"    {conversion.plan.words.summary}", markup=False, highlight=False, soft_wrap=True
             )
 
 

@@ -120,12 +120,12 @@ def test_joints_and_parameters_tell_the_same_motion(fixture: Path, tmp_path: Pat
 def test_plan_of_the_fixture(fixture: Path) -> None:
     plan = prepare(AistppConfig(source=fixture)).plan
     assert [(split, clip.id) for split, clip in plan.items] == [("train", REAL), ("test", TEST)]
-    assert plan.frames == {"train": 240, "val": 0, "test": 60}
-    assert plan.found == 3
+    assert plan.totals.frames == {"train": 240, "val": 0, "test": 60}
+    assert plan.totals.found == 3
     assert [(d.source, d.reason) for d in plan.dropped] == [(f"motions/{IGNORED}.pkl", "on the ignore list")]
     assert [d.source for d in plan.missing] == [LISTED]
     assert plan.broken == []
-    assert plan.licences == {MUSIC_LICENCE: 2}
+    assert plan.totals.licences == {MUSIC_LICENCE: 2}
 
 
 def test_official_lists_are_read_whole(fixture: Path) -> None:
@@ -195,7 +195,7 @@ def test_lengths_that_differ_are_cut_or_left_out(copy: Path) -> None:
     plan = prepare(AistppConfig(source=copy)).plan
     clip = next(clip for _, clip in plan.items if clip.id == REAL)
     assert clip.last == 678
-    assert plan.frames["train"] == 226
+    assert plan.totals.frames["train"] == 226
     assert any(note.startswith("1 clips end") for note in plan.notes)
     soundfile.write(copy / f"wavs/{REAL}.wav", music[: round(10.9 * rate)], rate)  # its own comes first
     plan = prepare(AistppConfig(source=copy)).plan

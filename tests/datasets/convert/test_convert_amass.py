@@ -106,7 +106,7 @@ def test_plan_accounts_for_every_file(amass: ModuleType, tmp_path: Path) -> None
     (source / "CMU/02/link_poses.npz").symlink_to(tmp_path / "outside.npz")
     amass.save(tmp_path / "outside.npz", **clip)
     plan = prepare(AmassConfig(source=source)).plan
-    assert plan.found == 6
+    assert plan.totals.found == 6
     assert [clip.id for _, clip in plan.items] == ["CMU/01/01_01_poses", "KIT/3/good_poses"]
     assert [(d.source, d.reason[:6]) for d in plan.dropped] == [("KIT/3/short_poses.npz", "0.52 s")]
     broken = {d.source: d.reason for d in plan.broken}
@@ -114,8 +114,8 @@ def test_plan_accounts_for_every_file(amass: ModuleType, tmp_path: Path) -> None
     assert sorted(broken) == ["CMU/02/cut_poses.npz", *linked]
     assert "cut off" in broken["CMU/02/cut_poses.npz"]
     assert all("leaves in/" in broken[name] for name in linked)
-    assert plan.licences == {"AMASS-noncommercial": 2}
-    assert sum(plan.frames.values()) == 2 * 61
+    assert plan.totals.licences == {"AMASS-noncommercial": 2}
+    assert sum(plan.totals.frames.values()) == 2 * 61
 
 
 class Boom:

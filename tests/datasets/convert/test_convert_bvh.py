@@ -17,8 +17,8 @@ from shard_samples import digests
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Manifest, Split
 from motionloom.datasets.convert.amass.convert import AmassConfig
+from motionloom.datasets.convert.bvh.config import BvhClip
 from motionloom.datasets.convert.bvh.convert import Bvh, BvhConfig
-from motionloom.datasets.convert.bvh.plan import BvhClip
 from motionloom.datasets.convert.common.conversion import run_conversion
 from motionloom.datasets.convert.common.facts import parse_where, require_known
 from motionloom.datasets.convert.registry import prepare
@@ -78,7 +78,7 @@ def test_clips_become_samples_with_captions_split_and_licence(clips: Path, tmp_p
     ((short, reason),) = reasons(manifest).items()
     assert short == "dataset-1_dash_normal_001.bvh" and reason.startswith("0.67 s")
     assert {s.split: s.samples for s in manifest.shards} == {"train": 3, "val": 1, "test": 2}
-    assert {s.split: s.frames for s in manifest.shards} == prepare(config(clips)).plan.frames
+    assert {s.split: s.frames for s in manifest.shards} == prepare(config(clips)).plan.totals.frames
     assert str(clips) not in json.dumps(manifest.dump())
     assert [p.name for p in (tmp_path / "out").iterdir() if p.name.startswith(".")] == []
     rows = {row["id"]: row for row in map(json.loads, (clips / "captions.jsonl").read_text().splitlines())}
@@ -130,7 +130,7 @@ def test_captions_of_other_times_than_the_clips_are_noted_and_left_out(copy: Pat
     plan = prepare(config(copy, captions=copy / "words.csv", uncaptioned="keep")).plan
     said = {clip.id: [text.text for text in clip.texts] for _, clip in plan.items}
     assert [texts for texts in said.values() if texts] == [["a person nods"]]
-    assert sum("is beyond its" in note for note in plan.notes) == 2
+    assert sum(", beyond its" in note for note in plan.notes) == 2
 
 
 def entries(out: Path, shard: str) -> list[ClipEntry]:
@@ -144,11 +144,11 @@ def test_plan_tells_missing_uncaptioned_duplicates_and_counts(copy: Path) -> Non
     clip_file(copy, "bow_active").unlink()
     (copy / "notes.txt").touch()
     plan = prepare(config(copy)).plan
-    assert plan.found == 8
+    assert plan.totals.found == 8
     assert plan.counts() == {"train": 3, "val": 1, "test": 1}
-    assert plan.frames["val"] == 65
+    assert plan.totals.frames["val"] == 65
     assert [d.source for d in plan.missing] == ["dataset-1/dataset-1_bow_active_001.bvh"]
-    assert plan.uncaptioned == ["again.bvh", "unknown.bvh"]
+    assert plan.words.uncaptioned == ["again.bvh", "unknown.bvh"]
     told = Counter(d.reason.split(",")[0] for d in plan.dropped)
     assert told == {
         "same bytes as dataset-1/dataset-1_bow_angry_001.bvh": 1,

@@ -101,7 +101,7 @@ def test_layouts(fixture: Path, layout: str, width: int, lost: int) -> None:
     if layout == "wholebody313":
         np.testing.assert_array_equal(made.motion, whole.motion[:, :313])
     plan = prepare(config(fixture, layout=layout)).plan
-    assert plan.frames["val"] == 44 - lost
+    assert plan.totals.frames["val"] == 44 - lost
 
 
 def test_raw_layout_keeps_the_columns(fixture: Path) -> None:

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import REMOVED_FILE, Decisions, Manifest, Split
 from motionloom.datasets.check.dataset import check
-from motionloom.datasets.convert.bvh.plan import BvhConfig
+from motionloom.datasets.convert.bvh.config import BvhConfig
 from motionloom.datasets.convert.captions.humanml_index import ORIGINALS, IndexRow
 from motionloom.datasets.convert.common import removed
 from motionloom.datasets.convert.common.conversion import Conversion, run_conversion
@@ -137,7 +137,7 @@ def test_share_alike_is_a_set_of_its_own(tree: Path) -> None:
     conversion = planned(tree, licence="CC-BY-SA-3.0")
     plan, path = conversion.plan, tree / "mocap" / [*FILES][5]
     assert [clip.id for _, clip in plan.items] == ["000040", "M000040"]
-    assert plan.licences == {"CC-BY-SA-3.0": 2}
+    assert plan.totals.licences == {"CC-BY-SA-3.0": 2}
     found = conversion.converter.joints(plan.items[0][1]).joints
     np.testing.assert_allclose(found, by_hand(path, 120.0, SECONDS["000040"]), atol=1e-6, rtol=0)
     with pytest.raises(UserError, match="CC-BY-SA-3"):

@@ -230,7 +230,7 @@ def test_captions_of_several_files_count_together(captioned: Path, tmp_path: Pat
     config = {"source": captioned, "joint_map": captioned / "map.json", "licence": "CC0-1.0"}
     captions = [str(given), f"{german}:text=Beschreibung,file=Datei"]
     made = prepare(BvhConfig.parse({**config, "captions": captions}, "x")).plan
-    assert not made.stop and "3 of 3 clips have captions in words, takes.csv" in made.captions
+    assert not made.stop and "3 of 3 clips have captions in words, takes.csv" in made.words.summary
     assert {clip.id: [text.text for text in clip.texts] for _, clip in made.items} == {
         "walk_a": ["a person walks", "geht"],
         "turn": ["turns around", "dreht sich"],

@@ -33,7 +33,7 @@ def test_captions_of_both_grammars(fixture: Path) -> None:
     assert [c.text for c in clips[BOW].face_texts] == ["happy"]
     assert clips[BOW].face_texts[0].source == "face"
     notes = prepare(config(fixture)).plan.notes
-    assert any(HUMANML in note and "0.5 s" in note and "1.7 s" in note for note in notes)
+    assert any(HUMANML in note and "2.5 s" in note and "1.7 s" in note for note in notes)
 
 
 def test_names_and_empty_captions(copy: Path) -> None:
@@ -46,7 +46,7 @@ def test_names_and_empty_captions(copy: Path) -> None:
     assert [c.text for c in clips[WAVE].texts] == ["Dance Break Back Cc"]
     assert {d.source for d in plan.dropped} == {f"{MOTION}/{i}.npy" for i in (BOW, TURN, MUG)}
     assert {d.reason for d in plan.dropped} == {"no usable caption"}
-    assert set(plan.uncaptioned) == {d.source for d in plan.dropped}
+    assert set(plan.words.uncaptioned) == {d.source for d in plan.dropped}
     assert [d.source for d in plan.broken] == [f"{TEXTS}/{TURN}.txt"]
     assert "byte 3" in plan.broken[0].reason
     assert set(planned(copy, uncaptioned="keep")) == ALL
@@ -104,7 +104,7 @@ def test_other_representations_and_copies_are_not_motion(copy: Path) -> None:
     (copy / MOTION / "GRAB/s1/._hidden.npy").write_bytes(b"x")
     plan = prepare(config(copy)).plan
     assert {clip.id for _, clip in plan.items} == ALL
-    assert plan.found == 9
+    assert plan.totals.found == 9
     (drop,) = plan.dropped
     assert f"'{MUG}'" in drop.reason and f"{MOTION}/{MUG}.npy" in drop.reason
     assert not plan.broken
@@ -139,5 +139,5 @@ def test_subsets_frames_limit_and_licences(fixture: Path) -> None:
     assert clips_of(fixture)[DANCE].licence.endswith("AIST++-annotations-CC-BY-4.0")
     plan = prepare(config(fixture)).plan
     assert {clip.id for _, clip in plan.items} == ALL
-    assert plan.frames == {"train": 50 + 42 + 45 + 50 + 50, "val": 44, "test": 30 + 41}
-    assert plan.found == 8
+    assert plan.totals.frames == {"train": 50 + 42 + 45 + 50 + 50, "val": 44, "test": 30 + 41}
+    assert plan.totals.found == 8
