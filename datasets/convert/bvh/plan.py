@@ -35,6 +35,8 @@ def plan_bvh(
     else:
         draft = ConversionPlan[BvhClip](config, stated=stated)
         _decide_by_index(config, config.humanml_index, folder, found, draft)
+    if folder != config.source and folder.is_relative_to(config.source):
+        draft.base = f"{folder.relative_to(config.source).as_posix()}/"
     maps = choose_maps(config, own_maps, draft, settings.maps)
     draft.limit(lambda clip: clip.id)
     if miscounted := [file.path for file in found if file.miscounted]:

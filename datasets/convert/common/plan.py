@@ -316,16 +316,15 @@ class ConversionPlan(Generic[C]):
             clip, reason = clips.get(line.key), line.reason
             if clip is not None and line.words and not reason and not line.words & words_of(clip):
                 reason = "none of its captions is of the clip's time"
-            if reason:
+            is_known = line.key in self.known.limited or fates.get(line.key, "missing") != "missing"
+            if reason or (clip is None and is_known):
                 counts["left out"] += 1
+                reason = reason or f"its clip {line.key} is left out"
                 self.not_ours.append(Dropped(source=line.place, reason=reason))
             elif clip is not None:
                 counts["clip"] += 1
-            elif line.is_catalogue:
-                counts["not ours"] += 1
             else:
-                known = line.key in self.known.limited or fates.get(line.key, "missing") != "missing"
-                counts["left out" if known else "missing"] += 1
+                counts["not ours" if line.is_catalogue else "missing"] += 1
         for name, counts in bins.items():
             self._say(f"lines of {name}", counts)
 
