@@ -130,10 +130,13 @@ class Amass(Release[AmassConfig]):
             return
         listing = self.listing = self.config.listing(labels)
         draft.notes += listing.notes
+        first: dict[str, str] = {}
         for label in labels:
+            same = first.setdefault(clip_key(label), label)
+            again = "" if same == label else f"the same recording as {same}"
             yield Entry(
                 listing.id_of(label), label, listing.texts_of(label), listing.split_of(label),
-                problem=listing.problem(label),
+                problem=listing.problem(label) or again,
             )  # fmt: skip
 
     def _index_entries(

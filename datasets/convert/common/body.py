@@ -20,6 +20,7 @@ from motionloom.datasets.audio.features import VERSION, AudioSettings, audio_fea
 from motionloom.datasets.audio.sound import read_sound, resample_sound, sound_seconds
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import content_of
+from motionloom.datasets.base.records import Split
 from motionloom.datasets.convert.amass.convert import FINGERS_MOVE
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.common.config import END_TOLERANCE
@@ -164,6 +165,18 @@ class BodyRelease(Release[Cfg]):
         sound = clip.entry.sound
         content = content_of(self.sound_folder / sound) if sound else ""
         return [*super().depends_on(clip), sound, content]
+
+    def copies(self, plan: ConversionPlan[ReleaseClip]) -> list[str]:
+        heard: dict[str, dict[str, Split]] = {}
+        for split, clip in plan.items:
+            if clip.entry.sound is not None:
+                content = content_of(self.sound_folder / clip.entry.sound)
+                heard.setdefault(content, {}).setdefault(clip.entry.sound, split)
+        return [
+            f"{' and '.join(names)} are one piece of music, heard in {' and '.join(sorted(set(names.values())))}"
+            for names in heard.values()
+            if len(names) > 1
+        ] + super().copies(plan)
 
     def song(self, clip: ReleaseClip) -> str | None:
         """Name of what is heard; clips with the same one dance to the same piece."""

@@ -19,6 +19,7 @@ from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.look import Look, look_at
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.shards.index import load_index
+from motionloom.datasets.shards.left_out import grouped_notes
 from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions
 from motionloom.datasets.shards.reader import load_manifest
 from motionloom.datasets.shards.tasks import plan_shards
@@ -68,7 +69,7 @@ class Conversion(Generic[C]):
             not_ours=self.plan.not_ours,
             lost=lost,
             most_lost=self.config.most_rejected,
-            notes=self.plan.notes,
+            notes=grouped_notes([*self.plan.notes, *self.converter.copies(self.plan)]),
         )
 
     def look(self) -> Look | None:

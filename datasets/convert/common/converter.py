@@ -101,6 +101,10 @@ class Converter(ABC, Generic[Cfg, C]):
         """Return the sentences that the licences of the planned clips ask for."""
         return credits_of(plan.totals.licences, self.config.name, [self.credit] if self.credit else [])
 
+    def copies(self, plan: ConversionPlan[C]) -> list[str]:
+        """Return notes on files of one content that are taken for several clips or songs."""
+        return []
+
     def options(self) -> dict[str, object]:
         """Return all that samples depend on beside the source: options, and facts of the files they name."""
         return self.config.options()

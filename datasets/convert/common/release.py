@@ -280,6 +280,16 @@ class Release(Converter[Cfg, ReleaseClip]):
         content = content_of(self.path_of(entry.file))
         return [clip.id, entry.file, content, clip.first, clip.last, texts, clip.licence]
 
+    def copies(self, plan: ConversionPlan[ReleaseClip]) -> list[str]:
+        first: dict[tuple[str, int, int], str] = {}
+        notes = []
+        for _, clip in plan.items:
+            key = (content_of(self.path_of(clip.file)), clip.first, clip.last)
+            same = first.setdefault(key, clip.file)
+            if same != clip.file:
+                notes.append(f"{clip.file} has the same bytes as {same}: one motion under two names")
+        return notes
+
     def licence(self, plan: ConversionPlan[ReleaseClip]) -> str:
         alone = next(iter(plan.totals.licences), self.terms) if len(plan.totals.licences) <= 1 else self.terms
         return self.config.licence or alone

@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import content_of
 from motionloom.datasets.base.records import Caption
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import features_of, require_human
-from motionloom.datasets.convert.common.files import check_id, files_in, inside
+from motionloom.datasets.convert.common.files import check_id, files_in, inside, is_there
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
@@ -40,6 +41,8 @@ from motionloom.datasets.shards.sample import Sample
 
 FPS = 20.0
 VECS, JOINTS = "new_joint_vecs", "new_joints"
+SAME_METRES, _COMPARED = 0.01, 20
+"""Distance of joints of the two copies of a motion, at most, in so many frames: 4e-8 was measured."""
 WIDTHS: dict[str, int | tuple[int, ...]] = {VECS: 263, JOINTS: (22, 3)}
 
 
@@ -134,7 +137,12 @@ class HumanMl3d(Release[HumanMl3dConfig]):
         return inside(self.config.source / folder, name, file)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
-        return check_array_header(path, width=WIDTHS[label.split("/", 1)[0]], name=label), FPS
+        frames, other = _frames(path, label), _other(label)
+        if is_there(self.path_of(other)) and (there := _frames(self.path_of(other), other)) != frames:
+            raise UserError(
+                f"{label}: {frames} frames, but {other}, which holds the same motion, has {there}"
+            )
+        return frames, FPS
 
     def frames(self, clip: ReleaseClip) -> int:
         kept = self.config.keeps_vectors and clip.entry.file.startswith(VECS)
@@ -157,8 +165,36 @@ class HumanMl3d(Release[HumanMl3dConfig]):
             motion = encode_h3d(resample(joints, FPS, layout.fps), layout, bones)
         return Sample(self.clip_meta(clip, motion), motion, texts=list(clip.entry.texts))
 
+    def depends_on(self, clip: ReleaseClip) -> list[object]:
+        other = self.path_of(_other(clip.entry.file))
+        return [*super().depends_on(clip), content_of(other) if is_there(other) else ""]
+
     def _load(self, file: str) -> NDArray[np.floating]:
-        return load_array(self.path_of(file), width=WIDTHS[file.split("/", 1)[0]], name=file)
+        """A motion file; `UserError` where the release's other copy of it shows another motion."""
+        stored, other = _load(self.path_of(file), file), _other(file)
+        if is_there(self.path_of(other)):
+            beside = _load(self.path_of(other), other)
+            apart = np.abs(_joints(stored[:_COMPARED]) - _joints(beside[:_COMPARED])).max()
+            if not apart < SAME_METRES:
+                raise UserError(
+                    f"{file}: {other} shows another motion ({apart:.2f} m apart), and nothing says which of "
+                    f"them the captions are about"
+                )
+        return stored
+
+
+def _other(file: str) -> str:
+    """The file with the release's other copy of a motion."""
+    folder, name = file.split("/", 1)
+    return f"{JOINTS if folder == VECS else VECS}/{name}"
+
+
+def _frames(path: Path, label: str) -> int:
+    return check_array_header(path, width=WIDTHS[label.split("/", 1)[0]], name=label)
+
+
+def _load(path: Path, label: str) -> NDArray[np.floating]:
+    return load_array(path, width=WIDTHS[label.split("/", 1)[0]], name=label)
 
 
 def _joints(stored: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -149,7 +149,7 @@ def test_one_folder_stands_in_for_the_other(copy: Path, tmp_path: Path) -> None:
 def test_a_file_changed_in_place_is_converted_again(copy: Path, tmp_path: Path) -> None:
     convert(copy, tmp_path / "out")
     path = copy / "new_joint_vecs/900001.npy"
-    np.save(path, np.load(path) + np.float32(0.001))
+    np.save(path, np.load(path) * np.float32(1.00001))
     convert(copy, tmp_path / "out")
     convert(copy, tmp_path / "fresh")
     found, fresh = (motions(tmp_path / name) for name in ("out", "fresh"))
@@ -185,3 +185,16 @@ def test_a_mirror_image_in_another_split_is_an_error_and_without_splits_pairs_st
     splits: dict[str, Split] = {clip.id: split for split, clip in made.items}
     assert splits == {clip_id: hash_split(clip_id.removeprefix("M")) for clip_id in splits}
     assert ["80/5/15" in note for note in made.notes] == [True]
+
+
+def test_two_copies_of_a_motion_are_compared(copy: Path, tmp_path: Path) -> None:
+    """Vectors of two ids exchanged, and a copy of other length: both paths are said, the others converted."""
+    vectors = copy / "new_joint_vecs"
+    first, second = (vectors / f"{name}.npy" for name in ("900001", "900003"))
+    first.rename(vectors / "x"), second.rename(first), (vectors / "x").rename(second)
+    np.save(copy / "new_joints/900004.npy", np.load(copy / "new_joints/900004.npy")[:-3])
+    assert "40" in reasons(plan(copy).broken)["new_joint_vecs/900004.npy"]
+    manifest = convert(copy, tmp_path / "out", most_rejected=1)
+    for name in ("900001", "900003"):
+        assert f"new_joints/{name}.npy" in reasons(manifest.dropped)[f"new_joint_vecs/{name}.npy"]
+    assert sum(shard.samples for shard in manifest.shards) == 3
