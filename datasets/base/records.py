@@ -73,6 +73,30 @@ class Caption(Config):
     """`word/POS` tags where the source brings them (HumanML3D)."""
 
 
+class Fault(Config):
+    """One thing that is wrong with a clip."""
+
+    kind: str
+    text: str
+    """The measured value and its bound, in one phrase."""
+    weight: float
+    """The measure over its bound: above 1."""
+    frame: int = 0
+    """The frame that shows it best."""
+
+
+_Faults = Annotated[
+    tuple[Fault, ...] | None,
+    BeforeValidator(lambda found: parse_json(found or "null", "faults") if type(found) is str else found),
+    PlainSerializer(
+        lambda found: (
+            "" if found is None else json.dumps([one.model_dump() for one in found], allow_nan=False)
+        )
+    ),
+]
+"""Stored as JSON text; None, where nobody has judged a clip, is empty text."""
+
+
 class ClipMeta(Config):
     """`meta.json` of one sample: where a clip comes from and what its features mean.
 
@@ -93,6 +117,8 @@ class ClipMeta(Config):
     mirror_of: _Text = None
     truth: _Record = None
     """True content of a synthetic clip (action, direction, side, count, hand, face)."""
+    faults: _Faults = None
+    """What the judge of motion found at the source's frame rate; None where no source was judged."""
     song: _Text = None
     """The piece of music of a recorded dance, by the source's name; several clips may have one."""
 

@@ -20,8 +20,7 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file, sha256_of, sha256_of_json
 from motionloom.datasets.base.json_doors import read_plain
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.base.records import HANDS, PRESENT_ALL
-from motionloom.datasets.check.faults import Fault
+from motionloom.datasets.base.records import HANDS, PRESENT_ALL, Fault
 from motionloom.datasets.motion.canonical import canonicalize, require_rate, resample
 from motionloom.datasets.motion.features.codec import encode
 from motionloom.datasets.motion.features.joints import joints_of
@@ -183,7 +182,7 @@ class Search:
                 if share > MISFIT:
                     nearest, best = own[int(mine.argmax())], different[int(spread[int(theirs.argmax())])]
                     text = f"'{nearest}' fits worse than {share:.0%} of all captions, such as '{best}'"
-                    yield place, Fault("caption disagrees", text, share / MISFIT)
+                    yield place, Fault(kind="caption disagrees", text=text, weight=float(share / MISFIT))
 
     def _texts(self, texts: Sequence[str]) -> Vectors:
         return np.asarray(self.tma.embed_captions(list(texts), self.tma.given["text"]))

@@ -1,6 +1,6 @@
 """The clips of a data set that look wrong, for a person to decide about: what `motionloom data clean` shows.
 
-Motions by `faults.py`, and clips that are another one again, as they are or mirrored (`duplicates.py`).
+Motions as the conversion's judge saw them (`motion/judge.py`), and clips that are another one again, as they are or mirrored (`duplicates.py`).
 Mirror images that are declared (`mirror_of`) in the split of their original are meant.
 
 Decisions about them lie in `cleaned.json` beside the shards, so that they last when the set is converted
@@ -22,11 +22,19 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_json
 from motionloom.datasets.base.lock import folder_lock
 from motionloom.datasets.base.progress import Meter
-from motionloom.datasets.base.records import CLEANED_FILE, MANIFEST_FILE, SPLITS, Decisions, Manifest, Split
+from motionloom.datasets.base.records import (
+    CLEANED_FILE,
+    MANIFEST_FILE,
+    SPLITS,
+    Decisions,
+    Fault,
+    Manifest,
+    Split,
+)
 from motionloom.datasets.check.duplicates import likeness, near, signature
-from motionloom.datasets.check.faults import Fault, motion_faults
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.joints import joints_of
+from motionloom.datasets.motion.judge import judge
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 
 
@@ -70,7 +78,8 @@ def find_suspects(
                 joints, fps = floored_joints(dataset, clip), dataset.layout.fps
                 places.append(Place(split, clip))
                 signatures.append(signature(joints))
-                found = [*motion_faults(joints, fps)]
+                stored = dataset.meta(clip).faults
+                found = list(judge(joints, fps) if stored is None else stored)
                 if found:
                     faults[places[-1]] = found
                 meter.advance()
@@ -114,7 +123,8 @@ def _again(splits: Splits, one: Place, other: Place) -> Fault | None:
         return None
     kind = "mirrored twin" if "mirror" in how else "duplicate"
     where = f" of split {one.split}" if one.split != other.split else ""
-    return Fault(kind, f"{how} '{original.id}'{where}", 2.0 + (one.split != other.split))
+    text = f"{how} '{original.id}'{where}"
+    return Fault(kind=kind, text=text, weight=2.0 + (one.split != other.split))
 
 
 def decide(root: Path, given: Decisions, where: str) -> Manifest:

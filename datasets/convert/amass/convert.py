@@ -235,25 +235,26 @@ class Amass(Release[AmassConfig]):
         return read_motion(self.path_of(label), label, hands=fingers, palms=palms, frames=frames)
 
     def joints(self, clip: ReleaseClip) -> SourceJoints:
-        return SourceJoints(self._posed(clip, self.figure(clip), 1), clip.fps)
+        return SourceJoints(self._posed(clip, self.figure(clip)), clip.fps)
 
     def convert(self, clip: ReleaseClip) -> Sample:
         figure, raw = self.figure(clip), self.layout.name == "smpl75"
         assert figure.rotations is not None
-        # Resampling would take every 6th frame as it is (120 to 20 a second): pose no others.
+        # Resampling would take every 6th frame as it is (120 to 20 a second).
         ratio = clip.fps / self.layout.fps
         step = max(round(ratio), 1) if abs(ratio - round(ratio)) < 1e-6 else 1
+        posed = self._posed(clip, figure)
         if raw:
             features = self._parameters(clip, figure, step)
         else:
-            joints = self._posed(clip, figure, step)
+            joints = posed[::step]
             if clip.entry.mirror_of is not None:
                 joints = mirror(joints, self.layout.skeleton)
             features = features_of(joints, clip.fps / step, self.layout, same_bones=self.config.retarget)
         turned = np.ptp(figure.rotations[:, BODY_JOINTS:], axis=0)
         hands = not raw and float(turned.max(initial=0.0)) > FINGERS_MOVE
         meta = self.meta(
-            clip, features, source=clip.entry.file, licence=clip.licence, hands=hands,
+            clip, features, seen=SourceJoints(posed, clip.fps), source=clip.entry.file, licence=clip.licence, hands=hands,
             mirror_of=clip.entry.mirror_of,
         )  # fmt: skip
         return Sample(meta, features, texts=list(clip.entry.texts))
@@ -272,12 +273,12 @@ class Amass(Release[AmassConfig]):
         require_human(smpl_joints(poses[:, :BODY_JOINTS], trans, body), clip.fps / step)
         return canonical_smpl75(poses, trans, body, clip.fps / step, self.layout.fps)
 
-    def _posed(self, clip: ReleaseClip, figure: Figure, step: int) -> NDArray[np.float64]:
-        """World joints [T, N, 3], Y up, of every `step`-th frame."""
+    def _posed(self, clip: ReleaseClip, figure: Figure) -> NDArray[np.float64]:
+        """World joints [T, N, 3], Y up."""
         assert figure.rotations is not None and figure.trans is not None
         body, count = self._body(clip), self.layout.num_joints
-        rotations = figure.rotations[::step, : BODY_JOINTS if self.layout.name == "smpl75" else count]
-        joints = smpl_joints(rotations, figure.trans[::step], body, figure.betas)
+        rotations = figure.rotations[:, : BODY_JOINTS if self.layout.name == "smpl75" else count]
+        joints = smpl_joints(rotations, figure.trans, body, figure.betas)
         if self.config.up == "z":
             joints = joints[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
         return np.asarray(joints, dtype=np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from motionloom.datasets.convert.common.look import SourceJoints, named_unit
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
 from motionloom.datasets.motion.bvh.joint_map import JointMap, metres, skeleton_key
+from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.canonical import mirror
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import PERSON_METRES, measure
@@ -36,7 +38,7 @@ class Bvh(Converter[BvhConfig, BvhClip]):
     summary = "BVH (and ASF/AMC) files of any skeleton to shards."
     example = "mocap shards --captions captions.jsonl --licence CC-BY-4.0"
     config_class = BvhConfig
-    beside = (".asf",)
+    beside: ClassVar[tuple[str, ...]] = (".asf",)
 
     def __init__(self, config: BvhConfig) -> None:
         super().__init__(config)
@@ -72,20 +74,21 @@ class Bvh(Converter[BvhConfig, BvhClip]):
         return [*credits_of(plan.totals.licences, self.config.name, own), *words]
 
     def convert(self, clip: BvhClip) -> Sample:
-        motion = self.encode(clip)
+        seen = self.joints(clip)
+        motion = self.encode(clip, seen.joints)
         hands = self.layout.num_joints > BODY_JOINTS and self.config.fingers != "missing"
-        meta = self.meta(clip, motion, hands=hands, licence=clip.licence, mirror_of=clip.mirror_of)
+        meta = self.meta(clip, motion, seen=seen, hands=hands, licence=clip.licence, mirror_of=clip.mirror_of)
         return Sample(meta=meta, motion=motion, texts=list(clip.texts))
 
     def joints(self, clip: BvhClip) -> SourceJoints:
         """The joints as the map reads them."""
-        joints, joint_map = self._world(clip)
-        return SourceJoints(joints, clip.fps, mapped=True, up=joint_map.up or self.config.up)
+        joints, joint_map = self.world(clip, clip.read())
+        up = joint_map.up or self.config.up
+        return SourceJoints(joints, clip.fps, mapped=True, up=up, is_sized=not joint_map.measured)
 
-    def encode(self, clip: BvhClip) -> NDArray[np.float32]:
-        """Features [T', D] of a clip."""
-        config = self.config
-        joints, joint_map = self._world(clip)
+    def encode(self, clip: BvhClip, joints: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Features [T', D] of the joints [T, N, 3] of a clip."""
+        config, joint_map = self.config, self.maps[clip.found.skeleton]
         try:
             if len(self.layout.skeleton) > joints.shape[1]:
                 joints = with_resting_hands(joints)
@@ -96,13 +99,14 @@ class Bvh(Converter[BvhConfig, BvhClip]):
             unit, up = joint_map.unit or config.unit, joint_map.up or config.up
             raise UserError(f"{clip.label()}: {error} (read with unit '{unit}', up '{up}')") from None
 
-    def _world(self, clip: BvhClip) -> tuple[NDArray[np.float64], JointMap]:
-        """Joints [T, N, 3] in metres, Y up, without an added first frame; and the map that reads them.
+    def world(self, clip: BvhClip, motion: BvhMotion) -> tuple[NDArray[np.float64], JointMap]:
+        """Joints [T, N, 3] of a clip's motion in metres, Y up, without an added first frame; and the map
+        that reads them.
 
         Where the unit is settled by the skeleton's first clips and makes no person of this one's figure, but
         another known unit does, that one counts: writers of one skeleton may use several.
         """
-        config, motion = self.config, clip.read()
+        config = self.config
         motion = replace(motion, values=motion.values[config.cut(clip.found.path)])
         joint_map = self.maps.get(skeleton_key(motion.joints, motion.parents))
         if joint_map is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.bvh.config import BvhClip, BvhConfig

@@ -212,6 +212,7 @@ class BodyRelease(Release[Cfg]):
         meta = self.clip_meta(
             clip,
             motion,
+            joints,
             hands=layout.num_joints > BODY_JOINTS and float(fingers.max(initial=0.0)) > FINGERS_MOVE,
             face=layout.has("face") and figure.face is not None and bool(figure.face.any()),
         )

@@ -122,14 +122,17 @@ class Converter(ABC, Generic[Cfg, C]):
         clip: C,
         motion: NDArray[np.float32],
         *,
+        seen: SourceJoints | None = None,
         hands: bool = False,
         face: bool = False,
         source: str | None = None,
         licence: str | None = None,
         mirror_of: str | None = None,
     ) -> ClipMeta:
-        """Return a sample's facts: `motion` [T, D], parts recorded, and the id of the clip it mirrors."""
-        return self.layout.clip_meta(
+        """Return a sample's facts: `motion` [T, D], the joints that it is `seen` by, which are judged, parts
+        recorded, and the id of the clip it mirrors.
+        """
+        about = self.layout.clip_meta(
             clip.id,
             source=source or clip.label(),
             split=clip.split,
@@ -139,6 +142,7 @@ class Converter(ABC, Generic[Cfg, C]):
             has_face=face,
             mirror_of=mirror_of,
         )
+        return about if seen is None else about.model_copy(update={"faults": seen.faults(self.layout.fps)})
 
 
 AnyConverter = Converter[Any, Any]

@@ -22,13 +22,16 @@ from rich.table import Table
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.printable import printable
-from motionloom.datasets.base.records import Dropped
+from motionloom.datasets.base.records import Dropped, Fault
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.motion.bvh.joint_map import METRES, NamedUnit, metres
+from motionloom.datasets.motion.judge import judge, on_floor
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.plausibility import MOST, PERSON_METRES, PlausibilityStats, measure
 from motionloom.datasets.shards.left_out import drop, grouped
 
+CHILD_METRES = 0.7
+"""Height of a figure, at least, where its unit is stated: a child of one year."""
 ADULT_METRES = 1.7
 """Height of an ordinary adult: of two units that make a person of a figure, the nearer one is meant."""
 
@@ -59,6 +62,14 @@ class SourceJoints:
     """Whether a joint map was used."""
     up: str = "y"
     """The upward axis of the file."""
+    is_sized: bool = False
+    """Whether somebody has stated the unit, so that the figure's size is believed."""
+
+    def faults(self, fps: float) -> tuple[Fault, ...]:
+        """What the judge of motion finds; frames are counted at `fps`."""
+        small = CHILD_METRES if self.is_sized else PERSON_METRES[0]
+        found = judge(on_floor(self.joints), self.fps, small=small)
+        return tuple(one.model_copy(update={"frame": int(one.frame * fps / self.fps)}) for one in found)
 
 
 def stats_of(clips: Iterable[SourceJoints]) -> PlausibilityStats:

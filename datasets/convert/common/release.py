@@ -314,11 +314,20 @@ class Release(Converter[Cfg, ReleaseClip]):
     def convert(self, clip: ReleaseClip) -> Sample:
         joints = self.posed(self.read(clip))
         motion = features_of(joints, clip.fps, self.layout, same_bones=self.config.retarget)
-        return Sample(self.clip_meta(clip, motion), motion, texts=list(clip.entry.texts))
+        return Sample(self.clip_meta(clip, motion, joints), motion, texts=list(clip.entry.texts))
 
-    def clip_meta(self, clip: ReleaseClip, motion: NDArray[np.float32], **facts: bool) -> ClipMeta:
+    def clip_meta(
+        self, clip: ReleaseClip, motion: NDArray[np.float32], joints: NDArray[np.float64], **facts: bool
+    ) -> ClipMeta:
+        seen = SourceJoints(joints, clip.fps)
         return self.meta(
-            clip, motion, source=clip.label(), licence=clip.licence, mirror_of=clip.entry.mirror_of, **facts
+            clip,
+            motion,
+            seen=seen,
+            source=clip.label(),
+            licence=clip.licence,
+            mirror_of=clip.entry.mirror_of,
+            **facts,
         )
 
 

@@ -121,21 +121,24 @@ def read_split_files(folder: Path) -> SplitLists:
 
 
 def read_ids(path: Path) -> tuple[dict[str, int], list[ListLine]]:
-    """The ids of a list, one a line, and the line of each; and the repeated lines."""
+    """The ids of a list, one a line, and the line of each; and the lines that are repeated or
+    no id.
+    """
     lines: dict[str, int] = {}
     repeated: list[ListLine] = []
     for number, line in enumerate(read_text_file(path).split("\n"), start=1):
         clip_id = _FILE.sub("", line.strip())
         if not clip_id:
             continue
+        place = f"{path.name}:{number}"
         try:
-            check_id(clip_id, f"{path.name}:{number}")
+            check_id(clip_id, place)
         except UserError as error:
-            notes.append(f"{error}; the line is left out")
+            repeated.append(ListLine(place, clip_id, str(error).removeprefix(f"{place}: ")))
             continue
         if clip_id in lines:
             reason = f"'{clip_id}' is listed twice; line {lines[clip_id]} counts"
-            repeated.append(ListLine(f"{path.name}:{number}", clip_id, reason))
+            repeated.append(ListLine(place, clip_id, reason))
         lines.setdefault(clip_id, number)
     return lines, repeated
 

@@ -163,7 +163,7 @@ class HumanMl3d(Release[HumanMl3dConfig]):
         else:
             bones = None if config.retarget else layout.skeleton.bones(joints[0])
             motion = encode_h3d(resample(joints, FPS, layout.fps), layout, bones)
-        return Sample(self.clip_meta(clip, motion), motion, texts=list(clip.entry.texts))
+        return Sample(self.clip_meta(clip, motion, joints), motion, texts=list(clip.entry.texts))
 
     def depends_on(self, clip: ReleaseClip) -> list[object]:
         other = self.path_of(_other(clip.entry.file))

@@ -234,6 +234,7 @@ class MotionX(Release[MotionXConfig]):
         meta = self.clip_meta(
             clip,
             motion,
+            joints,
             hands=layout.num_joints > BODY_JOINTS and bool(values[:, HANDS].any()),
             face=layout.has("face") and has_face,
         )

@@ -107,9 +107,9 @@ def test_ten_files_later_only_what_changed_is_converted(
     captions.write_text(captions.read_text().replace("a person", "somebody", 1))
     real, encoded, said = Bvh.encode, list[str](), list[str]()
 
-    def counted(self: Bvh, clip: BvhClip) -> Any:
+    def counted(self: Bvh, clip: BvhClip, joints: Any) -> Any:
         encoded.append(clip.label())
-        return real(self, clip)
+        return real(self, clip, joints)
 
     monkeypatch.setattr(Bvh, "encode", counted)
     manifest = run_conversion(

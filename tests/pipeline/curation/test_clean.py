@@ -15,9 +15,9 @@ from shard_samples import LAYOUT, write_made
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Caption, Decisions, Split
 from motionloom.datasets.check.dataset import examine
-from motionloom.datasets.check.faults import motion_faults
 from motionloom.datasets.motion.canonical import canonicalize, mirror
 from motionloom.datasets.motion.features.codec import encode
+from motionloom.datasets.motion.judge import judge
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import ShardDataset, load_manifest
 from motionloom.datasets.shards.sample import Sample
@@ -114,17 +114,17 @@ PLANTED: list[tuple[str, Callable[[Joints], Joints]]] = [
 
 def test_nothing_is_wrong_with_people(people: list[Joints]) -> None:
     for joints in people:
-        assert [*motion_faults(joints, LAYOUT.fps)] == []
+        assert [*judge(joints, LAYOUT.fps)] == []
         lies = joints @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])  # lower than the feet have stood
         both = [joints + np.array([0, 0.1, 0]), lies[-1:].repeat(9, 0) - [0, lies[-1, :, 1].min(), 0]]
-        assert "floats" not in {fault.kind for fault in motion_faults(np.concatenate(both), LAYOUT.fps)}
+        assert "floats" not in {fault.kind for fault in judge(np.concatenate(both), LAYOUT.fps)}
 
 
 @pytest.mark.parametrize(("kind", "spoil"), PLANTED)
 def test_planted_faults_are_found(kind: str, spoil: Callable[[Joints], Joints], people: list[Joints]) -> None:
     found = 0
     for joints in people:
-        faults = [*motion_faults(spoil(joints.copy()), LAYOUT.fps)]
+        faults = [*judge(spoil(joints.copy()), LAYOUT.fps)]
         assert all(fault.weight > 1 and 0 <= fault.frame < len(joints) for fault in faults)
         found += kind in {fault.kind for fault in faults}
     assert found >= 0.9 * len(people)  # feet that never rest say nothing

@@ -1,0 +1,232 @@
+"""Plants faults in real recordings, before they are resampled, and counts what the judge of motion finds.
+
+    python benchmarks/motion_faults.py SHARED/data --record benchmarks/records/motion_faults.json
+    python benchmarks/motion_faults.py SHARED/data --half tune     # the clips that bounds were chosen on
+
+Each fault is put into the channels of clean BVH and AMC files: 200 files in which the judge finds nothing, of
+Bandai-Namco, CMU and HDM05. A fault counts as found when its clip is named for one of the fault's kinds. False
+alarms are those in all files as they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tarfile
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.base.files import sha256_of_json
+from motionloom.datasets.convert.bvh.config import BvhClip, BvhConfig
+from motionloom.datasets.convert.bvh.convert import Bvh
+from motionloom.datasets.convert.registry import prepare
+from motionloom.datasets.motion.bvh.joint_map import JointMap
+from motionloom.datasets.motion.bvh.motion import BvhMotion, channel_columns
+from motionloom.datasets.motion.judge import judge, on_floor
+
+SETS = {
+    "Bandai-Namco": ("bandai", "*.tar.xz"),
+    "CMU": ("real/cmu", "*.tar.xz"),
+    "HDM05": ("real/hdm05", "*.xz"),
+}
+Planted = Callable[[BvhMotion, JointMap, np.random.Generator], BvhMotion]
+
+
+def columns_of(motion: BvhMotion, joint_map: JointMap, names: tuple[str, ...]) -> list[int]:
+    """Columns of the rotations of those of the file's joints that stand for ours."""
+    turns = channel_columns(motion.channels)[1]
+    target = joint_map.target.joints
+    wanted = {one for name in names for one in joint_map.sources[target.index(name)]}
+    return [
+        column for joint, name in enumerate(motion.joints) if name in wanted for column in turns[joint][1]
+    ]
+
+
+def root_columns(motion: BvhMotion) -> list[int]:
+    """Columns of the positions, x, y and z, of the first joint that moves."""
+    found = [(axis, column) for joint, axis, column in channel_columns(motion.channels)[0]
+             if np.ptp(motion.values[:, column]) > 0 or joint == 0]  # fmt: skip
+    return [column for _, column in sorted(found[:3])]
+
+
+def metre(motion: BvhMotion, joint_map: JointMap) -> float:
+    """A metre in lengths of the file, of a figure of 1.65 m."""
+    from motionloom.datasets.motion.plausibility import measure
+
+    return measure(joint_map.places(motion), motion.fps).height / 1.65
+
+
+def with_values(motion: BvhMotion, values: NDArray[Any]) -> BvhMotion:
+    return replace(motion, values=values)
+
+
+def stuck(*names: str) -> Planted:
+    def go(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+        values, columns = motion.values.copy(), columns_of(motion, joint_map, names)
+        values[:, columns] = values[len(values) // 2, columns]
+        return with_values(motion, values)
+
+    return go
+
+
+def rooted(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+    values, columns = motion.values.copy(), root_columns(motion)
+    values[:, columns] = values[0, columns]
+    return with_values(motion, values)
+
+
+def longer(factor: float) -> Planted:
+    def go(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+        limb = ("left_knee", "left_ankle", "right_elbow", "right_wrist")[rng.integers(4)]
+        (name, *_) = joint_map.sources[joint_map.target.joints.index(limb)]
+        offsets = motion.offsets.copy()
+        offsets[motion.joints.index(name)] *= factor
+        return replace(motion, offsets=offsets)
+
+    return go
+
+
+def shifted(frames: int | None, metres: float) -> Planted:
+    def go(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+        values, at = motion.values.copy(), int(rng.integers(len(motion.values) // 4, len(motion.values) // 2))
+        end = len(values) if frames is None else at + frames
+        values[at:end, root_columns(motion)[0]] += metres * metre(motion, joint_map)
+        return with_values(motion, values)
+
+    return go
+
+
+def spike(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+    names = ("left_hip", "right_knee", "left_shoulder", "right_elbow")
+    values, columns = motion.values.copy(), columns_of(motion, joint_map, (names[rng.integers(4)],))
+    values[int(rng.integers(len(values) // 4, len(values) // 2)), columns[:2]] += 60
+    return with_values(motion, values)
+
+
+def drift(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+    values, columns = motion.values.copy(), root_columns(motion)
+    values[:, columns[0]] += 0.7 * metre(motion, joint_map) * np.arange(len(values)) / motion.fps
+    return with_values(motion, values)
+
+
+def repeated(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+    source = np.arange(motion.frames)
+    source[3::4] -= 1
+    return with_values(motion, motion.values[source])
+
+
+def frozen(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+    values, at = motion.values.copy(), motion.frames // 4
+    count = int(0.7 * motion.fps) + 1
+    values[at : at + count] = values[at]
+    return with_values(motion, values)
+
+
+def faster(factor: float) -> Planted:
+    return lambda motion, joint_map, rng: replace(motion, fps=motion.fps * factor)
+
+
+def as_is(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
+    return motion
+
+
+LEGS = tuple(f"{side}_{name}" for side in ("left", "right") for name in ("hip", "knee", "ankle"))
+FAULTS: dict[str, tuple[Planted, set[str]]] = {
+    "knee stuck": (stuck("left_knee"), {"stuck"}),
+    "arm stuck": (stuck("right_shoulder", "right_elbow"), {"stuck"}),
+    "both legs stuck": (stuck(*LEGS), {"stuck"}),
+    "root stuck": (rooted, {"stuck", "slides"}),
+    "limb x 1.3": (longer(1.3), {"uneven limbs"}),
+    "limb x 1.6": (longer(1.6), {"uneven limbs"}),
+    "jump of 20 cm": (shifted(None, 0.2), {"jumps"}),
+    "spike of 20 cm, one frame": (shifted(1, 0.2), {"jumps"}),
+    "spike of a joint, one frame": (spike, {"flips", "jumps"}),
+    "drift of 0.7 m/s": (drift, {"slides"}),
+    "every 4th frame repeats": (repeated, {"repeated frames"}),
+    "frozen 0.7 s": (frozen, {"frozen"}),
+    "5 times too slow": (faster(0.2), {"frame rate"}),
+    "2 times too slow": (faster(0.5), {"frame rate"}),
+    "2 times too fast": (faster(2.0), {"frame rate", "jumps"}),
+    "another axis up": (as_is, {"stands along the ground", "no person"}),
+}  # fmt: skip
+"""What is planted, and the kinds that name it."""
+STEPS = {name for name in FAULTS if "too" in name}
+"""Faults that only steps and falls show."""
+
+
+def clips_of(place: Path, pattern: str, folder: Path) -> tuple[Bvh, list[BvhClip]]:
+    for path in sorted(place.glob(pattern)):
+        with tarfile.open(path) as archive:
+            archive.extractall(folder, filter="data")
+    given = {"source": folder, "licence": "x", "uncaptioned": "keep"}
+    conversion = prepare(BvhConfig.parse(given, "motion_faults"))
+    clips = sorted((clip for _, clip in conversion.plan.items), key=lambda clip: sha256_of_json(clip.id))
+    return conversion.converter, clips  # type: ignore[return-value]
+
+
+def kinds_of(converter: Bvh, clip: BvhClip, fault: str = "") -> set[str] | None:
+    """Kinds of the faults that the judge finds in a clip with a planted one; None where it has no channels."""
+    rng = np.random.default_rng(int(sha256_of_json([clip.id, fault])[:8], 16))
+    motion = clip.read()
+    if fault:
+        motion = FAULTS[fault][0](motion, converter.maps[clip.found.skeleton], rng)
+    joints, _ = converter.world(replace(clip, fps=motion.fps), motion)
+    if fault == "another axis up":
+        joints = joints[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
+    return {one.kind for one in judge(on_floor(joints), motion.fps)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--half", choices=("tune", "report"), default="report")
+    parser.add_argument(
+        "--clips", type=int, default=200, help="clips to plant in, and alarms: ten times as many"
+    )
+    parser.add_argument("--record", type=Path)
+    options = parser.parse_args()
+    alarms: dict[str, dict[str, Any]] = {}
+    clean: dict[str, list[tuple[Bvh, BvhClip]]] = defaultdict(list)
+    with tempfile.TemporaryDirectory() as folder:
+        for name, (place, pattern) in SETS.items():
+            converter, clips = clips_of(options.data / place, pattern, Path(folder) / name)
+            half = [clip for at, clip in enumerate(clips) if at % 2 == (options.half == "report")]
+            half = half[: 10 * options.clips]
+            told: Counter[str] = Counter()
+            named = []
+            for clip in half:
+                found = kinds_of(converter, clip)
+                told.update(found or ())
+                if found:
+                    named.append(f"{clip.id}: {', '.join(sorted(found))}")
+                else:
+                    clean[name].append((converter, clip))
+            alarms[name] = {"clips": len(half), "alarms": len(named), "kinds": dict(told), "named": named}
+            print(name, {**alarms[name], "named": named[:12]}, flush=True)
+        # As many of each set as there are, so that the largest does not speak for all.
+        chosen = [pair for row in zip_longest_of(list(clean.values())) for pair in row][: options.clips]
+        rows = {}
+        for fault, (_, kinds) in FAULTS.items():
+            found = [bool(kinds & (kinds_of(converter, clip, fault) or set())) for converter, clip in chosen]
+            rows[fault] = {"clips": len(found), "found": sum(found)}
+            print(f"{fault:30} {sum(found)} of {len(found)}", flush=True)
+    if options.record is not None:
+        record = {"half": options.half, "false alarms": alarms, "planted": rows}
+        options.record.write_text(json.dumps(record, indent=1) + "\n", "utf-8")
+
+
+def zip_longest_of(lists: list[list[Any]]) -> list[list[Any]]:
+    """Rows of one of each list, as long as any has one."""
+    longest = max(map(len, lists), default=0)
+    return [[one[at] for one in lists if at < len(one)] for at in range(longest)]
+
+
+if __name__ == "__main__":
+    main()
