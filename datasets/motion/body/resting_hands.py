@@ -41,6 +41,11 @@ def relaxed_fingers() -> NDArray[np.float64]:
     return out
 
 
+def relaxed_hands() -> NDArray[np.float64]:
+    """Local rotations [30, 3, 3] of both hands, as they follow the body in `smplx52`."""
+    return np.concatenate([relaxed_fingers(), relaxed_fingers() * _MIRROR])
+
+
 def with_resting_hands(
     joints: NDArray[np.floating], fingers: Sequence[NDArray[np.floating]] | None = None
 ) -> NDArray[np.float64]:

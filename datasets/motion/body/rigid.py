@@ -17,7 +17,6 @@ by the smallest turn (h3d.py), so they would add nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,8 +24,9 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
-from motionloom.datasets.motion.canonical import ground, resample, resample_quaternions, retarget
+from motionloom.datasets.motion.canonical import ground, resample, resample_quaternions
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
+from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.skeleton import Skeleton
 
 Floats = NDArray[np.float64]
@@ -36,6 +36,13 @@ _ROUNDS = 6
 """Rounds of "turn to the bones, average the bones" for pelvis, chest and palms; a few settle it."""
 _MEASURED = 500
 """Frames, at least, of longer motions that the shapes are measured on, spread evenly."""
+_BUILT_ALIKE = 0.15
+"""Mean difference of the logarithms of bone lengths up to which two figures are built alike: bodies of SMPL differ
+by half of it, skeletons of other makers by twice as much."""
+_UPRIGHT = 0.8
+"""Cosine of the angle up to which a chest is upright."""
+_STANDS = 0.3
+"""Share of the frames, those with the lowest ankle, in which a foot is taken to stand."""
 _FOREARM_SHARE = 0.5
 """Share of a hand's twist that the forearm takes."""
 
@@ -142,7 +149,46 @@ def measured_skeleton(joints: NDArray[np.floating], skeleton: Skeleton) -> Skele
         size = np.linalg.norm(offsets, axis=-1, keepdims=True)
         offsets *= lengths / np.where(size > _NO_BONE, size, 1.0)
         own = with_offsets(skeleton, offsets)
-    return own
+    return _leaning(points, own, skeleton)
+
+
+def _leaning(points: Floats, own: Skeleton, skeleton: Skeleton) -> Skeleton:
+    """Of a figure that is not built as `skeleton` is: with the lean of its neck and the steepness of its feet.
+
+    Nobody sees a head's pitch in positions. With our neck's lean, a figure whose neck leans less looks up.
+    """
+    lengths, ours = (np.linalg.norm(one.offsets[1:BODY_JOINTS], axis=-1) for one in (own, skeleton))
+    ratio = np.log(np.maximum(lengths, _NO_BONE) / ours)
+    if np.abs(ratio - np.median(ratio)).mean() < _BUILT_ALIKE:
+        return own
+    from scipy.spatial.transform import Rotation
+
+    offsets = own.offsets.copy()
+    chest, neck, head = (own.index(name) for name in ("spine3", "neck", "head"))
+    _, world = forward_kinematics(joints_to_rotations(points, own), points[:, 0], own.offsets, own.parents)
+    # On the whole, whoever is upright looks straight on.
+    upright = world[:, chest, 1, 1] > _UPRIGHT
+    ahead = world[upright, chest, :, 2]
+    level = Rotation.from_euler("y", np.arctan2(ahead[:, 0], ahead[:, 2])[:, None]).as_matrix()
+    way = (points[:, head] - points[:, neck])[upright]
+    lean = np.median(np.einsum("tji,tj->ti", level, way), axis=0) if upright.any() else np.zeros(3)
+    if lean.any():
+        offsets[head] = lean / np.linalg.norm(lean) * np.linalg.norm(offsets[head])
+    for side in ("left", "right"):
+        ankle, ball = own.index(f"{side}_ankle"), own.index(f"{side}_foot")
+        offsets[ball] = flat_foot(points[:, ankle], points[:, ball], offsets[ball])
+    return with_offsets(own, offsets)
+
+
+def flat_foot(ankle: Floats, ball: Floats, bone: Floats) -> Floats:
+    """The bone [3] from ankle to ball, as steep as it is in `ankle` and `ball` [T, 3] of a foot that stands."""
+    low = ankle[:, 1] <= np.quantile(ankle[:, 1], _STANDS)
+    way, size = ball[low] - ankle[low], float(np.linalg.norm(bone))
+    length = np.linalg.norm(way, axis=-1)
+    steep = float(np.median(way[:, 1] / np.where(length > _NO_BONE, length, np.inf)))
+    across = np.array([bone[0], 0.0, bone[2]])
+    across *= np.sqrt(1 - steep**2) / max(float(np.linalg.norm(across)), _NO_BONE)
+    return np.asarray(size * (across + [0.0, steep, 0.0]))
 
 
 def share_twist(rotations: Floats, skeleton: Skeleton) -> Floats:
@@ -168,31 +214,6 @@ def share_twist(rotations: Floats, skeleton: Skeleton) -> Floats:
         out[:, elbow] = out[:, elbow] @ share
         out[:, wrist] = share.swapaxes(-1, -2) @ out[:, wrist]
     return out
-
-
-def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
-    """Return the motions on one skeleton of their mean bones; errors are against the motions that came in."""
-    own = [motion.skeleton for motion in motions]
-    if all(skeleton == own[0] for skeleton in own):
-        return list(motions)
-    if any(skeleton.joints != own[0].joints for skeleton in own):
-        raise UserError("motions of different joints have no skeleton in common; write one file for each")
-    mean = with_offsets(own[0], np.mean([skeleton.offsets for skeleton in own], axis=0))
-    out = []
-    for motion in motions:
-        turned, root = solve_poses(motion.joints, mean.offsets, mean.parents, motion.rotations, motion.root)
-        out.append(RigidMotion.posed(mean, turned, root, motion.joints))
-    return out
-
-
-def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
-    """The motion on other bones [N, 3] of its joints, its path scaled with the legs so that feet stay on the
-    floor; the error is against its joints on these bones.
-    """
-    targets = retarget(motion.joints, motion.skeleton, offsets)
-    parents = motion.skeleton.parents
-    turned, root = solve_poses(targets, offsets, parents, motion.rotations, targets[:, 0])
-    return RigidMotion.posed(with_offsets(motion.skeleton, offsets), turned, root, targets)
 
 
 def with_offsets(skeleton: Skeleton, offsets: NDArray[np.floating]) -> Skeleton:

@@ -23,7 +23,8 @@ import numpy as np
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file
-from motionloom.datasets.motion.body.rigid import FitError, RigidMotion, on_bones
+from motionloom.datasets.motion.body.retarget import on_bones
+from motionloom.datasets.motion.body.rigid import FitError, RigidMotion
 from motionloom.datasets.motion.body.smpl import FINGERS, BodyModel
 from motionloom.datasets.motion.layout import BODY_JOINTS
 

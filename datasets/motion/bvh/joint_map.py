@@ -29,7 +29,8 @@ from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of_json
 from motionloom.datasets.base.json_doors import parse_json, read_plain
-from motionloom.datasets.motion.bvh.motion import END, BvhMotion
+from motionloom.datasets.motion.body.retarget import SourceFigure
+from motionloom.datasets.motion.bvh.motion import END, BvhMotion, channel_columns
 from motionloom.datasets.motion.skeleton import Skeleton
 
 NamedUnit = Literal["m", "cm", "mm", "inch", "dm", "foot", "inch/0.45"]
@@ -48,6 +49,8 @@ def metres(unit: Unit) -> float:
     return METRES[unit] if isinstance(unit, str) else unit
 
 
+_UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""From Z up to Y up."""
 _ROWS = TypeAdapter(list[tuple[int, str, str | list[str] | None]])
 
 
@@ -166,9 +169,18 @@ class JointMap:
         `unit` and `up` describe the file, which does not say them itself; the map's own count before them.
         """
         joints = self.places(motion) * metres(self.unit or unit)
+        return np.asarray(joints @ _UPRIGHT.T) if (self.up or up) == "z" else joints
+
+    def figure(self, motion: BvhMotion, *, unit: Unit = "cm", up: Up = "y") -> SourceFigure:
+        """The joints with the rotations that the file gives them."""
+        joints, rest = (self.apply(one, unit=unit, up=up) for one in (motion, motion.at_rest()))
+        orders = [order for order, _ in channel_columns(motion.channels)[1]]
+        index = {name: joint for joint, name in enumerate(motion.joints) if orders[joint]}
+        known = np.array([len(names) == 1 and names[0] in index for names in self.sources])
+        turns = motion.turns()[:, [index.get(names[0], 0) for names in self.sources]]
         if (self.up or up) == "z":
-            joints = np.stack([joints[..., 0], joints[..., 2], -joints[..., 1]], axis=-1)
-        return joints
+            turns = _UPRIGHT @ turns @ _UPRIGHT.T  # none at rest there, none here
+        return SourceFigure(joints, turns, known, rest[0])
 
     def places(self, motion: BvhMotion) -> NDArray[np.float64]:
         """Positions of the target's joints [T, N, 3] in the lengths and axes of the file."""

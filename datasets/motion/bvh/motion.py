@@ -110,6 +110,19 @@ class BvhMotion:
             out[rows] = turned.as_matrix().reshape(len(rows), self.frames, 3, 3)
         return out
 
+    def turns(self) -> Floats:
+        """World rotations of all joints [T, N, 3, 3], in the file's axes."""
+        out = np.moveaxis(self.local_rotations(range(len(self.joints))), 0, 1).copy()
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                out[:, joint] = out[:, parent] @ out[:, joint]
+        return out
+
+    def at_rest(self) -> BvhMotion:
+        """One frame of the figure in which nothing is turned."""
+        still = np.array([name.endswith("position") for names in self.channels for name in names])
+        return replace(self, values=np.where(still, self.values[:1], 0.0))
+
     def positions(self) -> Floats:
         # Offsets may move per frame, so `kinematics.forward_kinematics` does not fit. Time is the last axis,
         # in one piece: products of whole clips are then three times faster than batches of small matrices.

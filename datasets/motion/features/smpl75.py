@@ -11,7 +11,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.motion.body.rigid import fit_rigid, on_bones
+from motionloom.datasets.motion.body.retarget import on_bones
+from motionloom.datasets.motion.body.rigid import fit_rigid
 from motionloom.datasets.motion.body.smpl import BodyModel, smpl_joints
 from motionloom.datasets.motion.canonical import canonicalize, facing
 from motionloom.datasets.motion.layout import BODY_JOINTS

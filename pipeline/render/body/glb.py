@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.base.json_doors import number, parse_json, read_plain
-from motionloom.datasets.motion.body.rigid import RigidMotion, on_one_skeleton, with_offsets
+from motionloom.datasets.motion.body.retarget import on_one_skeleton
+from motionloom.datasets.motion.body.rigid import RigidMotion, with_offsets
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS

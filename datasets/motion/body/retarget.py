@@ -1,0 +1,301 @@
+"""The one retargeting: rotations of a figure carried to another skeleton, twists kept **[ours]**.
+
+Seen from the world, joint `j` of the source is turned by `S_j(t)`, in axes that are its maker's own. Ours is
+turned by `S_j(t) C_j`: `C_j` leads from our rest pose (T-pose, +Z ahead) to the axes of the source, once for the
+whole clip. It comes from
+
+1. the source's rest pose, where this is a standing figure: it faces ahead and looks straight on, as ours does;
+2. else (Bandai-Namco, LAFAN1: all bones along one line) the mean of what positions show, taken to the nearest
+   of the 24 rotations that exchange axes: makers put the axes of a joint along the bone and across it.
+
+Limbs are then turned by the smallest rotation that lays our bone on the source's, so that every direction is
+the file's; a trunk, necks and, where there is a rest pose, feet take their rest directions from the source, so
+that a neck that leans otherwise tilts no head, and no sole. Last, `chain_solver` takes up what is left between
+the joints (spines of other counts, joints that are means); ends keep the orientation of the file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.motion.body.chain_solver import solve_poses
+from motionloom.datasets.motion.body.resting_hands import relaxed_hands
+from motionloom.datasets.motion.body.rigid import RigidMotion, flat_foot, measured_skeleton, with_offsets
+from motionloom.datasets.motion.canonical import retarget
+from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations, swing
+from motionloom.datasets.motion.layout import BODY_JOINTS
+from motionloom.datasets.motion.skeleton import Skeleton
+
+Floats = NDArray[np.float64]
+
+_LIMBS = ("hip", "knee", "shoulder", "elbow")
+_MEASURED = 500
+"""Frames, at least, of longer clips that axes are measured on, spread evenly."""
+_MEANS = 0.02
+"""Weight of joints that no joint of the file stands for."""
+_BENT = 0.15
+"""Sine of the angle by which an elbow must be bent, on average, to show its axis."""
+_CARRIED = ("hip", "spine1", "collar")
+_UPRIGHT = 0.7
+"""Cosine to the vertical that head and legs of a standing figure have at least."""
+_ALONG = 0.97
+"""Cosine to one of its axes of a bone that lies along it."""
+_AXES = np.array(
+    [
+        np.diag(signs) @ np.eye(3)[list(order)]
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+        if np.linalg.det(np.diag(signs) @ np.eye(3)[list(order)]) > 0
+    ]
+)
+"""The 24 rotations that exchange axes [24, 3, 3]."""
+_MIRRORED = np.stack(
+    [
+        np.diag(turned) @ _AXES @ np.diag([-1.0, 1.0, 1.0])
+        for turned in product((1.0, -1.0), repeat=3)
+        if np.prod(turned) < 0
+    ],
+    axis=1,
+)
+"""What the right side may have for each of them on the left, which other axes than that of the image may be turned
+round for [24, 4, 3, 3]."""
+_CHAINS = (
+    ("pelvis",), ("spine1",), ("spine2",), ("spine3",), ("neck", "head"),
+    ("left_collar", "left_shoulder", "left_elbow", "left_wrist"), ("left_hip", "left_knee"), ("left_ankle",), ("left_foot",),
+)  # fmt: skip
+"""Joints whose axes are alike."""
+
+
+@dataclass(frozen=True)
+class SourceFigure:
+    """Joints of one of our skeletons as a file has them: T frames, metres, Y up."""
+
+    joints: Floats
+    """[T, N, 3]."""
+    turns: Floats
+    """World rotations [T, N, 3, 3] of the joints that stand for them, in axes of their maker."""
+    known: NDArray[np.bool_]
+    """Which joints have a rotation [N]; others are means of some, or End Sites."""
+    rest: Floats
+    """Joints [N, 3] while all of these rotations are none."""
+
+
+def carried(source: SourceFigure, skeleton: Skeleton) -> RigidMotion:
+    """The motion on our joints, with the source's bones, its rotations and the twists of these."""
+    parents, count = np.asarray(skeleton.parents), len(skeleton)
+    points = np.asarray(source.joints, dtype=np.float64)
+    own = measured_skeleton(points, skeleton)
+    seen = slice(None, None, max(1, len(points) // _MEASURED))
+    axes, standing = _axes_of(source, own, seen)
+    offsets = own.offsets.copy()
+    # From the root down, since hands are laid over the forearm that carries them.
+    for joint in range(count):
+        ends = np.flatnonzero(parents == joint)
+        name = skeleton.joints[joint]
+        carrier = parents[joint]
+        if not source.known[joint]:
+            continue
+        if standing and (joint >= BODY_JOINTS or "wrist" in name) and source.known[carrier]:
+            axes[joint] = axes[carrier]
+        if not len(ends):
+            continue
+        bones = points[seen, ends] if len(ends) == 1 else points[seen][:, ends]
+        bones = bones.reshape(len(bones), len(ends), 3) - points[seen, joint, None]
+        local = np.median(np.einsum("tji,tcj->tci", source.turns[seen, joint], bones), axis=0)
+        aims = local @ axes[joint]
+        if "ankle" in name and not standing:
+            offsets[ends[0]] = flat_foot(points[seen, joint], points[seen, ends[0]], own.offsets[ends[0]])
+        if "wrist" in name:
+            axes[joint] = axes[joint] @ _laid(own.offsets[ends], aims)
+        elif joint >= BODY_JOINTS or name.endswith(_LIMBS) or ("ankle" in name and not standing):
+            axes[joint] = axes[joint] @ _swing(offsets[ends[0]], aims[0])
+        else:
+            size = np.linalg.norm(aims, axis=-1, keepdims=True)
+            length = np.linalg.norm(own.offsets[ends], axis=-1, keepdims=True)
+            offsets[ends] = np.where(size > 1e-9, aims / np.maximum(size, 1e-9) * length, offsets[ends])
+    own = with_offsets(own, offsets)
+    return posed_by(points, source.turns @ axes, source.known, own)
+
+
+def posed_by(
+    joints: NDArray[np.floating], turns: Floats, known: NDArray[np.bool_], skeleton: Skeleton
+) -> RigidMotion:
+    """The skeleton at joints [T, N, 3] with world rotations [T, N, 3, 3] where these are known [N].
+
+    Other joints turn as little as positions allow; twists and ends stay as they are given.
+    """
+    parents = np.asarray(skeleton.parents)
+    world = np.array(turns, dtype=np.float64)
+    for joint, parent in enumerate(parents):
+        if known[joint]:
+            continue
+        world[:, joint] = world[:, parent] if parent >= 0 else np.eye(3)
+        if len(ends := np.flatnonzero(parents == joint)) == 1:
+            rest = (world[:, joint] @ skeleton.offsets[ends[0]]).T
+            bone = (joints[:, ends[0]] - joints[:, joint]).T
+            world[:, joint] = np.moveaxis(swing(_unit(rest), _unit(bone)), -1, 0) @ world[:, joint]
+    local = _local(world, parents)
+    # Joints that are means, or hang on bones that are not ours, are placed by what carries them: the hips do not
+    # turn from the file's to reach them.
+    targets = np.array(joints, dtype=np.float64)
+    weights = np.where(known | ~np.isin(np.arange(len(parents)), parents), 1.0, _MEANS)
+    for joint, name in enumerate(skeleton.joints):
+        if name.endswith(_CARRIED) and known[parents[joint]]:
+            targets[:, joint] = (
+                targets[:, parents[joint]] + world[:, parents[joint]] @ skeleton.offsets[joint]
+            )
+            weights[joint] = 1.0
+    local, root = solve_poses(targets, skeleton.offsets, skeleton.parents, local, targets[:, 0], weights)
+    _, now = forward_kinematics(local, root, skeleton.offsets, skeleton.parents)
+    for joint in np.flatnonzero(known):
+        if joint not in parents:
+            local[:, joint] = now[:, parents[joint]].swapaxes(-1, -2) @ world[:, joint]
+    return RigidMotion.posed(skeleton, local, root, joints)
+
+
+def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
+    """The motion on other bones [N, 3] of its joints, its path scaled with the legs so that feet stay on the
+    floor; the error is against its joints on these bones.
+    """
+    return _worn(motion, offsets, retarget(motion.joints, motion.skeleton, offsets))
+
+
+def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
+    """Return the motions on one skeleton of their mean bones; errors are against the motions that came in."""
+    own = [motion.skeleton for motion in motions]
+    if all(skeleton == own[0] for skeleton in own):
+        return list(motions)
+    if any(skeleton.joints != own[0].joints for skeleton in own):
+        raise UserError("motions of different joints have no skeleton in common; write one file for each")
+    mean = np.mean([skeleton.offsets for skeleton in own], axis=0)
+    return [_worn(motion, mean, motion.joints) for motion in motions]
+
+
+def _worn(motion: RigidMotion, offsets: NDArray[np.floating], joints: Floats) -> RigidMotion:
+    """The motion's orientations on other bones [N, 3] at joints [T, N, 3]."""
+    own = motion.skeleton
+    _, world = forward_kinematics(motion.rotations, motion.root, own.offsets, own.parents)
+    for joint in range(len(own)):
+        ends = [child for child, parent in enumerate(own.parents) if parent == joint]
+        if len(ends) == 1:
+            world[:, joint] = world[:, joint] @ _swing(np.asarray(offsets[ends[0]]), own.offsets[ends[0]])
+    return posed_by(joints, world, np.ones(len(own), dtype=np.bool_), with_offsets(own, offsets))
+
+
+def with_hands(figure: RigidMotion) -> RigidMotion:
+    """A figure without fingers, with hands at rest."""
+    whole, body = Skeleton.named("smplx52"), figure.skeleton
+    frames, sizes, local = len(figure.root), [], relaxed_hands()
+    for side in ("left", "right"):
+        wrist = whole.index(f"{side}_wrist")
+        forearm = np.linalg.norm(np.stack([body.offsets[wrist], whole.offsets[wrist]]), axis=-1)
+        sizes += [forearm[0] / forearm[1]] * (len(local) // 2)
+    fingers = whole.offsets[BODY_JOINTS:] * np.array(sizes)[:, None]
+    skeleton = with_offsets(whole, np.concatenate([body.offsets, fingers]))
+    rotations = np.concatenate([figure.rotations, np.broadcast_to(local, (frames, *local.shape))], axis=1)
+    posed = RigidMotion.posed(skeleton, rotations, figure.root, np.zeros((frames, len(whole), 3)))
+    return replace(posed, error=figure.error)
+
+
+def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, bool]:
+    """From our rest pose to the axes of the source's joints [N, 3, 3], and whether its rest pose says them."""
+    ahead = _ahead(source.rest, own)
+    if _stands(source.rest @ ahead.T, own):
+        return np.repeat(ahead.T[None], len(own), axis=0), True
+    points, turns = source.joints[seen], source.turns[seen]
+    _, shown = forward_kinematics(joints_to_rotations(points, own), points[:, 0], own.offsets, own.parents)
+    # Positions say nothing of a head: on the whole it looks where the chest does.
+    shown[:, own.index("head")] = shown[:, own.index("spine3")]
+    means = np.einsum("tnji,tnjk->nik", turns, shown)
+    left, _, right = np.linalg.svd(means)
+    left[..., 2] *= np.linalg.det(left @ right)[:, None]
+    axes = left @ right
+    # An elbow bends one way only, which shows how the upper arm is twisted.
+    for side in ("left", "right"):
+        arm = shoulder, elbow, wrist = [
+            own.index(f"{side}_{name}") for name in ("shoulder", "elbow", "wrist")
+        ]
+        upper, fore = (_unit((points[:, b] - points[:, a]).T) for a, b in ((shoulder, elbow), (elbow, wrist)))
+        bone, bent = (np.einsum("tji,jt->i", turns[:, shoulder], way) / len(points) for way in (upper, fore))
+        bent -= (bent @ bone) * bone
+        if np.linalg.norm(bent) > _BENT:
+            axes[arm] = _laid(np.stack([own.offsets[elbow], [0.0, 0.0, 1.0]]), np.stack([bone, bent]))
+    usable = source.known.copy()
+    for joint in range(len(own)):
+        ends = [child for child, parent in enumerate(own.parents) if parent == joint]
+        if len(ends) == 1:
+            bone = np.einsum("tji,tj->ti", turns[:, joint], points[:, ends[0]] - points[:, joint])
+            # Axes that are not along the bone are nobody's convention.
+            usable[joint] &= np.abs(_unit(np.median(bone, axis=0))).max() > _ALONG
+    for chain in _CHAINS:
+        left = [own.index(name) for name in chain]
+        right = own.mirror[left]
+        if not usable[[*left, *right]].all():
+            continue
+        scores = np.einsum("kij,ij->k", _AXES, axes[left].sum(axis=0))
+        if right[0] == left[0]:
+            axes[left] = _AXES[scores.argmax()]
+            continue
+        both = scores[:, None] + np.einsum("kdij,ij->kd", _MIRRORED, axes[right].sum(axis=0))
+        best = np.unravel_index(int(both.argmax()), both.shape)
+        axes[left] = _AXES[best[0]]
+        axes[right] = _MIRRORED[best]
+    return axes, False
+
+
+def _ahead(rest: Floats, skeleton: Skeleton) -> Floats:
+    """The rotation that turns a rest pose to stand upright and look ahead; between axes where it can be."""
+    pairs = [
+        rest[skeleton.index(f"left_{j}")] - rest[skeleton.index(f"right_{j}")] for j in ("hip", "shoulder")
+    ]
+    middles = [rest[skeleton.index(f"left_{j}")] - pair / 2 for j, pair in zip(("hip", "shoulder"), pairs)]
+    side = _unit(sum(pairs))
+    up = middles[1] - middles[0]
+    up = _unit(up - (up @ side) * side)
+    turn = np.stack([side, up, np.cross(side, up)])
+    nearest = _AXES[np.einsum("kij,ij->k", _AXES, turn).argmax()]
+    return nearest if np.trace(nearest @ turn.T) > 2.6 else turn  # 37 degrees
+
+
+def _stands(rest: Floats, skeleton: Skeleton) -> bool:
+    """Whether a rest pose [N, 3], Y up and +Z ahead, is a standing figure."""
+    bones = _unit(skeleton.bones(rest).T).T
+
+    def bone(name: str) -> Floats:
+        return np.asarray(bones[skeleton.index(name)])
+
+    legs = [bone(f"{side}_{joint}") for side in ("left", "right") for joint in ("knee", "ankle")]
+    feet = [bone(f"{side}_foot")[2] for side in ("left", "right")]
+    return min(bone("head")[1], bone("neck")[1], *(-leg[1] for leg in legs)) > _UPRIGHT and min(feet) > 0.3
+
+
+def _laid(bones: Floats, aims: Floats) -> Floats:
+    """The rotation that lays bones [C, 3] over aims [C, 3], direction by direction."""
+    left, _, right = np.linalg.svd(_unit(aims.T) @ _unit(bones.T).T)
+    left[:, 2] *= np.linalg.det(left @ right)
+    return np.asarray(left @ right)
+
+
+def _swing(bone: Floats, aim: Floats) -> Floats:
+    """The smallest rotation that turns a bone where it aims; none for those without length."""
+    if not (bone.any() and aim.any()):
+        return np.eye(3)
+    return swing(_unit(bone), _unit(aim))
+
+
+def _unit(vectors: Floats) -> Floats:
+    """Unit vectors of [3, ...]."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=0), 1e-12))
+
+
+def _local(world: Floats, parents: NDArray[np.int64]) -> Floats:
+    """Local rotations of world rotations [T, N, 3, 3]."""
+    out = world.copy()
+    out[:, 1:] = world[:, parents[1:]].swapaxes(-1, -2) @ world[:, 1:]
+    return out
