@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import register
-from motionloom.datasets.motion.body.rigid import RigidMotion
+from motionloom.datasets.motion.body.rigid import RigidMotion, at_rate, fit_rigid, mirrored
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.canonical import facing, ground, mirror, resample
 from motionloom.datasets.motion.layout import PIECES, piece_joints
@@ -82,8 +82,11 @@ def recorded_of(motion: GeneratedMotion) -> RecordedClip:
 def changed(clip: RecordedClip, task: EditTask) -> RecordedClip:
     """The clip mirrored, at another speed and several times in a row, as a task says."""
     joints, face, pace = clip.joints, clip.face, clip.fps * task.speed
+    posed = clip.posed or clip.figure
     if task.mirror:
         joints = mirror(joints, Skeleton.named("smplx52" if clip.has_hands else "smpl22"))
+        posed = posed and mirrored(posed)
+    posed = posed and at_rate(posed, pace, clip.fps)
     joints = once = resample(joints, pace, clip.fps)
     blend = np.clip(np.arange(len(once)) / (_BLEND * clip.fps), 0, 1)[:, None, None]
     for _ in range(task.repeat - 1):
@@ -96,7 +99,9 @@ def changed(clip: RecordedClip, task: EditTask) -> RecordedClip:
     if face is not None:
         face = resample(face, pace, clip.fps)
         face = np.concatenate([face, *[face[1:]] * (task.repeat - 1)])
-    return replace(clip, joints=joints, face=face, figure=None)
+    if posed is not None and task.repeat > 1:
+        posed = fit_rigid(joints, posed.skeleton)
+    return replace(clip, joints=joints, face=face, figure=None, posed=posed)
 
 
 def edit_clip(

@@ -144,11 +144,8 @@ def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMo
     turn = Rotation.from_euler("y", (heading[inside] - frames.clip_root.heading)[:, None]).as_matrix()
     posing = (clip.skeleton.offsets, clip.skeleton.parents)
     _, was = forward_kinematics(clip.rotations, clip.root, *posing)
-    _, seen = forward_kinematics(figure.rotations[inside], clip.root, *posing)
     for joint, parent in enumerate(clip.skeleton.parents):
         loose, wanted = kept[:, joint] & ~kept[:, parent], turn @ was[:, joint]
-        if joint in frames.bare_wrists:  # new fingers come with the hand that they were made on
-            loose, wanted = kept[:, joint], seen[:, joint]
         if pieces[joint] in _TRUNK_AND_ARMS and loose.any():
             _, now = forward_kinematics(own, clip.root, *posing)
             own[loose, joint] = (now[:, parent].swapaxes(-1, -2) @ wanted)[loose]

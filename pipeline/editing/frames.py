@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.body.retarget import with_hands
 from motionloom.datasets.motion.body.rigid import RigidMotion, at_rate, fit_rigid, moved
 from motionloom.datasets.motion.canonical import (
     canonicalize,
@@ -37,7 +38,6 @@ WALKS = 0.3
 """Metres a second of the root above which the figure should face where it goes [ours]."""
 _TURNS = 0.5
 """Seconds beside kept frames in which it may turn there [ours]."""
-_WRISTS = ("left_wrist", "right_wrist")
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,6 @@ class EditFrames:
     """Size of the model's figure in that of the clip's."""
     lift: float
     """By how much the model's figure, in the clip's size, stands too low for the clip's feet, in metres."""
-    bare_wrists: tuple[int, ...]
-    """Wrists of a clip without fingers, where the model makes these."""
     remarks: tuple[str, ...]
 
     @property
@@ -153,19 +151,27 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     drawn = clip.figure if clip.joints.shape[1] == layout.num_joints else None
     drawn = None if drawn is None else at_rate(drawn, clip.fps, layout.fps)
     joints = resample(clip.joints, clip.fps, layout.fps) if drawn is None else drawn.joints
+    posed = None if clip.posed is None else at_rate(clip.posed, clip.fps, layout.fps)
     face = None if clip.face is None else resample(clip.face, clip.fps, layout.fps)
     hands = layout.num_joints > BODY_JOINTS
     if not hands:
         joints = joints[:, :BODY_JOINTS]
     elif not clip.has_hands:
-        joints = with_resting_hands(joints)
-        remarks.append("the clip has no hands, so the model makes them")
+        if posed is None:
+            joints = with_resting_hands(joints)
+        else:
+            posed = with_hands(posed)
+            joints = np.concatenate([joints, posed.joints[:, BODY_JOINTS:]], axis=1)
+        remarks.append("hands are not recorded in the clip: they rest where it is kept")
     origin = complex(ground(joints[0, 0]))
     turn = float(facing(joints[:1])[0])
     floor = float(joints[..., 1].min())
     # The clip as its first frame sees it.
     if drawn is None:
-        figure = fit_rigid(canonicalize(joints), layout.skeleton)
+        if posed is None or len(posed.skeleton) != layout.num_joints:
+            figure = fit_rigid(canonicalize(joints), layout.skeleton)
+        else:
+            figure = moved(posed, -turn, -origin * np.exp(-1j * turn), -floor)
         world = World(origin, turn, 0.0)
     else:
         figure = moved(drawn, -turn, -origin * np.exp(-1j * turn), -floor)
@@ -174,10 +180,10 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     own = figure.joints
     # The features must be of the figure that the model knows; `scale` and `lift` lead back to the clip's.
     retargeted = retarget(own, layout.skeleton)
-    posed = canonicalize(retargeted)
+    standing = canonicalize(retargeted)
     scale = float(retargeted[0, 0, 1] / own[0, 0, 1])
-    lift = float(retargeted[0, 0, 1] - posed[0, 0, 1]) / scale
-    features = encode(posed, layout, face if layout.has("face") else None)
+    lift = float(retargeted[0, 0, 1] - standing[0, 0, 1]) / scale
+    features = encode(standing, layout, face if layout.has("face") else None)
     # Features of steps have one frame less than the joints.
     face = None if face is None else face[: len(features)]
     if layout.has("face") and face is None:
@@ -191,7 +197,7 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     heading, x, z = (one.numpy() for one in torch_way(torch.from_numpy(features).double(), layout))
     clip_root = RootPath(heading, (z + 1j * x) / scale)
     timed = TimedTask(task, layout, lead, total)
-    pieces = timed.pieces(len(features)) & present(clip, layout)
+    pieces = timed.pieces(len(features)) & present(clip)
     path = timed.path(world)
     timed.require_free(path, pieces[:, LOWER], clip_root)
     pins = timed.pins(pieces, world)
@@ -211,7 +217,6 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
         written=Written(written[rows], base, drawn is not None),
         scale=scale,
         lift=lift,
-        bare_wrists=() if clip.has_hands or not hands else tuple(map(layout.skeleton.index, _WRISTS)),
         remarks=tuple(remarks),
     )
 

@@ -156,10 +156,9 @@ class TimedTask:
         return out
 
 
-def present(clip: RecordedClip, layout: MotionLayout) -> NDArray[np.bool_]:
-    """Pieces [P] that can be kept: fingers and face are made where the clip has none."""
-    hands = clip.has_hands or layout.num_joints == BODY_JOINTS
-    return np.array([True] * 4 + [hands] * 2 + [clip.face is not None])
+def present(clip: RecordedClip) -> NDArray[np.bool_]:
+    """Pieces [P] that can be kept: hands that nobody recorded rest, and a face that nobody did is made."""
+    return np.array([True] * 6 + [clip.face is not None])
 
 
 def require_work(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> None:
@@ -179,7 +178,7 @@ def require_work(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> No
         )
     if task.changes_clip:
         return
-    kept = TimedTask(task, layout, lead, total).pieces(frames) & present(clip, layout)
+    kept = TimedTask(task, layout, lead, total).pieces(frames) & present(clip)
     if kept[:, np.isin(np.arange(len(PIECES)), piece_columns(layout))].all():
         raise UserError(
             "everything of the clip is kept, so there is nothing to make: keep less of it, or give seconds "

@@ -1,4 +1,6 @@
-"""Read a clip from one file: BVH of any human skeleton, and the npz and GLB files that are written here."""
+"""Read a clip from one file: BVH and AMC of any human skeleton, SMPL parameters as AMASS has them (npz), and
+the npz and GLB files that are written here.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +10,31 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import number, parse_json
 from motionloom.datasets.base.records import FACE, HANDS
+from motionloom.datasets.convert.amass.smpl_npz import read_motion as read_smpl
+from motionloom.datasets.convert.amass.smpl_npz import read_motion_header
 from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map
+from motionloom.datasets.convert.bvh.read import read_file, read_motion
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
-from motionloom.datasets.convert.common.features import features_of, require_human
+from motionloom.datasets.convert.common.features import features_of, require_human, upright
 from motionloom.datasets.motion.body.resting_hands import with_resting_hands
+from motionloom.datasets.motion.body.retarget import carried
 from motionloom.datasets.motion.body.rigid import RigidMotion, with_offsets
-from motionloom.datasets.motion.bvh.joint_map import metres
-from motionloom.datasets.motion.bvh.motion import read_bvh
+from motionloom.datasets.motion.body.smpl import BodyModel
+from motionloom.datasets.motion.bvh.joint_map import JointMap, Unit, Up, metres
+from motionloom.datasets.motion.bvh.motion import BvhMotion, read_bvh
 from motionloom.datasets.motion.bvh.own_file import OwnBvh
 from motionloom.datasets.motion.bvh.text import load_text
+from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import BODY_JOINTS, FACE_DIMS, MotionLayout
 from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.motion.skeleton import Skeleton
 
-ENDINGS = (".bvh", ".npz", ".glb")
+ENDINGS = (".bvh", ".amc", ".npz", ".glb")
 _FIGURE = ("rotations", "offsets", "root")
 _SAME_MM = 0.1
 """Millimetres within which an npz's joints are those of its figure: both are rounded to float32."""
@@ -49,6 +58,8 @@ class RecordedClip:
     """The file, where it is a BVH."""
     figure: RigidMotion | None = None
     """The figure whose joints these are, where a file of ours holds it."""
+    posed: RigidMotion | None = None
+    """Another file's figure with its rotations, on our joints; these are millimetres from `joints`."""
 
     @property
     def has_hands(self) -> bool:
@@ -68,6 +79,9 @@ def read_clip(path: Path) -> RecordedClip:
         raise UserError(f"{path}: no such file")
     if ending == ".bvh":
         return require_clip(_read_bvh(path))
+    if ending == ".amc":
+        motion = read_motion(read_file(path, str(path)), str(path))
+        return require_clip(_mapped(path, motion)[0])
     if ending == ".npz":
         return require_clip(_read_npz(path))
     from motionloom.pipeline.render.body.glb import read_glb
@@ -122,6 +136,13 @@ def _read_bvh(path: Path) -> RecordedClip:
     mark = BOM_UTF8 if raw.startswith(BOM_UTF8) else b""
     ends = next((end for end in (b"\r\n", b"\r") if end in raw), b"\n")
     motion = read_bvh(data, name=name)
+    clip, joint_map, unit, up, added = _mapped(path, motion)
+    own = OwnBvh(data, motion, joint_map, metres(joint_map.unit or unit), up, added, mark, ends)
+    return replace(clip, bvh=own)
+
+
+def _mapped(path: Path, motion: BvhMotion) -> tuple[RecordedClip, JointMap, Unit, Up, int]:
+    """The clip of a motion whose joints have known names, how they are read, and the added frames."""
     guesses = [guess_joint_map(motion, Skeleton.named(name)) for name in ("smplx52", "smpl22")]
     joint_map = next((one for one in guesses if not one.open_rows), None)
     if joint_map is None:
@@ -130,14 +151,16 @@ def _read_bvh(path: Path) -> RecordedClip:
             f"joint map of its own: motionloom data convert bvh --set joint_map=FILE"
         )
     unit, up, _ = settled(joint_map, [motion])
-    joints = joint_map.apply(motion, unit=unit, up=up)
-    added = added_frames(joints)
-    own = OwnBvh(data, motion, joint_map, metres(joint_map.unit or unit), up, added, mark, ends)
-    return RecordedClip(str(path), joints[added:], motion.fps, bvh=own)
+    added = added_frames(joint_map.apply(motion, unit=unit, up=up))
+    source = joint_map.figure(replace(motion, values=motion.values[added:]), unit=unit, up=up)
+    clip = RecordedClip(str(path), source.joints, motion.fps, posed=carried(source, joint_map.target))
+    return clip, joint_map, unit, up, added
 
 
 def _read_npz(path: Path) -> RecordedClip:
     with NpzFile(path) as stored:
+        if "joints" not in stored.names and {"poses", "pose_body"} & stored.names:
+            return _read_smpl(path)
         joints = stored.numbers("joints")
         face = stored.numbers("face").astype(np.float32) if "face" in stored.names else None
         posed = [stored.numbers(name) for name in _FIGURE if name in stored.names]
@@ -151,6 +174,21 @@ def _read_npz(path: Path) -> RecordedClip:
     fps = number(facts.get("fps"), f"{path}: its metadata: fps", 1000, 0.1)
     figure = _figure_of(joints, *posed) if len(posed) == len(_FIGURE) else None
     return RecordedClip(str(path), joints, fps, face, str(facts.get("caption", "")), figure=figure)
+
+
+def _read_smpl(path: Path) -> RecordedClip:
+    """Parameters of SMPL, Z up, on the neutral body."""
+    header = read_motion_header(path, str(path))
+    if header.fps is None:
+        raise UserError(f"{path}: no mocap_frame_rate, so its frame rate is not known")
+    given = read_smpl(path, str(path), hands=header.hands)
+    body = BodyModel.neutral("smplx52" if header.hands else "smpl22")
+    vectors, trans = upright(given.rotations, given.trans, body)
+    local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+    root, skeleton = body.rest_joints()[0] + trans, body.skeleton
+    joints, _ = forward_kinematics(local, root, skeleton.offsets, skeleton.parents)
+    figure = RigidMotion.posed(skeleton, local, root, joints)
+    return RecordedClip(str(path), joints, header.fps, figure=figure)
 
 
 def _figure_of(joints: Floats, rotations: Floats, offsets: Floats, root: Floats) -> RigidMotion | None:

@@ -1,17 +1,17 @@
 """The one retargeting: rotations of a figure carried to another skeleton, twists kept **[ours]**.
 
 Seen from the world, joint `j` of the source is turned by `S_j(t)`, in axes that are its maker's own. Ours is
-turned by `S_j(t) C_j`: `C_j` leads from our rest pose (T-pose, +Z ahead) to the axes of the source, once for the
-whole clip. It comes from
+turned by `S_j(t) C_j`: `C_j` leads from our rest pose (T-pose, +Z ahead) to the axes of the source, once for
+the whole clip. It comes from
 
-1. the source's rest pose, where this is a standing figure: it faces ahead and looks straight on, as ours does;
+1. the source's rest pose, where this is a standing figure: it faces ahead and looks straight on, as ours;
 2. else (Bandai-Namco, LAFAN1: all bones along one line) the mean of what positions show, taken to the nearest
    of the 24 rotations that exchange axes: makers put the axes of a joint along the bone and across it.
 
 Limbs are then turned by the smallest rotation that lays our bone on the source's, so that every direction is
-the file's; a trunk, necks and, where there is a rest pose, feet take their rest directions from the source, so
-that a neck that leans otherwise tilts no head, and no sole. Last, `chain_solver` takes up what is left between
-the joints (spines of other counts, joints that are means); ends keep the orientation of the file.
+the file's. Trunks, necks and, where there is a rest pose, feet take their rest directions from the source:
+a neck that leans otherwise tilts no head, and no sole. Last, `chain_solver` takes up what is left between the
+joints (spines of other counts, joints that are means); ends keep the orientation of the file.
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ _MIRRORED = np.stack(
     ],
     axis=1,
 )
-"""What the right side may have for each of them on the left, which other axes than that of the image may be turned
-round for [24, 4, 3, 3]."""
+"""For each of them on the left, what the right may have: its image, with axes turned round [24, 4, 3, 3]."""
 _CHAINS = (
     ("pelvis",), ("spine1",), ("spine2",), ("spine3",), ("neck", "head"),
-    ("left_collar", "left_shoulder", "left_elbow", "left_wrist"), ("left_hip", "left_knee"), ("left_ankle",), ("left_foot",),
+    ("left_collar", "left_shoulder", "left_elbow", "left_wrist"), ("left_hip", "left_knee"), ("left_ankle",),
+    ("left_foot",),
 )  # fmt: skip
 """Joints whose axes are alike."""
 
@@ -141,8 +141,8 @@ def posed_by(
             bone = (joints[:, ends[0]] - joints[:, joint]).T
             world[:, joint] = np.moveaxis(swing(_unit(rest), _unit(bone)), -1, 0) @ world[:, joint]
     local = _local(world, parents)
-    # Joints that are means, or hang on bones that are not ours, are placed by what carries them: the hips do not
-    # turn from the file's to reach them.
+    # Joints that are means, or hang on bones that are not ours, are placed by what carries them: hips do not
+    # turn away from the file's to reach them.
     targets = np.array(joints, dtype=np.float64)
     weights = np.where(known | ~np.isin(np.arange(len(parents)), parents), 1.0, _MEANS)
     for joint, name in enumerate(skeleton.joints):
@@ -204,7 +204,7 @@ def with_hands(figure: RigidMotion) -> RigidMotion:
 
 
 def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, bool]:
-    """From our rest pose to the axes of the source's joints [N, 3, 3], and whether its rest pose says them."""
+    """From our rest pose to the axes of the source's joints [N, 3, 3]; whether its rest pose says them."""
     ahead = _ahead(source.rest, own)
     if _stands(source.rest @ ahead.T, own):
         return np.repeat(ahead.T[None], len(own), axis=0), True
@@ -251,12 +251,10 @@ def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, 
 
 def _ahead(rest: Floats, skeleton: Skeleton) -> Floats:
     """The rotation that turns a rest pose to stand upright and look ahead; between axes where it can be."""
-    pairs = [
-        rest[skeleton.index(f"left_{j}")] - rest[skeleton.index(f"right_{j}")] for j in ("hip", "shoulder")
-    ]
-    middles = [rest[skeleton.index(f"left_{j}")] - pair / 2 for j, pair in zip(("hip", "shoulder"), pairs)]
-    side = _unit(sum(pairs))
-    up = middles[1] - middles[0]
+    names = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+    hips, shoulders = np.split(rest[[skeleton.index(name) for name in names]], 2)
+    side = _unit(hips[0] - hips[1] + shoulders[0] - shoulders[1])
+    up = shoulders.mean(axis=0) - hips.mean(axis=0)
     up = _unit(up - (up @ side) * side)
     turn = np.stack([side, up, np.cross(side, up)])
     nearest = _AXES[np.einsum("kij,ij->k", _AXES, turn).argmax()]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
-from motionloom.datasets.motion.canonical import ground, resample, resample_quaternions
+from motionloom.datasets.motion.canonical import ground, mirror, resample, resample_quaternions
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -37,8 +37,8 @@ _ROUNDS = 6
 _MEASURED = 500
 """Frames, at least, of longer motions that the shapes are measured on, spread evenly."""
 _BUILT_ALIKE = 0.15
-"""Mean difference of the logarithms of bone lengths up to which two figures are built alike: bodies of SMPL differ
-by half of it, skeletons of other makers by twice as much."""
+"""Mean difference of the logarithms of bone lengths up to which two figures are built alike: bodies of SMPL
+differ by half of it, skeletons of other makers by twice as much."""
 _UPRIGHT = 0.8
 """Cosine of the angle up to which a chest is upright."""
 _STANDS = 0.3
@@ -153,7 +153,7 @@ def measured_skeleton(joints: NDArray[np.floating], skeleton: Skeleton) -> Skele
 
 
 def _leaning(points: Floats, own: Skeleton, skeleton: Skeleton) -> Skeleton:
-    """Of a figure that is not built as `skeleton` is: with the lean of its neck and the steepness of its feet.
+    """Of a figure that is not built as `skeleton`: with the lean of its neck and the steepness of its feet.
 
     Nobody sees a head's pitch in positions. With our neck's lean, a figure whose neck leans less looks up.
     """
@@ -181,14 +181,14 @@ def _leaning(points: Floats, own: Skeleton, skeleton: Skeleton) -> Skeleton:
 
 
 def flat_foot(ankle: Floats, ball: Floats, bone: Floats) -> Floats:
-    """The bone [3] from ankle to ball, as steep as it is in `ankle` and `ball` [T, 3] of a foot that stands."""
+    """The bone [3] from ankle to ball, as steep as between `ankle` and `ball` [T, 3] of a standing foot."""
     low = ankle[:, 1] <= np.quantile(ankle[:, 1], _STANDS)
     way, size = ball[low] - ankle[low], float(np.linalg.norm(bone))
     length = np.linalg.norm(way, axis=-1)
     steep = float(np.median(way[:, 1] / np.where(length > _NO_BONE, length, np.inf)))
     across = np.array([bone[0], 0.0, bone[2]])
     across *= np.sqrt(1 - steep**2) / max(float(np.linalg.norm(across)), _NO_BONE)
-    return np.asarray(size * (across + [0.0, steep, 0.0]))
+    return np.asarray(size * np.array([across[0], steep, across[2]]))
 
 
 def share_twist(rotations: Floats, skeleton: Skeleton) -> Floats:
@@ -232,6 +232,14 @@ def moved(figure: RigidMotion, turn: float, place: complex, height: float) -> Ri
     rotations = figure.rotations.copy()
     rotations[:, 0] = Rotation.from_euler("y", turn).as_matrix() @ rotations[:, 0]
     return replace(figure, rotations=rotations, root=put(figure.root), joints=put(figure.joints))
+
+
+def mirrored(figure: RigidMotion) -> RigidMotion:
+    """The figure's mirror image: left and right swapped, x negated."""
+    skeleton, flip = figure.skeleton, np.array([-1.0, 1.0, 1.0])
+    swapped = with_offsets(skeleton, skeleton.offsets[skeleton.mirror] * flip)
+    rotations = figure.rotations[:, skeleton.mirror] * np.outer(flip, flip)
+    return RigidMotion.posed(swapped, rotations, figure.root * flip, mirror(figure.joints, skeleton))
 
 
 def at_rate(figure: RigidMotion, fps_in: float, fps_out: float) -> RigidMotion:

@@ -163,7 +163,7 @@ def test_other_rates_bones_and_missing_hands_are_said(walk: Walk) -> None:
     tall = RecordedClip("tall", tall.joints[:, :22] * 1.2, 40.0)
     made = edit(editor(), tall, keep=ENDS)
     assert len(made.joints) == 60
-    for word in ("40 frames/s", "no hands", "no face"):
+    for word in ("40 frames/s", "hands are not recorded", "no face"):
         assert any(word in remark for remark in made.remarks)
     kept = np.r_[0:20, 40:60]
     np.testing.assert_allclose(made.joints[kept, :22], made.original.joints[kept, :22], atol=1e-9)
@@ -285,7 +285,7 @@ def test_long_and_slow_clips_are_refused_before_a_frame_is_made(
 def test_what_is_no_clip_is_refused(walk: Walk, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="walk: the figure measures"):
         require_clip(RecordedClip("walk", walk(frames=9) * 100, 20.0))
-    for name, words in (("none.npz", "no such file"), ("clip.fbx", "ends in .bvh, .npz, .glb")):
+    for name, words in (("none.npz", "no such file"), ("clip.fbx", "ends in .bvh, .amc, .npz, .glb")):
         with pytest.raises(UserError, match=name) as error:
             read_clip(tmp_path / name)
         assert words in str(error.value)
