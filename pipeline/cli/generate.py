@@ -12,7 +12,7 @@ from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.cli.options import At, Device, ModelFolder, Settings, settings_of
-from motionloom.pipeline.inference.writers import default_formats, formats_help
+from motionloom.pipeline.inference.writers import default_formats, figure_keys, figure_options, formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
 
@@ -68,7 +68,6 @@ def generate(
     from motionloom.datasets.audio.given_beats import in_words
     from motionloom.datasets.audio.sound import Excerpt
     from motionloom.pipeline.contract.sampling import SamplingConfig
-    from motionloom.pipeline.inference.display_figure import FigureOptions
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.outputs import page_note, page_title
     from motionloom.pipeline.inference.request import Request, require_words
@@ -76,10 +75,10 @@ def generate(
     from motionloom.pipeline.runs.snapshot import run_at
 
     fields, figure, more = settings_of(
-        settings, SamplingConfig.model_fields, FigureOptions.model_fields, ("face", "seed_motion")
+        settings, SamplingConfig.model_fields, figure_keys(), ("face", "seed_motion")
     )
-    posing, wanted = FigureOptions.parse(figure, "--set"), formats_of(formats)
-    posing.require_formats(wanted)
+    wanted = formats_of(formats)
+    posing = figure_options(figure, wanted)
     face, begun = more.get("face"), more.get("seed_motion")
     faces = None if face is None else [str(one) for one in (face if isinstance(face, list) else [face])]
     texts, songs = list(captions or []), audio or []

@@ -12,7 +12,7 @@ from motionloom.datasets.base.register import register
 from motionloom.pipeline.cli.generate import formats_of, print_note, write_files
 from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
 from motionloom.pipeline.contract.command import Command
-from motionloom.pipeline.inference.writers import formats_help
+from motionloom.pipeline.inference.writers import figure_keys, figure_options, formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
 
@@ -47,13 +47,12 @@ def edit(
     """
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.editing.task import EditTask
-    from motionloom.pipeline.inference.display_figure import FigureOptions
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.outputs import page_note
     from motionloom.pipeline.store.yaml import read_yaml
 
     sampling, figure, fields = settings_of(
-        settings, SamplingConfig.model_fields, FigureOptions.model_fields, EditTask.model_fields
+        settings, SamplingConfig.model_fields, figure_keys(), EditTask.model_fields
     )
     written = {} if task is None else read_yaml(task) or {}
     if not isinstance(written, dict):
@@ -62,7 +61,8 @@ def edit(
     if caption is not None:
         fields["caption"] = caption
     edits = EditTask.parse(fields, "task" if task is None else str(task))
-    wanted, posing = formats_of(formats), FigureOptions.parse(figure, "--set")
+    wanted = formats_of(formats)
+    posing = figure_options(figure, wanted)
     require_folder(out)
     aside = make_console(aside=True)  # standard output is the list of files
     model = MotionModel(run_folder, device)

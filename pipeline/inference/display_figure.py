@@ -6,15 +6,15 @@ do: they read the features' own joints (`GeneratedMotion.joints`).
 
 from __future__ import annotations
 
-from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from motionloom.datasets.base.config import Config
-from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.feet import FeetReport, foot_contacts, plant_feet
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.features.joints import rotations_of
@@ -31,15 +31,11 @@ class FigureOptions(Config):
     """Hold feet still where they stand (`datasets/motion/body/feet.py`)."""
     body_model: Path | None = None
     """Your SMPL-X model (.npz), which the files of format smplx are made for."""
+    more: dict[str, Any] = Field(default_factory=dict)
+    """Options that formats of others take, by name (`Writer.options`)."""
     arkit_bases: Path | None = None
     """Your two bases (.npz with `source` and `arkit`), which expressions become ARKit weights by; without,
     expressions are those of the synthetic face."""
-
-    def require_formats(self, formats: Container[str]) -> None:
-        """Refuse what only a format takes that is not written."""
-        for name, form in (("body_model", "smplx"), ("arkit_bases", "arkit")):
-            if getattr(self, name) is not None and form not in formats:
-                raise UserError(f"{name} is what --format {form} is made by: name that format too")
 
 
 @dataclass(frozen=True)

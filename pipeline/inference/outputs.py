@@ -67,6 +67,7 @@ def write_motions(
     names = [motion.caption for motion in motions] if names is None else names
     out: list[Path] = []
     clips: list[OutputClip] = []
+    said: dict[str, None] = {}
     with new_files(folder) as new:
         for number, (motion, score) in enumerate(zip(motions, scores, strict=True)):
             name = file_stem(number, names[number])
@@ -78,11 +79,14 @@ def write_motions(
             for _, writer in writers:
                 if writer.alone:
                     out.append(new / f"{name}{writer.suffix}")
-                    writer.write(out[-1], Outputs(clips[-1:], title, note))
+                    lacks = writer.write(out[-1], Outputs(clips[-1:], title, note)) or ()
+                    said.update(dict.fromkeys(lacks))
         for _, writer in writers:
             if writer.together and (len(clips) > 1 or not writer.alone):
                 out.append(new / writer.together)
-                writer.write(out[-1], Outputs(clips, title, note))
+                said.update(dict.fromkeys(writer.write(out[-1], Outputs(clips, title, note)) or ()))
+        for line in said if say is not None else ():
+            say(line)
         paths = [folder / path.name for path in out]
         if made_from is not None and any(path.exists() and path.samefile(made_from) for path in paths):
             raise UserError(f"{made_from}: would be replaced by a motion made from it; choose another folder")

@@ -7,7 +7,7 @@ A new format is one function and its `Writer`, registered: `generate --format`, 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -87,15 +87,18 @@ class Writer:
     """Media type, for the server's answers."""
     help: str
     """A few words for the help of `--format`."""
-    write: Callable[[Path, Outputs], object] = field(repr=False)
+    write: Callable[[Path, Outputs], Sequence[str] | None] = field(repr=False)
     """Writes the clips to the path; a single one, unless it is the file `together`. `clip.shown.joints` are
-    [T, N, 3] in metres, Y up. Raises `UserError` for motions that the format cannot hold."""
+    [T, N, 3] in metres, Y up. Returns sentences on what the file could not take, if any. Raises `UserError`
+    for motions that the format cannot hold."""
     together: str = ""
     """Name of the file that holds all motions; empty where each has only its own."""
     alone: bool = True
     """Whether each motion has a file of its own."""
     default: bool = False
     """Whether it is written where nobody names formats."""
+    options: Mapping[str, str] = field(default_factory=dict)
+    """Options that it alone takes (`--set`), with a few words on each; they come in `clip.options.more`."""
     needs_face: bool = False
     """Left out of what a server offers for motions without a face."""
 
@@ -240,8 +243,35 @@ def default_formats() -> list[str]:
 
 def formats_help() -> str:
     """The formats in one sentence of a command's help."""
-    names = [f"{name} ({writer.help})" for name, writer in WRITERS.items()]
+    names = []
+    for name, writer in WRITERS.items():
+        options = "".join(f"; --set {option}: {words}" for option, words in writer.options.items())
+        names.append(f"{name} ({writer.help}{options})")
     return f"Comma-separated, default {','.join(default_formats())}: {', '.join(names)}."
+
+
+_MADE_BY = {"body_model": "smplx", "arkit_bases": "arkit"}
+
+
+def figure_keys() -> list[str]:
+    """Keys of `FigureOptions`, and options of formats."""
+    from motionloom.pipeline.inference.display_figure import FigureOptions
+
+    own = [key for key in FigureOptions.model_fields if key != "more"]
+    return [*own, *(option for writer in WRITERS.values() for option in writer.options)]
+
+
+def figure_options(values: Mapping[str, object], formats: Sequence[str]) -> FigureOptions:
+    """The options of `figure_keys`; `UserError` where one is of a format that is not among `formats`."""
+    from motionloom.pipeline.inference.display_figure import FigureOptions
+
+    by_option = {option: name for name, writer in WRITERS.items() for option in writer.options}
+    for option, form in {**_MADE_BY, **by_option}.items():
+        if values.get(option) is not None and form not in formats:
+            raise UserError(f"{option} is what --format {form} is made by: name that format too")
+    own = {key: value for key, value in values.items() if key not in by_option}
+    more = {key: value for key, value in values.items() if key in by_option}
+    return FigureOptions.parse({**own, "more": more} if more else own, "--set")
 
 
 def known_format(name: str) -> str:

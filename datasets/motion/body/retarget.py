@@ -174,10 +174,10 @@ def on_bones(motion: RigidMotion, offsets: NDArray[np.floating]) -> RigidMotion:
         [[own.index(f"{side}_{name}") for name in ("ankle", "foot")] for side in ("left", "right")]
     )
     _, world = forward_kinematics(motion.rotations, motion.root, own.offsets, own.parents)
-    for joint in range(len(own)):
-        ends = [child for child, parent in enumerate(own.parents) if parent == joint]
-        if len(ends) == 1:
-            world[:, joint] = world[:, joint] @ _swing(skeleton.offsets[ends[0]], own.offsets[ends[0]])
+    for end in range(1, len(own)):
+        joint = own.parents[end]
+        if own.joints[joint].endswith(_LIMBS) or joint >= BODY_JOINTS:
+            world[:, joint] = world[:, joint] @ _swing(skeleton.offsets[end], own.offsets[end])
     local = _local(world, np.asarray(own.parents))
     scale = skeleton.rest_joints[feet, 1].mean() / own.rest_joints[feet, 1].mean()
     targets, _ = forward_kinematics(local, motion.root * scale, skeleton.offsets, skeleton.parents)
@@ -221,7 +221,7 @@ def with_hands(figure: RigidMotion) -> RigidMotion:
 
 def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, bool]:
     """From our rest pose to the axes of the source's joints [N, 3, 3]; whether its rest pose says them."""
-    ahead = _ahead(source.rest, own)
+    ahead = upright_turn(source.rest, own)
     if _stands(source.rest @ ahead.T, own):
         return np.repeat(ahead.T[None], len(own), axis=0), True
     points, turns = source.joints[seen], source.turns[seen]
@@ -265,7 +265,7 @@ def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, 
     return axes, False
 
 
-def _ahead(rest: Floats, skeleton: Skeleton) -> Floats:
+def upright_turn(rest: Floats, skeleton: Skeleton) -> Floats:
     """The rotation that turns a rest pose to stand upright and look ahead; between axes where it can be."""
     names = ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
     hips, shoulders = np.split(rest[[skeleton.index(name) for name in names]], 2)

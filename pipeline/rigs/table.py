@@ -1,0 +1,9 @@
+"""The formats and the converter of this folder: which module registers each."""
+
+from __future__ import annotations
+
+from motionloom.datasets.base.register import declare
+
+_HERE = "motionloom.pipeline.rigs"
+
+declare("writer", dict.fromkeys(("vrma", "rig"), f"{_HERE}.formats"))
