@@ -10,6 +10,7 @@ from pathlib import Path
 from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.files import write_text
+from motionloom.datasets.base.register import discover
 from motionloom.pipeline.inference.display_figure import FigureOptions, shown
 from motionloom.pipeline.inference.motion_data import MotionData
 from motionloom.pipeline.inference.writers import WRITERS, OutputClip, Outputs, cell_of, writer_for
@@ -99,6 +100,7 @@ def write_motions(
 
 def require_formats(formats: Sequence[str]) -> None:
     """Refuse names of formats that there are not, and none at all."""
+    discover()
     if not formats or isinstance(formats, str):
         raise UserError(f"formats {formats!r}: give a list of some; known: {', '.join(WRITERS)}")
     for name in formats:

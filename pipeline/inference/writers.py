@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import AfterValidator
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.register import Table, register
+from motionloom.datasets.base.register import Table, discover, register
 
 if TYPE_CHECKING:
     import numpy as np
@@ -265,6 +265,7 @@ def figure_options(values: Mapping[str, object], formats: Sequence[str]) -> Figu
     """The options of `figure_keys`; `UserError` where one is of a format that is not among `formats`."""
     from motionloom.pipeline.inference.display_figure import FigureOptions
 
+    discover()
     by_option = {option: name for name, writer in WRITERS.items() for option in writer.options}
     for option, form in {**_MADE_BY, **by_option}.items():
         if values.get(option) is not None and form not in formats:
@@ -287,6 +288,7 @@ Format = Annotated[str, AfterValidator(known_format)]
 
 def writer_for(path: Path) -> Writer:
     """The format of a file's ending; `UserError` where there is none."""
+    discover()
     fitting = [writer for writer in WRITERS.values() if path.name.lower().endswith(writer.suffix)]
     if not fitting:
         known = ", ".join(writer.suffix for writer in WRITERS.values())

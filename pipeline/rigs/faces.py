@@ -27,8 +27,8 @@ def face_values(clip: OutputClip) -> dict[str, Floats]:
 def face_tracks(gltf: Gltf, values: dict[str, Floats]) -> dict[tuple[int, str], Floats]:
     """Weights [T, S] of the shapes of each node whose mesh has some that are known.
 
-    A mesh with ARKit's shapes moves by these alone, another by what its VRM expressions bind, or by the names of
-    its shapes.
+    A mesh with ARKit's shapes moves by these alone, another by what its VRM expressions bind, or by its
+    shapes' names.
     """
     if not values:
         return {}

@@ -5,9 +5,9 @@ world rotation of its node at rest and `H` the turn that makes the character loo
 
     node(t) = H^-1 G(t) A^-1 H R
 
-Its own bones are measured first and the motion is put on them (`retarget.on_bones`), so that steps are as long
-as its legs and feet are on its floor. Rotations are the world's: what a joint that it lacks would turn, its
-children turn.
+Its own bones are measured first and the motion is put on them (`retarget.on_bones`), so that steps are as
+long as its legs and feet are on its floor. Rotations are the world's: what a joint that it lacks would turn,
+its children turn.
 """
 
 from __future__ import annotations

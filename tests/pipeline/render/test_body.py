@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +14,7 @@ from typing import Any
 import numpy as np
 import pygltflib
 import pytest
+from gltf_validator import validated
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -326,27 +325,6 @@ def test_a_head_can_carry_all_of_arkits_shapes(clips: list[GlbClip], tmp_path: P
     channel = next(c for c in gltf.animations[0].channels if c.target.path == "weights")
     keys = gltf.animations[0].samplers[channel.sampler].output
     np.testing.assert_allclose(values(gltf, keys).reshape(40, 52), weights, atol=1e-6)
-
-
-VALIDATE = """
-import { pathToFileURL } from "node:url";
-import fs from "node:fs";
-const { default: validator } = await import(pathToFileURL(process.argv[1]).href);
-const report = await validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])));
-console.log(JSON.stringify(report));
-"""
-
-
-def validated(path: Path) -> dict[str, Any]:
-    """The validator's report; skips where it is not: `MOTIONLOOM_NODE_MODULES` names a folder that has it."""
-    module = Path(os.environ.get("MOTIONLOOM_NODE_MODULES", "")) / "gltf-validator" / "index.js"
-    node = shutil.which("node")
-    if node is None or not module.is_file():
-        pytest.skip("MOTIONLOOM_NODE_MODULES names no folder with gltf-validator, or there is no node")
-    command = [node, "--input-type=module", "-e", VALIDATE, str(module), str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    report: dict[str, Any] = json.loads(done.stdout)
-    return report
 
 
 @pytest.mark.browser

@@ -1,0 +1,401 @@
+"""Motions on characters of others, by kinematics of the test's own, Khronos' validator and three-vrm."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gltf_validator import validated
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.motion.body.expressions import APEX, BASIS
+from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid, with_offsets
+from motionloom.datasets.motion.kinematics import forward_kinematics
+from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.skeleton import Skeleton
+from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.motion import GeneratedMotion
+from motionloom.pipeline.inference.outputs import write_motions
+from motionloom.pipeline.inference.writers import figure_options
+from motionloom.pipeline.rigs.gltf import Gltf
+from motionloom.pipeline.rigs.names import HUMANOID
+from motionloom.pipeline.rigs.rig import Rig
+from motionloom.pipeline.rigs.vrma import t_pose
+
+Floats = NDArray[np.float64]
+OURS = Skeleton.named("smplx52")
+_MIXAMO = {
+    "pelvis": "Hips", "spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2", "neck": "Neck",
+    "head": "Head", "hip": "UpLeg", "knee": "Leg", "ankle": "Foot", "foot": "ToeBase", "collar": "Shoulder",
+    "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand",
+}  # fmt: skip
+_RIGIFY = {
+    "pelvis": "spine", "spine1": "spine.001", "spine2": "spine.002", "spine3": "spine.003",
+    "neck": "spine.004", "head": "spine.006", "hip": "thigh", "knee": "shin", "ankle": "foot", "foot": "toe",
+    "collar": "shoulder", "shoulder": "upper_arm", "elbow": "forearm", "wrist": "hand",
+}  # fmt: skip
+_UNREAL = {
+    "pelvis": "pelvis", "spine1": "spine_01", "spine2": "spine_02", "spine3": "spine_03", "neck": "neck_01",
+    "head": "head", "hip": "thigh", "knee": "calf", "ankle": "foot", "foot": "ball", "collar": "clavicle",
+    "shoulder": "upperarm", "elbow": "lowerarm", "wrist": "hand",
+}  # fmt: skip
+
+
+def named(maker: str, joint: str) -> str:
+    """A maker's word for one of our joints."""
+    side, _, word = joint.partition("_") if joint.startswith(("left", "right")) else ("", "", joint)
+    finger, number = word[:-1], word[-1]
+    is_finger = finger in ("index", "middle", "pinky", "ring", "thumb")
+    if maker == "mixamo":
+        word = f"Hand{finger.title()}{number}" if is_finger else _MIXAMO[word]
+        return f"mixamorig:{side.title()}{word}"
+    if maker == "rigify":
+        word = f"{'thumb' if finger == 'thumb' else 'f_' + finger}.0{number}" if is_finger else _RIGIFY[word]
+        return f"DEF-{word}" + (f".{side[0].upper()}" if side else "")
+    if maker == "unreal":
+        word = f"{finger}_0{number}" if is_finger else _UNREAL[word]
+        return word + (f"_{side[0]}" if side else "")
+    return {ours: bone for bone, ours in HUMANOID.items()}[joint]
+
+
+def character(
+    path: Path, maker: str, *, lacks: tuple[str, ...] = (), scale: float = 1.0, seed: int = 0
+) -> dict[str, int]:
+    """Write a character of 1.15 our size, rest axes at random, a triangle for its skin; returns its nodes.
+
+    `maker` vrm0 looks along -Z, unreal lies on its back below a root that raises it and hangs its arms,
+    mixamo is in centimetres below a node of scale 0.01.
+    """
+    rng = np.random.default_rng(seed)
+    places = 1.15 * with_offsets(OURS, t_pose(OURS)).rest_joints + [0.0, 1.05, 0.0]
+    if maker == "unreal":
+        for side, sign in (("left", -1), ("right", 1)):
+            root = places[OURS.index(f"{side}_shoulder")].copy()
+            hang = Rotation.from_euler("z", 40 * sign, degrees=True)
+            below = [
+                j
+                for j, name in enumerate(OURS.joints)
+                if name.startswith(side) and (j > 21 or name[-5:] in ("elbow", "wrist"))
+            ]
+            places[below] = root + hang.apply(places[below] - root)
+    if maker == "vrm0":
+        places = places * [-1.0, 1.0, -1.0]
+    turns = Rotation.random(52, rng=rng).as_matrix() if maker != "vrm0" else np.tile(np.eye(3), (52, 1, 1))
+    lying = Rotation.from_euler("x", -90, degrees=True)  # Z up, raised again by the root
+    frame = lying.as_matrix() if maker == "unreal" else np.eye(3)
+    unit = 0.01 if maker == "mixamo" else 1.0
+    raised = Rotation.from_matrix(frame).as_quat().tolist()
+    nodes: list[dict[str, Any]] = [{"name": "root", "rotation": raised, "scale": [unit] * 3}]
+    kept = [joint for joint, name in enumerate(OURS.joints) if name not in lacks]
+    row = {joint: number for number, joint in enumerate(kept, 1)}
+    out: dict[str, int] = {}
+    for joint in kept:
+        parent = OURS.parents[joint]
+        while parent >= 0 and parent not in row:
+            parent = OURS.parents[parent]
+        above_turn = turns[parent] if parent >= 0 else frame
+        above = places[parent] if parent >= 0 else np.zeros(3)
+        local = above_turn.T @ turns[joint]
+        nodes.append({
+            "name": named(maker, OURS.joints[joint]),
+            "translation": (above_turn.T @ (places[joint] - above) / unit).tolist(),
+            "rotation": Rotation.from_matrix(local).as_quat().tolist(),
+        })  # fmt: skip
+        nodes[row[parent] if parent >= 0 else 0].setdefault("children", []).append(row[joint])
+        out[OURS.joints[joint]] = row[joint]
+    low = places[:, 1].min() - 0.03
+    blob = np.array(
+        [[0, low, 0], [0.1, 1, 0], [0, 1, 0.1], *np.zeros((3, 3)), [0, 0.1, 0], [0, 0, 0], [0, 0, 0]], "<f4"
+    )
+    nodes.append({"name": "skin", "mesh": 0})
+    accessors = [
+        {"bufferView": 0, "byteOffset": 36 * n, "componentType": 5126, "count": 3, "type": "VEC3",
+         "min": part.min(axis=0).tolist(), "max": part.max(axis=0).tolist()}
+        for n, part in ((0, blob[:3]), (2, blob[6:]))
+    ]  # fmt: skip
+    primitive = {"attributes": {"POSITION": 0}, "targets": [{"POSITION": 1}, {"POSITION": 1}]}
+    mesh = {"primitives": [primitive], "extras": {"targetNames": ["mouthSmile", "Blink"]}}
+    data: dict[str, Any] = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, len(nodes) - 1]}], "nodes": nodes,
+        "meshes": [mesh], "accessors": accessors, "buffers": [{"byteLength": blob.nbytes}],
+        "bufferViews": [{"buffer": 0, "byteLength": blob.nbytes, "byteStride": 12}],
+    }  # fmt: skip
+    bones = {named("vrm", joint): {"node": node} for joint, node in out.items()}
+    bind = {"node": len(nodes) - 1, "index": 0, "weight": 1.0}
+    meta = {"name": "made", "authors": ["a test"], "licenseUrl": "https://vrm.dev/licenses/1.0/"}
+    if maker == "vrm1":
+        mesh.pop("extras")
+        about = {"specVersion": "1.0", "meta": meta, "humanoid": {"humanBones": bones}}
+        data["extensions"] = {
+            "VRMC_vrm": about | {"expressions": {"preset": {"happy": {"morphTargetBinds": [bind]}}}}
+        }
+        data["extensionsUsed"] = ["VRMC_vrm"]
+    if maker == "vrm0":
+        old = [
+            {
+                "bone": bone.replace("ThumbProximal", "ThumbIntermediate").replace("Metacarpal", "Proximal"),
+                **place,
+            }
+            for bone, place in bones.items()
+        ]
+        groups = [{"name": "Joy", "presetName": "joy", "binds": [{"mesh": 0, "index": 0, "weight": 50}]}]
+        data["extensions"] = {
+            "VRM": {
+                "specVersion": "0.0",
+                "meta": {"title": "made"},
+                "materialProperties": [],
+                "humanoid": {"humanBones": old},
+                "blendShapeMaster": {"blendShapeGroups": groups},
+            }
+        }
+        data["extensionsUsed"] = ["VRM"]
+    write(path, data, blob.tobytes())
+    return out
+
+
+def write(path: Path, data: dict[str, Any], blob: bytes) -> None:
+    text = json.dumps(data).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(blob), 0x004E4942) + blob
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+
+
+def played(gltf: Gltf, animation: int = 0) -> tuple[Floats, Floats]:
+    """World places [T, N, 3] and rotations [T, N, 3, 3] of all nodes, by the test's own kinematics."""
+    tracks: dict[tuple[int, str], Floats] = {}
+    about = gltf.json["animations"][animation]
+    for channel in about["channels"]:
+        keys = gltf.values(about["samplers"][channel["sampler"]]["output"])
+        tracks[channel["target"]["node"], channel["target"]["path"]] = keys
+    frames = max(len(keys) for (_, path), keys in tracks.items() if path != "weights")
+    worlds = np.tile(np.eye(4), (frames, len(gltf.parents), 1, 1))
+    for node in gltf.in_order():
+        place, turn, scale = gltf.local(node)
+        moved = np.broadcast_to(tracks.get((node, "translation"), place[None]), (frames, 3))
+        quaternions = tracks.get((node, "rotation"))
+        turned = np.tile(turn, (frames, 1, 1))
+        if quaternions is not None:
+            turned[:] = Rotation.from_quat(quaternions).as_matrix()
+        worlds[:, node, :3, :3] = turned * scale
+        worlds[:, node, :3, 3] = moved
+        if gltf.parents[node] >= 0:
+            worlds[:, node] = worlds[:, gltf.parents[node]] @ worlds[:, node]
+    size = np.linalg.norm(worlds[..., :3, :3], axis=-2, keepdims=True)
+    return worlds[..., :3, 3], worlds[..., :3, :3] / size
+
+
+@pytest.fixture
+def motion(walk: Callable[..., Floats]) -> GeneratedMotion:
+    """A walk with moving fingers, a turning head, and a face that smiles more and more."""
+    figure = fit_rigid(walk(40), OURS)
+    rotations = figure.rotations.copy()
+    sway = 0.4 * np.sin(np.arange(40) / 5)
+    rotations[:, OURS.index("head")] = Rotation.from_euler("y", sway[:, None]).as_matrix()
+    for joint in range(22, 52):
+        rotations[:, joint] = Rotation.from_rotvec(np.outer(sway, [0.3, 0.2, 1.0])).as_matrix()
+    joints, _ = forward_kinematics(rotations, figure.root, figure.skeleton.offsets, OURS.parents)
+    figure = RigidMotion.posed(figure.skeleton, rotations, figure.root, joints)
+    face = (APEX * np.linspace(0, 1, 40)[:, None] * BASIS[:, 0]).astype(np.float32)
+    layout = MotionLayout.named("wholebody363", fps=20.0)
+    return GeneratedMotion(
+        Prompt("a person walks"), np.zeros((40, layout.dim - 50), np.float32), figure.joints, face, layout,
+        figure=figure,
+    )  # fmt: skip
+
+
+def angles(one: Floats, other: Floats) -> Floats:
+    both = (one * other).sum(axis=-1) / np.linalg.norm(one, axis=-1) / np.linalg.norm(other, axis=-1)
+    return np.degrees(np.arccos(np.clip(both, -1, 1)))
+
+
+@pytest.mark.parametrize("maker", ["vrm0", "vrm1", "mixamo", "rigify", "unreal"])
+def test_a_character_moves_as_the_motion_does(tmp_path: Path, motion: GeneratedMotion, maker: str) -> None:
+    lacks = ("left_foot", "right_foot", "spine2") if maker == "vrm1" else ()
+    nodes = character(tmp_path / "hero.glb", maker, lacks=lacks)
+    said: list[str] = []
+    options = figure_options({"rig": str(tmp_path / "hero.glb")}, ["rig"])
+    [path] = write_motions(tmp_path / "out", [motion], ["rig"], title="", figure=options, say=said.append)
+    assert bool(lacks) == any("left_foot" in line for line in said)
+    gltf = Gltf.read(path)
+    places, turns = played(gltf)
+    rest, rest_turns = (one[0] for one in played_at_rest(gltf))
+    figure = motion.figure
+    assert figure is not None
+    front = np.diag([-1.0, 1.0, -1.0]) if maker == "vrm0" else np.eye(3)
+    # Limbs and fingers point where they do in the motion.
+    for joint, parent in enumerate(OURS.parents):
+        name = OURS.joints[parent]
+        if (
+            not (name.endswith(("hip", "knee", "shoulder", "elbow")) or parent >= 22)
+            or OURS.joints[joint] in lacks
+        ):
+            continue
+        bone = places[:, nodes[OURS.joints[joint]]] - places[:, nodes[name]]
+        assert angles(bone @ front.T, figure.joints[:, joint] - figure.joints[:, parent]).max() < 1, (
+            OURS.joints[joint]
+        )
+    # Head, hips and feet are turned as they are in the motion.
+    _, world = forward_kinematics(figure.rotations, figure.root, figure.skeleton.offsets, OURS.parents)
+    for name in ("head", "pelvis", "left_ankle", *(() if lacks else ("right_foot",))):
+        node, joint = nodes[name], OURS.index(name)
+        turned = front @ turns[:, node] @ rest_turns[node].T @ front.T
+        assert angles(turned[..., 2], world[:, joint, :, 2]).max() < (1 if "ankle" not in name else 6)
+    # Its feet reach its floor, and it goes as much farther as its legs are longer.
+    low = places[:, [nodes["left_ankle"], nodes["right_ankle"]], 1].min()
+    assert abs(low - rest[[nodes["left_ankle"], nodes["right_ankle"]], 1].min()) < 0.04
+    way = [
+        np.linalg.norm(one[-1, [0, 2]] - one[0, [0, 2]]) for one in (places[:, nodes["pelvis"]], figure.root)
+    ]
+    assert way[0] / way[1] == pytest.approx(
+        1.15 * OURS.rest_joints[7, 1] / figure.skeleton.rest_joints[7, 1], rel=0.05
+    )
+    weights = [c for c in gltf.json["animations"][0]["channels"] if c["target"]["path"] == "weights"]
+    keys = gltf.values(gltf.json["animations"][0]["samplers"][weights[0]["sampler"]]["output"]).reshape(40, 2)
+    assert keys[-1, 0] == pytest.approx(0.5 if maker == "vrm0" else 1.0, abs=0.01) and keys[0, 0] == 0
+    messages = validated(path)["issues"]["messages"]
+    assert [one for one in messages if one["severity"] < 1] == []
+
+
+def played_at_rest(gltf: Gltf) -> tuple[Floats, Floats]:
+    worlds = gltf.worlds()[None]
+    size = np.linalg.norm(worlds[..., :3, :3], axis=-2, keepdims=True)
+    return worlds[..., :3, 3], worlds[..., :3, :3] / size
+
+
+def test_names_of_ones_own(tmp_path: Path) -> None:
+    nodes = character(tmp_path / "hero.glb", "mixamo")
+    data = Gltf.read(tmp_path / "hero.glb")
+    for number, node in enumerate(data.json["nodes"]):
+        node["name"] = f"bone {number}"
+    data.write(tmp_path / "odd.glb")
+    with pytest.raises(UserError, match=r"no node for pelvis, head.* and more: name them in a JSON file"):
+        Rig.read(tmp_path / "odd.glb")
+    (tmp_path / "map.json").write_text(json.dumps({joint: f"bone {node}" for joint, node in nodes.items()}))
+    assert Rig.read(tmp_path / "odd.glb", tmp_path / "map.json").nodes == nodes
+    (tmp_path / "map.json").write_text('{"pelvis": "bone 1000"}')
+    with pytest.raises(UserError, match=r"pelvis: .* has no single node 'bone 1000'"):
+        Rig.read(tmp_path / "odd.glb", tmp_path / "map.json")
+    with pytest.raises(UserError, match="what --format rig is made by"):
+        figure_options({"rig": "x.vrm"}, ["npz"])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda d: d["nodes"][1].update(children=[0]), "circle|two others"),
+        (lambda d: d["nodes"][1].update(children=[999]), "two others, or is none"),
+        (lambda d: d.update(nodes=[]), "0 nodes"),
+        (lambda d: d.update(nodes=3), "not a glTF scene"),
+        (lambda d: d["nodes"][2].update(translation=["a", 0, 0]), "no place"),
+        (lambda d: d.pop("nodes"), "nodes"),
+    ],
+)
+def test_broken_characters_are_refused_in_a_sentence(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], said: str
+) -> None:
+    character(tmp_path / "hero.glb", "mixamo")
+    gltf = Gltf.read(tmp_path / "hero.glb")
+    change(gltf.json)
+    write(tmp_path / "broken.glb", gltf.json, bytes(gltf.blob))
+    with pytest.raises(UserError, match=said):
+        Rig.read(tmp_path / "broken.glb")
+    whole = (tmp_path / "hero.glb").read_bytes()
+    for cut in (0, 11, 19, 40, len(whole) - 5):
+        (tmp_path / "cut.glb").write_bytes(whole[:cut])
+        with pytest.raises(UserError):
+            Rig.read(tmp_path / "cut.glb")
+
+
+def test_a_vrm_animation_holds_the_motion(tmp_path: Path, motion: GeneratedMotion) -> None:
+    [path] = write_motions(tmp_path, [motion], ["vrma"], title="")
+    gltf = Gltf.read(path)
+    places, _ = played(gltf)
+    about = gltf.json["extensions"]["VRMC_vrm_animation"]
+    bones = {HUMANOID[bone]: place["node"] for bone, place in about["humanoid"]["humanBones"].items()}
+    assert set(bones) == set(OURS.joints) and about["specVersion"] == "1.0"
+    figure = motion.figure
+    assert figure is not None
+    for joint, parent in enumerate(OURS.parents):
+        if OURS.joints[parent].endswith(("hip", "knee", "shoulder", "elbow")) or parent >= 22:
+            bone = places[:, bones[OURS.joints[joint]]] - places[:, bones[OURS.joints[parent]]]
+            assert angles(bone, figure.joints[:, joint] - figure.joints[:, parent]).max() < 1
+    happy = about["expressions"]["preset"]["happy"]["node"]
+    assert places[-1, happy, 0] == pytest.approx(1, abs=0.01) and len(about["expressions"]["custom"]) == 52
+    assert [one for one in validated(path)["issues"]["messages"] if one["severity"] < 2] == []
+
+
+PLAY = """
+import * as THREE from 'three';
+import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
+import { VRMLoaderPlugin } from '@pixiv/three-vrm';
+import { VRMAnimationLoaderPlugin, createVRMAnimationClip } from '@pixiv/three-vrm-animation';
+const loader = new GLTFLoader();
+loader.register((parser) => new VRMLoaderPlugin(parser));
+loader.register((parser) => new VRMAnimationLoaderPlugin(parser));
+const vrm = (await loader.loadAsync('hero.vrm')).userData.vrm;
+const clip = createVRMAnimationClip((await loader.loadAsync('motion.vrma')).userData.vrmAnimations[0], vrm);
+const mixer = new THREE.AnimationMixer(vrm.scene);
+mixer.clipAction(clip).play();
+mixer.setTime(1.0);
+vrm.update(0);
+vrm.scene.updateMatrixWorld(true);
+const node = (bone) => vrm.humanoid.getRawBoneNode(bone);
+const place = (bone) => node(bone).getWorldPosition(new THREE.Vector3()).toArray();
+const names = ['leftUpperArm', 'leftLowerArm', 'leftHand', 'rightUpperLeg', 'rightLowerLeg', 'rightFoot'];
+window.places = Object.fromEntries(names.map((name) => [name, place(name)]));
+window.happy = vrm.expressionManager?.getValue('happy');
+"""
+
+
+@pytest.fixture(scope="module")
+def browser_arguments() -> list[str]:
+    return ["--no-sandbox", "--disable-gpu", "--allow-file-access-from-files"]
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("maker", ["vrm0", "vrm1"])
+def test_three_vrm_plays_it(tmp_path: Path, motion: GeneratedMotion, maker: str, browser: Any) -> None:
+    modules = Path(os.environ.get("MOTIONLOOM_NODE_MODULES", ""))
+    if not (modules / "@pixiv/three-vrm-animation").is_dir():
+        pytest.skip("MOTIONLOOM_NODE_MODULES names no folder with three and @pixiv/three-vrm-animation")
+    character(tmp_path / "hero.vrm", maker)
+    motion.save(tmp_path / "motion.vrma")
+    folders = {"three": "three/build/three.module.js", "three/addons/": "three/examples/jsm/"}
+    folders |= {
+        f"@pixiv/{name}": f"@pixiv/{name}/lib/{name}.module.js"
+        for name in ("three-vrm", "three-vrm-animation")
+    }
+    places = json.dumps(
+        {
+            "imports": {
+                name: (modules / place).as_uri() + "/" * name.endswith("/") for name, place in folders.items()
+            }
+        }
+    )
+    page = f'<script type="importmap">{places}</script><script type="module">{PLAY}</script>'
+    (tmp_path / "page.html").write_text(page)
+    tab = browser.new_page()
+    tab.goto((tmp_path / "page.html").as_uri())
+    tab.wait_for_function("window.places", timeout=60_000)
+    seen, happy = tab.evaluate("[window.places, window.happy]")
+    front = np.diag([-1.0, 1.0, -1.0]) if maker == "vrm0" else np.eye(3)
+    figure = motion.figure
+    assert figure is not None
+    for upper, lower in (
+        ("leftUpperArm", "leftLowerArm"),
+        ("leftLowerArm", "leftHand"),
+        ("rightUpperLeg", "rightLowerLeg"),
+        ("rightLowerLeg", "rightFoot"),
+    ):
+        bone = front @ (np.array(seen[lower]) - seen[upper])
+        ours = [figure.joints[20, OURS.index(HUMANOID[name])] for name in (lower, upper)]
+        assert angles(bone, ours[0] - ours[1]) < 1, lower
+    assert happy == pytest.approx(20 / 39, abs=0.02)
