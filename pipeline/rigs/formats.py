@@ -20,11 +20,23 @@ def _write_rig(path: Path, outputs: Outputs) -> list[str]:
     return write_rig(path, outputs)
 
 
+def _write_page(path: Path, outputs: Outputs) -> list[str]:
+    from motionloom.pipeline.rigs.page import write_rig_page
+
+    return write_rig_page(path, outputs)
+
+
 _GLB = "model/gltf-binary"
 register(Writer("vrma", ".vrma", _GLB, "VRM animation, for any VRM character", _write_vrma))
 register(
     Writer(
         "rig", "_rig.glb", _GLB, "your own character, as GLB", _write_rig, "rig.glb",
         options={"rig": "your .vrm or .glb", "rig_map": "names of its joints (JSON)"},
+    )
+)  # fmt: skip
+register(
+    Writer(
+        "rig-page", "_rig.html", "text/html; charset=utf-8", "a page with your own character (--set rig)",
+        _write_page, "rig.html", False,
     )
 )  # fmt: skip

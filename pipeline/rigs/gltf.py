@@ -190,6 +190,11 @@ class Gltf:
 
     def write(self, path: Path) -> None:
         """Write the file, whole or not at all."""
+        with atomic_file(path) as file:
+            file.write(self.to_bytes())
+
+    def to_bytes(self) -> bytes:
+        """The file."""
         self.blob += bytes(-len(self.blob) % 4)
         self.json["buffers"] = [{"byteLength": len(self.blob)}]
         text = json.dumps(self.json, ensure_ascii=False, separators=(",", ":")).encode()
@@ -197,8 +202,7 @@ class Gltf:
         chunks = struct.pack("<II", len(text), _JSON) + text
         if self.blob:
             chunks += struct.pack("<II", len(self.blob), _BIN) + bytes(self.blob)
-        with atomic_file(path) as file:
-            file.write(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def _without_flips(turns: Floats) -> Floats:

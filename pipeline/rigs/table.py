@@ -6,4 +6,4 @@ from motionloom.datasets.base.register import declare
 
 _HERE = "motionloom.pipeline.rigs"
 
-declare("writer", dict.fromkeys(("vrma", "rig"), f"{_HERE}.formats"))
+declare("writer", dict.fromkeys(("vrma", "rig", "rig-page"), f"{_HERE}.formats"))
