@@ -35,6 +35,7 @@ FENCE = (
     "pipeline/baselines",
     "pipeline/curation",
     "pipeline/editing",
+    "pipeline/rigs",
     "pipeline/songs",
     "datasets/convert/sets",
 )

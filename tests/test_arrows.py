@@ -24,6 +24,7 @@ FENCE = (
     "pipeline/baselines",
     "pipeline/curation",
     "pipeline/editing",
+    "pipeline/rigs",
     "pipeline/songs",
     "datasets/convert/sets",
 )
@@ -154,7 +155,7 @@ def test_no_room_imports_itself_by_way_of_others() -> None:
 
 
 FLOORS = {
-    "pipeline": "curation editing songs "
+    "pipeline": "curation editing rigs songs "
     "cli serve runs baselines stages results evaluation training inference contract store render launch",
     "models": "utt diffusion gpt tokenizer pretrained tma evaluator quantize discriminator "
     "condition metrics training layers",

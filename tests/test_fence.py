@@ -13,6 +13,7 @@ FENCE = (
     "pipeline/baselines",
     "pipeline/curation",
     "pipeline/editing",
+    "pipeline/rigs",
     "pipeline/songs",
     "datasets/convert/sets",
 )
