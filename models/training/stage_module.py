@@ -17,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Self, TypedDict
 
@@ -228,8 +228,9 @@ class StageModule(L.LightningModule, ABC):
             return super().load_from_checkpoint(
                 checkpoint_path, map_location, hparams_file, strict, weights_only, **arguments
             )
-        # Kinds of stages stand on the floor above, which only this needs.
-        rebuild = import_module("motionloom.pipeline.training.lightning_data").rebuild
+        # Who knows kinds of stages stands on the floor above, and is found as a package's plugin is.
+        (who,) = entry_points(group="motionloom.checkpoints", name="stage")
+        rebuild = who.load()
         content = torch.load(checkpoint_path, map_location or "cpu", weights_only=True)
         module = rebuild(content, checkpoint_path, arguments.get("inputs", {}))
         if not isinstance(module, cls):

@@ -201,8 +201,9 @@ class StageContext:
     again: Path | None = None
     """The run, where a stage is run outside of it, finished or not (`motionloom report`); then inputs may be
     missing, and times may be shown. Within a run equal stages give equal outputs."""
-    draws: bool = False
-    """Whether motions can be drawn while it trains."""
+    draws: tuple[str, ...] = ()
+    """Command that draws motions while it trains, to be given the run and the stage; empty where none can be
+    drawn."""
     begun: Callable[[], None] = _nothing
     """Called by a training once its checkpoint has been loaded: until then the folder says what it said."""
 

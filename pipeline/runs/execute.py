@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
@@ -37,6 +38,10 @@ from motionloom.pipeline.store.yaml import flatten
 
 LOCKS = ".locks"
 """In the run folder: a lock file for each stage."""
+
+
+_DRAWING = (sys.executable, "-P", "-m", "motionloom.pipeline.runs.samples")
+"""Draws motions of a training's newest checkpoint, in a process of its own."""
 
 
 def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Console) -> list[str]:
@@ -182,7 +187,7 @@ def context_of(
         stage_cache=StageCache(recipe.hardware.device()) if stage_cache is None else stage_cache,
         rank=team.rank,
         world=team.world,
-        draws=draws_motions(recipe, stage),
+        draws=_DRAWING if draws_motions(recipe, stage) else (),
     )
 
 

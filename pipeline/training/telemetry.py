@@ -290,10 +290,6 @@ class StepProgress:
             self._bar.stop()
 
 
-_PROGRAM = "motionloom.pipeline.runs.samples"
-"""Module of a layer above, imported by the new process alone."""
-
-
 class SampleProcess:
     """Starts processes that draw samples, one at a time; the training does not wait for them."""
 
@@ -316,7 +312,7 @@ class SampleProcess:
             with open_own(log, "wb") as file:
                 # A session of its own: what signals the training's group does not reach it.
                 self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-m", _PROGRAM, str(run), self.context.name],
+                    [*self.context.draws, str(run), self.context.name],
                     stdin=subprocess.DEVNULL,
                     stdout=file,
                     stderr=file,

@@ -22,7 +22,7 @@ from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.aistpp.accompaniment import GENRES, TEMPI, song_for
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
-from motionloom.datasets.convert.common.body import SOUND_SUFFIXES, BodyConfig, BodyRelease, analyse, cut_of
+from motionloom.datasets.convert.amass.body import SOUND_SUFFIXES, BodyConfig, BodyRelease, analyse, cut_of
 from motionloom.datasets.convert.common.files import files_in
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip

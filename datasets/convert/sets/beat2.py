@@ -17,8 +17,8 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import number
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
+from motionloom.datasets.convert.amass.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.arrays import check_values
-from motionloom.datasets.convert.common.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import files_in, is_there, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan

@@ -15,8 +15,8 @@ import numpy as np
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Split
 from motionloom.datasets.base.register import register
+from motionloom.datasets.convert.amass.body import SOURCE_FPS, BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
-from motionloom.datasets.convert.common.body import SOURCE_FPS, BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import files_in, is_there
 from motionloom.datasets.convert.common.plan import ConversionPlan

@@ -16,7 +16,7 @@ from dataclasses import replace
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
-from motionloom.datasets.convert.common.body import BodyConfig, BodyRelease
+from motionloom.datasets.convert.amass.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
 from motionloom.datasets.convert.common.files import inside, is_there, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
