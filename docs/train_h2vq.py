@@ -135,9 +135,8 @@ def validate(net: H2VQ, clips: ShardDataset, stats: FeatureStats) -> float:
         motion = np.asarray(clips.motion(number))[:, columns]
         motion = motion[: len(motion) // 4 * 4]  # tokens are of groups of four frames
         x = torch.from_numpy(stats.normalize(motion, columns))[None].to(device)
-        present = torch.from_numpy(clips.layout.present_columns[clips.present[number], columns])[None].to(
-            device
-        )
+        held = clips.layout.present_columns[clips.present[number], columns]  # bool: hands may be missing
+        present = torch.from_numpy(held)[None].to(device)
         codes = net.encode(x, present=present)  # {"body": [1, T / 2], "hand": [1, T / 4]}
         made = stats.denormalize(net.decode(codes, present=present)[0].cpu().numpy(), columns)
         pair = [torch.from_numpy(joints_of(features, clips.layout)) for features in (made, motion)]
