@@ -237,13 +237,15 @@ def test_the_readme_says_what_the_models_of_the_package_know() -> None:
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), *(ROOT / "models/pretrained").glob("*/*.md")]
 SOURCES = [path for room in ("datasets", "models", "pipeline") for path in (ROOT / room).rglob("*.py")]
 OF_SLURM = "cpus-per-task dependency gpus-per-node gpus-per-task jobs kill-on-bad-exit kill-on-invalid-dep"
-OF_TORCHRUN = "max-restarts rdzv-backend"
-OF_OTHERS = f"{OF_SLURM} nodes noheader ntasks-per-node parsable requeue extra-index-url torch-backend help {OF_TORCHRUN} filename yes"
+OF_MORE = "max-restarts rdzv-backend filename yes"
+OTHERS = (
+    f"{OF_SLURM} {OF_MORE} nodes noheader ntasks-per-node parsable requeue extra-index-url torch-backend help"
+)
 ADVISED = {
     " ".join(words): {"--help", *(option for each in command.params for option in each.opts)}
     for words, command in options_by_command()
 }
-OPTIONS = {"--version", *(f"--{name}" for name in OF_OTHERS.split())}.union(*ADVISED.values())
+OPTIONS = {"--version", *(f"--{name}" for name in OTHERS.split())}.union(*ADVISED.values())
 
 
 def configs(base: type[Config]) -> Iterator[type[Config]]:

@@ -34,8 +34,6 @@ _LOOK = 1.0
 
 _ANSWER = 5.0
 """Seconds for which ranks are asked who is still there: a step of training may end before one hears it."""
-
-_PARENT = os.getppid()
 started: list[subprocess.Popen[bytes]] = []
 """Processes of ranks 1, 2, ... of this machine that this one has started: none under torchrun or srun."""
 
@@ -57,17 +55,14 @@ class TeamError(Exception):
 
 def _who_ended() -> str:
     """Name the process that ended first and how, as far as this one can know."""
-    led, end = _started_by_lead(), time.monotonic() + _LOOK
-    while (led or started) and time.monotonic() < end:
-        if led and os.getppid() != _PARENT:
-            return "process 0, which started this one, has ended"
+    end = time.monotonic() + _LOOK
+    while started and time.monotonic() < end:
         for number, process in enumerate(started, start=1):
             code = process.poll()
             if code not in (None, 0, LOST):  # those have ended because of another
                 return f"process {number} of this machine (pid {process.pid}) {_how_ended(code or 0)}"
         time.sleep(0.02)
-    where = "process 0" if led else "its own log"
-    return f"{_who_is_silent()}; {where} may say why"
+    return f"{_who_is_silent()}; its own log may say why"
 
 
 members: list[str] = []

@@ -24,7 +24,6 @@ import torch.distributed as dist
 
 from motionloom import datasets, models, pipeline
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import sha256_of_json
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.launch.process import JointError, TeamError, members, srun_tasks, started
 
@@ -93,17 +92,13 @@ class Team:
 
         Two seeds train a model that no recipe makes again, and two numbers of steps wait for ever.
         """
-        digests = self.gather(sha256_of_json(facts))
-        odd = next((rank for rank, digest in enumerate(digests) if digest != digests[0]), None)
-        if odd is None:
-            return
-        all_facts = self.gather(facts)
-        lead, other = all_facts[0], all_facts[odd]
-        key = next(key for key in (*lead, *other) if lead.get(key, _NONE) != other.get(key, _NONE))
-        raise JointError(
-            f"rank {odd} differs from rank 0 in {key}: {other.get(key, _NONE)} there, "
-            f"{lead.get(key, _NONE)} here; start all ranks with the same command, files and versions"
-        )
+        lead, *others = self.gather(facts)  # some 20 kB of each
+        for rank, other in enumerate(others, start=1):
+            for key in (key for key in (*lead, *other) if lead.get(key, _NONE) != other.get(key, _NONE)):
+                raise JointError(
+                    f"rank {rank} differs from rank 0 in {key}: {other.get(key, _NONE)} there, "
+                    f"{lead.get(key, _NONE)} here; start all ranks with the same command, files and versions"
+                )
 
     def meet(self) -> None:
         if self.waiting is None:
@@ -131,9 +126,9 @@ _NONE = "(nothing)"
 def _versions() -> dict[str, str]:
     """Versions that all ranks must have alike; ours with a digest: a checkout changes under its version."""
     code = hashlib.sha256()
-    folders = [Path(package.__path__[0]) for package in (datasets, models, pipeline)]
-    for path in sorted(path for folder in folders for path in folder.rglob("*.py")):
-        code.update(f"{path.name} {path.stat().st_size}\n".encode() + path.read_bytes())
+    for package in (datasets, models, pipeline):
+        for path in sorted(Path(package.__path__[0]).rglob("*.py")):
+            code.update(path.read_bytes())
     ours = f"{metadata.version('motionloom')} (code {code.hexdigest()[:12]})"
     return {"motionloom": ours, "torch": torch.__version__}
 

@@ -24,7 +24,7 @@ from motionloom.pipeline.launch.hardware import choose_device
 from motionloom.pipeline.launch.process import beside, process_rank, take_place
 from motionloom.pipeline.launch.team import Team
 from motionloom.pipeline.runs.dry_run import explain_replacements, plan_table, replaced_stages, say_estimate
-from motionloom.pipeline.runs.execute import context_of, execute, perform
+from motionloom.pipeline.runs.execute import context_of, execute, facts_of, perform
 from motionloom.pipeline.runs.plan import Selection, doubts, make_plan, require_fit, selected
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.runs.snapshot import run_at
@@ -32,7 +32,6 @@ from motionloom.pipeline.store.artifact import require_consistent, require_uncha
 from motionloom.pipeline.store.files import new_folder, remove_tree, require_file_place, require_folder
 from motionloom.pipeline.store.run_folder import hint_at, owner_of, require_own, require_run, stage_folder
 from motionloom.pipeline.store.run_state import RunState, run_state
-from motionloom.pipeline.store.yaml import flatten
 
 
 def run_recipe(
@@ -132,7 +131,7 @@ def _stages_again(
     require_own(folder)
     recipe = load_recipe(folder / "recipe.yaml")
     take_place(recipe.hardware.nodes)
-    facts = {**flatten(recipe.tree(folder)), **changes, "the run folder": str(folder.absolute())}
+    facts = {**facts_of(recipe, folder, ()), **changes}
     team = Team.start(recipe.hardware, facts) if share and device == "auto" else Team()
     stage_cache = StageCache(recipe.hardware.device() if device == "auto" else choose_device(device))
     stages = [s for s in recipe.stages if what in s.kind.gives(s.config)]

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import faulthandler
 import math
+import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -123,7 +125,20 @@ class StallTimer:
                 stack.callback(self._remove)
             stack.callback(faulthandler.cancel_dump_traceback_later)
             self.progress()
+            ended = threading.Event()
+            stack.callback(ended.set)
+            threading.Thread(target=self._tell, args=(ended,), daemon=True).start()
             yield
+
+    def _tell(self, ended: threading.Event) -> None:
+        """Say where the main thread hangs, a moment before this process ends: nothing may be said then."""
+        while time.monotonic() - self._armed < self.seconds - 1:
+            if ended.wait(0.5):
+                return
+        frame = sys._current_frames()[threading.main_thread().ident or 0]
+        where = f"{frame.f_code.co_name} ({frame.f_code.co_filename}:{frame.f_lineno})"
+        told = f"process {rank()}: no step for {self.seconds} s, it hangs in {where}; stacks: {self.path}"
+        print(told, file=sys.stderr, flush=True)
 
     def _remove(self) -> None:
         with suppress(OSError):  # the folder may have become one that nobody writes to

@@ -7,6 +7,7 @@ import os
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,26 @@ def test_what_follows_a_failure_is_cancelled(cluster: Any, program: Callable[[st
         "CANCELLED",
         "COMPLETED",
     ]
+
+
+def test_a_sweep_runs_row_by_row(cluster: Any, program: Callable[[str], None]) -> None:
+    """In the order of its groups each; and sbatch takes all scripts once more, to test them alone."""
+    program('echo "$SLURM_ARRAY_TASK_ID $SLURM_JOB_NAME" >> order')
+    folder, made = Path("run").absolute(), plan(nodes=1)
+    rows = [replace(made, out=str(folder / row)) for row in ("seed=1", "seed=2")]
+    submit_run(rows, folder, OPTIONS, Console(file=io.StringIO()))
+    for script in folder.glob(".slurm/*/*.sbatch"):
+        subprocess.run(["sbatch", "--test-only", str(script)], check=True, env=os.environ)
+    wanted = [made.job(group) for group in made.groups]
+    until(lambda: Path("order").is_file() and len(Path("order").read_text().split()) == 4 * len(wanted), 180)
+    order = [line.split() for line in Path("order").read_text().splitlines()]
+    for row in ("1", "2"):
+        done = [job for number, job in order if number == row]
+        assert sorted(done) == wanted and all(
+            done.index(made.job(group))
+            > max((done.index(f"{made.name}-{one}") for one in group.after), default=-1)
+            for group in made.groups
+        )
 
 
 STEPS = 100

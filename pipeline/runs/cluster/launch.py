@@ -24,12 +24,6 @@ from motionloom.pipeline.runs.recipe import load_recipe
 
 Engine = Literal["slurm", "kubernetes", "sky"]
 
-_ENGINES = {
-    "kubernetes": (manifest, ("kubectl", "apply", "--filename")),
-    "sky": (pipeline, ("sky", "jobs", "launch", "--yes")),
-}
-"""What writes a file of one, and the command that takes it."""
-
 
 def launch_recipe(
     recipe: str | Path,
@@ -71,8 +65,8 @@ def launch_recipe(
     if on == "slurm":
         launch_on_slurm(plans, run, asked, dry_run=dry_run, console=console)
         return
-    write, command = _ENGINES[on]
-    text = write(plans[0], asked)
+    text = (manifest if on == "kubernetes" else pipeline)(plans[0], asked)
+    command = ("kubectl apply --filename" if on == "kubernetes" else "sky jobs launch --yes").split()
     if dry_run:
         console.print(f"\n{text}", soft_wrap=True, markup=False, highlight=False)
         return

@@ -136,10 +136,7 @@ def launch_on_slurm(
         say_estimate(plans[0].recipe, console, Path(plans[0].out), planned[0])
     if len(plans) == 1:
         plans = [_what_is_missing(plans[0], planned[0])]
-    if dry_run:
-        _show_scripts(plans, out, options, console)
-    else:
-        submit_run(plans, out, options, console)
+    submit_run(plans, out, options, console, dry_run=dry_run)
 
 
 def _planned(
@@ -187,16 +184,6 @@ def _require_time(plan: LaunchPlan, options: ClusterOptions, times: Mapping[str,
             )
 
 
-def _show_scripts(plans: Sequence[LaunchPlan], out: Path, options: ClusterOptions, console: Console) -> None:
-    folder, ids = out / LOG_FOLDER / "DATE-TIME", defaultdict[str, list[str]](list)
-    for name in recipe_files(plans):
-        say(console, f"would write {folder / name}: the resolved recipe")
-    for script in slurm_scripts(plans, options, folder, Path.cwd()):
-        console.print(f"\n{script.path}:\n{script.text}", soft_wrap=True, markup=False)
-        say(console, " ".join(script.submit(ids)))
-        ids[script.group.name].append(f"ID-OF-{script.path.stem}")
-
-
 def recipe_files(plans: Sequence[LaunchPlan]) -> list[str]:
     """Names of the files of the resolved recipes, next to the scripts: one for each row of a sweep."""
     return [f"recipe-{row + 1}.yaml" for row in range(len(plans))] if len(plans) > 1 else ["recipe.yaml"]
@@ -219,8 +206,11 @@ def slurm_scripts(
             array: Sequence[int] = [job - start for job in jobs if 0 < job - start <= most]
             if array:
                 name = f"{group.name}{f'-from-{start + 1}' * (start > 0)}"
-                array = array if group.parts > 1 else range(1, rows + 1) if rows > 1 else ()
-                text = _text(plans, group, options, folder, cwd, _ranges(array), start)
+                if group.parts == 1:
+                    array = range(1, rows + 1) if rows > 1 else ()
+                every = array and array[-1] - array[0] == len(array) - 1
+                numbers = f"{array[0]}-{array[-1]}" if every else ",".join(map(str, array))
+                text = _text(plans, group, options, folder, cwd, numbers, start)
                 scripts.append(Script(group, folder / f"{name}.sbatch", text, rows > 1))
     return scripts
 
@@ -235,46 +225,59 @@ def _most_jobs() -> int:
     return max(1, int(found[1] if found else 1001) - 1)
 
 
-def _ranges(numbers: Sequence[int]) -> str:
-    """`1-3,7` of 1, 2, 3, 7."""
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1] = [runs[-1][0], number]
-        else:
-            runs.append([number])
-    return ",".join("-".join(map(str, ends)) for ends in runs)
-
-
 def submit_run(
-    plans: Sequence[LaunchPlan], out: Path, options: ClusterOptions, console: Console
+    plans: Sequence[LaunchPlan],
+    out: Path,
+    options: ClusterOptions,
+    console: Console,
+    *,
+    dry_run: bool = False,
 ) -> list[str]:
-    """Write the scripts into the run folder and submit them; the job ids."""
-    if shutil.which("sbatch") is None:
-        raise UserError("no sbatch here: start this where jobs are submitted, or look with --dry-run")
-    require_own(out)
+    """Write the scripts into the run folder and submit them, or only print them; the job ids."""
     # A folder of its own for every submission.
-    folder = out / LOG_FOLDER / f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
-    folder.mkdir(parents=True)
-    for name, plan in zip(recipe_files(plans), plans, strict=True):
-        write_text(folder / name, plan.recipe.to_yaml())
+    now = "DATE-TIME" if dry_run else f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
+    folder = out / LOG_FOLDER / now
     scripts = slurm_scripts(plans, options, folder, Path.cwd())
-    for script in scripts:
-        write_text(script.path, script.text)
+    recipes = dict(zip(recipe_files(plans), plans, strict=True))
+    if dry_run:
+        for name in recipes:
+            say(console, f"would write {folder / name}: the resolved recipe")
+    else:
+        if shutil.which("sbatch") is None:
+            raise UserError("no sbatch here: start this where jobs are submitted, or look with --dry-run")
+        require_own(out)
+        folder.mkdir(parents=True)
+        for name, plan in recipes.items():
+            write_text(folder / name, plan.recipe.to_yaml())
+        for script in scripts:
+            write_text(script.path, script.text)
     jobs: list[str] = []
     ids = defaultdict[str, list[str]](list)  # by group, which may be several arrays
     for script in scripts:
-        submitted = subprocess.run(script.submit(ids), capture_output=True, text=True)
-        if submitted.returncode != 0:
-            if jobs:
-                subprocess.run(["scancel", *jobs], capture_output=True)
-            raise UserError(f"sbatch refused {script.path}: {submitted.stderr.strip()}")
-        jobs.append(submitted.stdout.strip().partition(";")[0])
-        ids[script.group.name].append(jobs[-1])
-        before = ", ".join(job for one in script.group.after for job in ids[one])
-        say(console, f"{script.group.name}: job {jobs[-1]}{before and f', after {before}'}")
-    say(console, f"watch: squeue --jobs {','.join(jobs)}; stop: scancel {' '.join(jobs)}; logs: {folder}")
+        command = script.submit(ids)
+        if dry_run:
+            console.print(f"\n{script.path}:\n{script.text}", soft_wrap=True, markup=False)
+            say(console, " ".join(command))
+            job = f"ID-OF-{script.path.stem}"
+        else:
+            job = _submit(command, jobs)
+            before = ", ".join(job for one in script.group.after for job in ids[one])
+            say(console, f"{script.group.name}: job {job}{before and f', after {before}'}")
+        jobs.append(job)
+        ids[script.group.name].append(job)
+    if not dry_run:
+        say(console, f"watch: squeue --jobs {','.join(jobs)}; stop: scancel {' '.join(jobs)}; logs: {folder}")
     return jobs
+
+
+def _submit(command: Sequence[str], jobs: Sequence[str]) -> str:
+    """The id of a new job; where SLURM refuses it, it takes `jobs` with it."""
+    submitted = subprocess.run(command, capture_output=True, text=True)
+    if submitted.returncode == 0:
+        return submitted.stdout.strip().partition(";")[0]
+    if jobs:
+        subprocess.run(["scancel", *jobs], capture_output=True)
+    raise UserError(f"sbatch refused {command[-1]}: {submitted.stderr.strip()}")
 
 
 def _text(

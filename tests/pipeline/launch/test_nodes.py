@@ -8,7 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -39,10 +39,10 @@ HELPERS = str(Path(__file__).parents[2] / "helpers")
 
 
 class Starts:
-    """Starts commands in a folder, with a log each; nothing of them outlives the test."""
+    """Starts commands in a folder."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.processes = folder, list[subprocess.Popen[bytes]]()
+    def __init__(self, folder: Path, start: Callable[..., subprocess.Popen[str]]) -> None:
+        self.folder, self.start, self.processes, self.said = folder, start, list[subprocess.Popen[str]](), ""
         (folder / "toys.yaml").write_text(RECIPE)
         (folder / "wider.yaml").write_text(RECIPE.replace("kind: toy,", "kind: toy, width: 9,"))
         (folder / "other_version.py").write_text(OTHER)
@@ -51,49 +51,43 @@ class Starts:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
 
-    def __call__(self, *words: object, pause: float = 0.0, **variables: object) -> None:
-        known = {"MOTIONLOOM_STAGES": "toy_training_stage,watched_steps", "OMP_NUM_THREADS": 1, PAUSE: pause}
-        known |= {RECORDS: self.folder / "records", "PYTHONPATH": f"{HELPERS}:{self.folder}", **variables}
-        env = {**os.environ, **{key: str(value) for key, value in known.items()}}
-        with (self.folder / f"log{len(self.processes)}").open("wb") as log:
-            how: dict[str, Any] = {"cwd": self.folder, "stdout": log, "stderr": log, "env": env}
-            self.processes.append(subprocess.Popen([*map(str, words)], start_new_session=True, **how))
+    def __call__(self, place: Any, *words: object, pause: float = 0.0, **variables: object) -> None:
+        known = {"MOTIONLOOM_STAGES": "toy_training_stage,watched_steps", PAUSE: pause, RECORDS: "records"}
+        known |= {"PYTHONPATH": f"{HELPERS}:{self.folder}", **variables}
+        there = ("env", f"--chdir={self.folder}", *(f"{key}={value}" for key, value in known.items()))
+        self.processes.append(self.start(*words, program=(*place, *there)))
 
     def nodes(
         self, *words: Any, on: Any = ((), ()), address: str = "127.0.0.1", second: Any = (), **how: Any
     ) -> None:
         """One command a node: the second one, which may be another, is told its number by an Indexed Job."""
         meet = {"MASTER_ADDR": address, "MASTER_PORT": self.port, **how}
-        self(*on[0], *RUN, *words, NODE_RANK=0, **meet)
+        self(on[0], *RUN, *words, NODE_RANK=0, **meet)
         meet |= second if isinstance(second, dict) else {}
         words = words if isinstance(second, dict) else second or words
-        self(*on[1], *RUN, *words, JOB_COMPLETION_INDEX=1, **meet)
-
-    def said(self) -> str:
-        return "\n".join(path.read_text() for path in sorted(self.folder.glob("log*")))
+        self(on[1], *RUN, *words, JOB_COMPLETION_INDEX=1, **meet)
 
     def end_with(self, *codes: int) -> None:
-        assert [process.wait(100) for process in self.processes[-len(codes) :]] == [*codes], self.said()
+        ended = self.processes[-len(codes) :]
+        self.said += "\n".join(process.communicate(timeout=100)[0] for process in ended)
+        assert [process.returncode for process in ended] == [*codes], self.said
 
-    def reach(self, run: str, step: int) -> None:
-        place = self.folder / run / "stages/toy/checkpoints"
+    def reach(self, step: int) -> None:
+        place = self.folder / "run/stages/toy/checkpoints"
         there = lambda: any(int(path.stem[5:]) >= step for path in place.glob("s*.ckpt"))  # noqa: E731
         until(lambda: there() or any(one.poll() for one in self.processes), "no checkpoint", 120)
-        assert there(), self.said()
+        assert there()
 
 
 @pytest.fixture
-def starts(tmp_path: Path) -> Iterator[Starts]:
-    made = Starts(tmp_path)
-    yield made
-    for process in (process for process in made.processes if process.poll() is None):
-        os.killpg(process.pid, signal.SIGKILL)
+def starts(tmp_path: Path, start: Any) -> Starts:
+    return Starts(tmp_path, start)
 
 
 @pytest.fixture(scope="module")
-def calm(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def calm(tmp_path_factory: pytest.TempPathFactory, start: Any) -> dict[str, str]:
     """The files of the undisturbed training of two ranks."""
-    starts = Starts(tmp_path_factory.mktemp("calm"))
+    starts = Starts(tmp_path_factory.mktemp("calm"), start)
     starts.nodes("toys.yaml", "-o", "run")
     starts.end_with(0, 0)
     return finished_files(starts.folder / "run/stages/toy")
@@ -115,7 +109,7 @@ def test_ranks_that_differ_are_named_before_anything_is_written(
 ) -> None:
     starts.nodes("toys.yaml", second=second)
     starts.end_with(2, 2)
-    assert f"rank 1 differs from rank 0 in {said}" in starts.said()
+    assert f"rank 1 differs from rank 0 in {said}" in starts.said
     assert not [*starts.folder.glob("**/stages")]
 
 
@@ -130,14 +124,14 @@ def test_torchrun_restarts_what_died_with_the_same_bytes(starts: Starts, calm: A
             sizes = (f"--nnodes={nodes}", f"--nproc-per-node={each}", "--max-restarts=3")
             words = ("toys.yaml", "-o", "run", "--set", f"hardware.nodes={nodes}")
             words += ("--set", f"hardware.devices={each}")
-            heals = {"TORCH_DISABLE_SHARE_RDZV_TCP_STORE": 1}
-            starts(*place, *TORCHRUN, *meet, *sizes, *RUN, *words, pause=0.05, **heals)
-        starts.reach("run", 10)
+            heals: dict[str, Any] = {"pause": 0.05, "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": 1}
+            starts(place, *TORCHRUN, *meet, *sizes, *RUN, *words, **heals)
+        starts.reach(10)
         agent = starts.processes[-1].pid
         children = Path(f"/proc/{agent}/task/{agent}/children").read_text().split()
         os.kill(int(children[-1]), signal.SIGKILL)
         starts.end_with(*[0] * nodes)
-    assert "resuming" in starts.said()
+    assert "resuming" in starts.said
     assert finished_files(starts.folder / "run/stages/toy") == calm
 
 
@@ -149,7 +143,7 @@ def test_an_evicted_node_has_all_save_and_the_same_commands_go_on(
     with two_nodes() if apart else nullcontext(((), ())) as places:
         how = {"on": places, "address": "10.77.0.1" if apart else "127.0.0.1"}
         starts.nodes("toys.yaml", "-o", "run", pause=0.05, **how)
-        starts.reach("run", 10)
+        starts.reach(10)
         starts.processes[-1].terminate()
         starts.end_with(SAVED, SAVED)
         starts.nodes("toys.yaml", "-o", "run", **how)
@@ -161,11 +155,11 @@ def test_an_evicted_node_has_all_save_and_the_same_commands_go_on(
 @pytest.mark.parametrize("dead", [0, 1])
 def test_a_node_that_dies_is_named_by_the_other(starts: Starts, dead: int) -> None:
     starts.nodes("toys.yaml", "-o", "run", pause=0.05)
-    starts.reach("run", 5)
+    starts.reach(5)
     starts.processes[dead].kill()
     starts.end_with(*[-signal.SIGKILL, LOST][:: 1 - 2 * dead])
     named = f": rank {dead} (process {starts.processes[dead].pid} on "
-    assert named in starts.said() and ".cpp:" not in starts.said()
+    assert named in starts.said and ".cpp:" not in starts.said
 
 
 @pytest.mark.parametrize(

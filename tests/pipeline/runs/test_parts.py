@@ -37,7 +37,7 @@ def test_parts_beside_each_other_equal_one_process(tmp_path: Path) -> None:
     run.mkdir()
     (run / "stages/data/shards").mkdir(parents=True)
     (run / "stages/data/shards/old.tar").touch()  # of another plan: the first part clears it away, no other
-    for part, left in (("2/2", ["1"]), ("1/2", []), ("2/2", [])):
+    for part, left in (("2/2", ["1-1"]), ("1/2", []), ("2/2", [])):
         convert(recipe, run, part)
         said = Console(file=io.StringIO(), width=200)
         how: dict[str, Any] = {"out": run, "gpus_per_node": 0, "dry_run": True, "console": said}

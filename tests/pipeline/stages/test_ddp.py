@@ -117,7 +117,7 @@ def test_an_error_of_the_lead_ends_those_who_wait(
     words = ("run", recipe, "--out", run, "--from", "tokens", "--until", "gpt", *PAIR)
     output = finish(start(*words), code=2)
     assert "where a folder is" in output
-    assert "process 1: process 0, which started this one, has ended" in output
+    assert "process 1: rank 0 (process " in output
 
 
 # Stages whose work all processes share: the same files, bit for bit, by one process and by two.
