@@ -20,7 +20,7 @@ import time
 from datetime import date
 from pathlib import Path
 
-from fuzzing import files, requests, stores, trees  # noqa: F401 - they fill the table
+from fuzzing import files, models, requests, stores, trees  # noqa: F401 - they fill the table
 from fuzzing.table import READERS, ROOT, missing
 from fuzzing.worker import Count, Worker, as_record
 
@@ -91,14 +91,12 @@ def run(
 
 def table(counts: dict[str, Count]) -> str:
     """The counts as a table for a terminal."""
-    lines = [
-        f"{'reader':24}{'inputs':>10}{'refused':>10}{'taken':>10}{'unexpected':>11}{'> 2 s':>7}{'large':>7}{'most s':>8}{'most MB':>9}"
-    ]
+    titles = ("inputs", "refused", "taken", "unexpected", "> 2 s", "large", "most s", "most MB")
+    lines = [f"{'reader':24}" + "".join(f"{title:>11}" for title in titles)]
     for name, one in {**counts, "all": total(counts)}.items():
-        lines.append(
-            f"{name:24}{one.inputs:10,}{one.refused:10,}{one.taken:10,}{one.unexpected:11,}{one.slow:7}{one.large:7}"
-            f"{one.slowest_seconds:8.2f}{one.largest_mb:9.0f}"
-        )
+        numbers = (one.inputs, one.refused, one.taken, one.unexpected, one.slow, one.large)
+        most = f"{one.slowest_seconds:11.2f}{one.largest_mb:11.0f}"
+        lines.append(f"{name:24}" + "".join(f"{number:11,}" for number in numbers) + most)
     return "\n".join(lines)
 
 
@@ -123,10 +121,12 @@ def record(counts: dict[str, Count]) -> None:
     }
     _RECORD.write_text(json.dumps(facts, indent=1) + "\n")
     wrong = whole.unexpected + whole.slow + whole.large
+    read = f"{whole.refused:,} ended in a sentence and {whole.taken:,} were read"
     line = (
-        f"- **Fuzzed** on {today.day} {today:%B %Y} at {commit} by `python benchmarks/fuzz.py WORK --hours N`: of {whole.inputs:,}\n"
-        f"  damaged inputs of {len(counts)} readers, converters and requests {whole.refused:,} ended in a sentence and\n"
-        f"  {whole.taken:,} were read; {wrong or 'none'} raised, took over 2 s, or 20 times their size and 200 MB\n"
+        f"- **Fuzzed** on {today.day} {today:%B %Y}, at {commit}, by `python benchmarks/fuzz.py`:\n"
+        f"  of {whole.inputs:,} damaged inputs of {len(counts)} readers, converters and requests\n"
+        f"  {read};\n"
+        f"  {wrong or 'none'} raised, took over 2 s, or 20 times their size and 200 MB\n"
         f"  (`benchmarks/records/fuzzing.json`). Whether what was read is right is not compared."
     )
     page = ROOT / "SECURITY.md"

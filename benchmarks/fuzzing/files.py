@@ -19,6 +19,7 @@ from fuzzing.sealed import damaged_glb, damaged_npy, damaged_pickle, damaged_zip
 from fuzzing.sounds import damaged_flac, damaged_mp3, damaged_ogg, damaged_wav
 from fuzzing.table import Read, Seed, of_files, of_tree, reader
 from motionloom.datasets.audio.sound import Sound, sound_seconds
+from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
 from motionloom.datasets.convert.amass.smpl_npz import read_motion, read_motion_header
 from motionloom.datasets.convert.captions.collect import Captions
@@ -72,7 +73,10 @@ def npz_clip(folder: Path) -> bytes:
 @cache
 def glb_clip(folder: Path) -> bytes:
     """An animation as we write it, without the body's surface, which nobody reads and is most of it."""
-    save(folder / "made.glb", _made())
+    layout = MotionLayout.named("body133", fps=20.0)
+    joints = walked()[:, :22]
+    features = np.zeros((len(joints), layout.dim), np.float32)
+    save(folder / "made.glb", GeneratedMotion(Prompt("walks"), features, joints, None, layout, seed=1))
     raw = (folder / "made.glb").read_bytes()
     end = 20 + int.from_bytes(raw[12:16], "little")
     scene, blob, kept = json.loads(raw[20:end]), raw[end + 8 :], b""
@@ -108,14 +112,14 @@ def bvh_clip(folder: Path, frames: int = 12) -> bytes:
     return write_clip(folder / "made.bvh", 1, frames=frames).read_bytes()
 
 
-@reader("bvh", "datasets/motion/bvh", "datasets/convert/bvh/read.py")
+@reader("bvh", "bvh/text.py", "bvh/read.py")
 def _bvh(folder: Path) -> Made:
     foreign = trees.release_trees.bvh_file("Xsens MVN", 10.0).encode()
     seeds, read = of_files(folder, "a.bvh", [bvh_clip(folder), foreign], damaged_text, read_bvh)
     return seeds, lambda seed, content: read(seed, content).positions()  # type: ignore[attr-defined]
 
 
-@reader("clip bvh", "pipeline/inference/clip_file.py")
+@reader("clip bvh", "clip_file.py")
 def _clip_bvh(folder: Path) -> Made:
     return of_files(folder, "a.bvh", [bvh_clip(folder)], damaged_text, read_clip)
 
@@ -125,7 +129,7 @@ def _clip_npz(folder: Path) -> Made:
     return of_files(folder, "a.npz", [npz_clip(folder)], damaged_zip, read_clip)
 
 
-@reader("clip glb", "pipeline/render/body/glb.py")
+@reader("clip glb", "body/glb.py")
 def _clip_glb(folder: Path) -> Made:
     return of_files(folder, "a.glb", [glb_clip(folder)], damaged_glb, read_clip)
 
@@ -141,14 +145,14 @@ def _acclaim(folder: Path) -> Made:
     return [Seed("a.asf", asf, damaged_text), Seed("a.amc", amc, damaged_text)], read
 
 
-@reader("joint map")
+@reader("joint map", "joint_map.py")
 def _joint_map(folder: Path) -> Made:
     rows = [[number, name, name] for number, name in enumerate(Skeleton.named("smpl22").joints)]
     whole = {"smpl22": rows, "unmapped": [], "unit": "cm", "up": "y"}
     return of_files(folder, "map.json", [json.dumps(whole).encode()], damaged_json, JointMap.load)
 
 
-@reader("aist pickle")
+@reader("aist pickle", "pickle_reader.py")
 def _aist(folder: Path) -> Made:
     data = {
         "smpl_loss": 0.5,
@@ -160,7 +164,7 @@ def _aist(folder: Path) -> Made:
     return of_files(folder, "a.pkl", contents, damaged_pickle, read_aist_motion)
 
 
-@reader("amass npz", "datasets/motion/npz.py")
+@reader("amass npz", "motion/npz.py", "smpl_npz.py")
 def _amass(folder: Path) -> Made:
     clip = amass_clips.walk(30.0, 0.4)
     forms = (clip, amass_clips.as_smplx(clip), amass_clips.in_parts(clip))
@@ -173,7 +177,7 @@ def _amass(folder: Path) -> Made:
     return of_files(folder, "a.npz", contents, damaged_zip, read)
 
 
-@reader("body model", "datasets/motion/body")
+@reader("body model", "body/smpl.py")
 def _body(folder: Path) -> Made:
     path = amass_clips.body_model(folder / "model.npz", 52, 1.0)
     return of_files(
@@ -181,7 +185,7 @@ def _body(folder: Path) -> Made:
     )
 
 
-@reader("face bases", "pipeline/render/body/face.py")
+@reader("face bases", "body/face.py")
 def _face(folder: Path) -> Made:
     random = np.random.default_rng(0)
     np.savez(
@@ -196,7 +200,7 @@ def _face(folder: Path) -> Made:
     )
 
 
-@reader("vectors npy", "datasets/convert/common/arrays.py")
+@reader("vectors npy", "common/arrays.py")
 def _vectors(folder: Path) -> Made:
     contents = []
     for values in (
@@ -240,7 +244,7 @@ for _ending, _damage in (
     ("ogg", damaged_ogg),
     ("mp3", damaged_mp3),
 ):
-    reader(f"sound {_ending}", "datasets/audio/sound.py")(
+    reader(f"sound {_ending}", "audio/sound.py")(
         lambda folder, ending=_ending, damage=_damage: of_files(
             folder, f"a.{ending}", [sound(folder, ending)], damage, _heard
         )
@@ -261,9 +265,11 @@ def _part(folder: Path) -> Made:
 @reader(
     "captions",
     "datasets/schema.py",
-    "datasets/convert/captions",
-    "datasets/convert/common/tables.py",
-    "datasets/convert/common/files.py",
+    "captions/read.py",
+    "captions/options.py",
+    "humanml_text.py",
+    "common/tables.py",
+    "common/files.py",
 )
 def _captions(folder: Path) -> Made:
     damages = {
@@ -287,16 +293,24 @@ def _captions(folder: Path) -> Made:
     return seeds, read
 
 
-@reader("humanml index")
+@reader("humanml index", "humanml_index.py")
 def _index(folder: Path) -> Made:
     text = (
         "source_path,start_frame,end_frame,new_name\n./pose_data/KIT/3/kick_high_left02_poses.npy,0,117,000000.npy\n"
         "./pose_data/CMU/01/01_01_poses.npy,10,-1,000001.npy\n"
     )
-    return of_files(folder, "index.csv", [text.encode()], damaged_text, read_index)
+
+    def read(path: Path) -> object:
+        bad: dict[str, str] = {}
+        rows = read_index(path, bad)
+        if not rows and bad:
+            raise UserError(next(iter(bad.values())))
+        return rows
+
+    return of_files(folder, "index.csv", [text.encode()], damaged_text, read)
 
 
-@reader("split files", "datasets/convert/common/splits.py")
+@reader("split files", "common/splits.py")
 def _splits(folder: Path) -> Made:
     tree = folder / "lists"
     tree.mkdir()

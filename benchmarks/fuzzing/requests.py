@@ -129,7 +129,7 @@ def _request(path: str, media: str, contents: Callable[[Path], list[tuple[str, b
 
         return [Seed(path.strip("/"), content, damage) for _, content, damage in contents(folder)], read
 
-    reader(f"POST {path}", "pipeline/serve", "pipeline/editing/task.py")(make)
+    reader(f"POST {path}", "serve/app.py")(make)
 
 
 def _as_json(bodies: tuple[dict[str, Any], ...]) -> list[tuple[str, bytes, Mutator]]:

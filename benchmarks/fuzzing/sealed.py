@@ -11,6 +11,7 @@ import re
 import struct
 import tarfile
 import zipfile
+from itertools import pairwise
 from random import Random
 from typing import Any
 
@@ -151,7 +152,7 @@ def damaged_pickle(random: Random, data: bytes, other: bytes) -> bytes:
     if random.random() < 0.3:
         return damaged_bytes(random, data, other)
     starts = [place or 0 for _, _, place in codes] + [len(data)]
-    pieces = [data[a:b] for a, b in zip(starts, starts[1:], strict=False)]
+    pieces = [data[a:b] for a, b in pairwise(starts)]
     for _ in range(random.choice((1, 1, 2, 4))):
         at, to = random.randrange(len(pieces)), random.randrange(len(pieces))
         match random.randrange(6):
@@ -251,7 +252,7 @@ def _damaged_header(random: Random, header: bytes) -> bytes:
 
 
 def damaged_tar(random: Random, data: bytes, other: bytes) -> bytes:
-    """A shard with a header changed and its sum right, or a member's content within its size or another one."""
+    """A shard with a header changed and its sum right, or the content of a member."""
     if random.random() < 0.15:
         return damaged_bytes(random, data, other)
     with tarfile.open(fileobj=io.BytesIO(data)) as file:

@@ -205,7 +205,7 @@ def damaged_mp3(random: Random, data: bytes, other: bytes) -> bytes:
 
 
 def damaged_wav(random: Random, data: bytes, other: bytes) -> bytes:
-    """A WAV with its chunks changed, exchanged or repeated; lengths are right but where they are the damage."""
+    """A WAV with its chunks changed, exchanged or repeated; lengths are right or are the damage."""
     if random.random() < 0.2:
         return damaged_bytes(random, data, other)
     chunks, at = [], 12

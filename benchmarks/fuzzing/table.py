@@ -39,14 +39,14 @@ class Reader:
     name: str
     make: Make
     doors: tuple[str, ...] = ()
-    """Modules whose readings it goes through."""
+    """Ends of the paths of the modules that it covers, which may move."""
 
 
 READERS: dict[str, Reader] = {}
 
 
 def reader(name: str, *doors: str) -> Callable[[Make], Make]:
-    """Add the function below as the reader `name`; `doors` are modules of the package that it covers."""
+    """Add the function below as the reader `name`; `doors` end the paths of modules that it covers."""
 
     def add(make: Make) -> Make:
         assert name not in READERS, name
@@ -175,7 +175,7 @@ def missing() -> list[str]:
     lacking = [
         f"no reader covers {name} ({', '.join(calls)})"
         for name, calls in doors().items()
-        if not any(name.startswith(one) for one in covered)
+        if not any(f"/{name}".endswith(f"/{one}") for one in covered)
     ]
     lacking += [f"no seeds for the converter {name}" for name in names() if name not in TREES]
     lacking += [f"no seeds for the request {route}" for route in routes() if route not in ROUTES]

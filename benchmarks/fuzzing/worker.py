@@ -112,7 +112,8 @@ class Worker:
         self, seeds: list[Seed], read: Read, first: int, count: int, seconds: float
     ) -> tuple[Count, bool]:
         """What a child has counted, and whether an input ended it."""
-        shared, notes = self._shared, tempfile.TemporaryFile()
+        shared = self._shared
+        notes = tempfile.TemporaryFile()  # noqa: SIM115 - open in the child, too
         shared[: _ROW.size] = _ROW.pack(0, 0, 0, 0, 0, 0.0, 0.0, 0.0)
         child = os.fork()
         if child == 0:
@@ -260,8 +261,7 @@ def _peak() -> int:
 
 
 def _size() -> int:
-    with open("/proc/self/statm", "rb") as file:
-        return int(file.read().split()[1]) * mmap.PAGESIZE
+    return int(Path("/proc/self/statm").read_bytes().split()[1]) * mmap.PAGESIZE
 
 
 def as_record(count: Count) -> dict[str, Any]:
