@@ -45,7 +45,7 @@ class Config(BaseModel):
         except FileNotFoundError:
             raise UserError(f"{path}: no such file") from None
         except OSError as error:
-            raise UserError(f"{path}: cannot be read ({error})") from None
+            raise UserError(f"{path}: cannot be read ({error.strerror or error})") from None
         return cls.parse(parse_json(raw, str(path)), str(path))
 
     def dump(self) -> dict[str, Any]:
