@@ -20,7 +20,7 @@ class UserError(Exception):
     def __init__(self, words: str = "") -> None:
         lines, half, said = list[str](), _LONGEST // 2, words.split("\n")
         if len(said) > _MOST_LINES:  # names of strangers may hold line breaks
-            said[_MOST_LINES - 1 : -1] = ["…"]
+            said[_MOST_LINES - 2 : -1] = ["…"]
         for line in said:
             if not line.isprintable():
                 line = "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)

@@ -18,26 +18,29 @@ from motionloom.pipeline.inference.writers import Outputs
 from motionloom.pipeline.render.viewer import fill, safe_json
 from motionloom.pipeline.rigs.rig_file import put_on, rig_of
 
+_CROWN = 1.4
+"""From the floor to the head's joint, to the crown of a big head."""
+
 
 def write_rig_page(path: Path, outputs: Outputs) -> list[str]:
     """Write the page with all clips; returns sentences on what the character lacks."""
     rig = rig_of(outputs.clips[0])
     rig.gltf.json.pop("animations", None)
     said = put_on(rig, list(outputs.clips))
-    if any(
-        "KHR_draco" in str(name) or "meshopt" in str(name)
-        for name in rig.gltf.json.get("extensionsRequired", ())
-    ):
-        said.append(
-            f"{Path(rig.gltf.where).name}: its meshes are packed, which the page does not draw; export it plain"
-        )
+    packed = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
+    if any(name in packed for name in rig.gltf.json.get("extensionsRequired") or ()):
+        said.append(f"{Path(rig.gltf.where).name}: its meshes are packed: the page draws none")
+    rest = rig.skeleton.rest_joints[:, 1]
+    tall = (
+        float(rest[rig.skeleton.index("head")] - rest[rig.skeleton.index("left_foot")]) * rig.unit + rig.ball
+    )
     ahead = rig.ahead.T @ [0.0, 0.0, 1.0]
     web = resources.files("motionloom.pipeline.rigs") / "web"
     data = {
         "title": outputs.title,
         "note": "\n".join([outputs.note, *said]),
         "hips": rig.nodes["pelvis"],
-        "size": 1.75 * rig.unit,
+        "size": _CROWN * tall,
         "ahead": float(np.arctan2(ahead[0], ahead[2])),
         "glb": base64.b64encode(rig.gltf.to_bytes()).decode("ascii"),
     }

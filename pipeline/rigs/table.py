@@ -6,4 +6,5 @@ from motionloom.datasets.base.register import declare
 
 _HERE = "motionloom.pipeline.rigs"
 
+declare("converter", {"glb": f"{_HERE}.convert"})
 declare("writer", dict.fromkeys(("vrma", "rig", "rig-page"), f"{_HERE}.formats"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +25,8 @@ from motionloom.datasets.motion.bvh.text import (
 from motionloom.datasets.shards.left_out import drop
 
 SUFFIX = (".bvh", ".amc")
+READERS: dict[str, Callable[[Path, str], bytes]] = {}
+"""Other endings, of packages, and what makes a BVH text of such a file; errors call it by the second word."""
 MAX_SKELETON_BYTES = 1 << 20
 
 
@@ -45,6 +47,8 @@ def list_files(source: Path) -> tuple[Path, list[str]]:
 
 def read_file(path: Path, label: str) -> bytes:
     """Return a motion file's content, an .amc's behind its .asf and `JOINED`; `label` names it in errors."""
+    if reader := READERS.get(path.suffix.lower()):
+        return reader(path, label)
     try:
         data = read_plain(path, MAX_FILE_BYTES, label)
         if path.suffix.lower() != ".amc":

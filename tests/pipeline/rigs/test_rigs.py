@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.body.expressions import APEX, BASIS
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid, with_offsets
+from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
@@ -25,6 +26,7 @@ from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import write_motions
 from motionloom.pipeline.inference.writers import figure_options
+from motionloom.pipeline.rigs.animations import SUFFIX, read_animation
 from motionloom.pipeline.rigs.gltf import Gltf
 from motionloom.pipeline.rigs.names import HUMANOID
 from motionloom.pipeline.rigs.rig import Rig
@@ -257,6 +259,17 @@ def test_a_character_moves_as_the_motion_does(tmp_path: Path, motion: GeneratedM
     assert way[0] / way[1] == pytest.approx(
         1.15 * OURS.rest_joints[7, 1] / figure.skeleton.rest_joints[7, 1], rel=0.05
     )
+    # Read again as a clip, it is the motion.
+    clip = read_bvh(read_animation(path / f"00-walk{SUFFIX}", "walk"))
+    back, row = clip.positions(), [clip.joints.index(name) for name in OURS.joints]
+    for joint, parent in enumerate(OURS.parents):
+        if OURS.joints[parent].endswith(("knee", "shoulder", "elbow")) or parent >= 22:
+            bone = back[:, row[joint]] - back[:, row[parent]]
+            assert (
+                joint in (10, 11)
+                or angles(bone, figure.joints[:, joint] - figure.joints[:, parent]).max() < 1
+            )
+    assert clip.fps == 20 and angles(clip.turns()[:, row[15], :, 2], world[:, 15, :, 2]).max() < 1
     weights = [c for c in gltf.json["animations"][0]["channels"] if c["target"]["path"] == "weights"]
     keys = gltf.values(gltf.json["animations"][0]["samplers"][weights[0]["sampler"]]["output"]).reshape(40, 2)
     assert keys[-1, 0] == pytest.approx(0.5 if maker == "vrm0" else 1.0, abs=0.01) and keys[0, 0] == 0

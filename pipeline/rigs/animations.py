@@ -1,0 +1,129 @@
+"""Animations of a character's file as clips: `hero.glb/02-walk.animation` is the third one of `hero.glb`.
+
+The inverse of `rig.py`: world rotations of nodes become those of our joints, on the character's bones. Faces
+are not read.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.motion.bvh.motion import write_bvh
+from motionloom.pipeline.rigs.gltf import Gltf
+from motionloom.pipeline.rigs.rig import Rig
+
+Floats = NDArray[np.float64]
+
+SUFFIX = ".animation"
+ENDINGS = (".glb", ".vrm", ".vrma")
+_RATES = (10.0, 120.0)
+_MOST_SECONDS, _MOST_POSES = 3600.0, 10_000_000
+"""Length of a clip, and its frames times the file's nodes: ten minutes of 150 nodes at 120 frames a second."""
+
+
+def clips_in(path: Path) -> dict[str, str]:
+    """Names of the clips of a file -> their captions, the animations' names."""
+    animations = Gltf.read(path).json.get("animations") or []
+    out = {}
+    for number, animation in enumerate(animations):
+        name = str(animation.get("name") or "")[:200]
+        words = re.sub(r"(?<=[a-z])(?=[A-Z])|[_|.]+", " ", name).strip()
+        out[f"{path.name}/{number:02d}-{re.sub(r'[^0-9A-Za-z]+', '-', name)[:40].strip('-')}{SUFFIX}"] = words
+    return out
+
+
+def read_animation(path: Path, label: str) -> bytes:
+    """A clip's BVH text, on our joints, in centimetres."""
+    rig = Rig.read(path.parent)
+    number = int(re.match(r"\d+", path.name)[0]) if re.match(r"\d+", path.name) else -1  # type: ignore[index]
+    animations = rig.gltf.json.get("animations") or []
+    if not 0 <= number < len(animations):
+        raise UserError(f"{label}: {path.parent.name} has {len(animations)} animations")
+    turns, places, fps = _played(rig, animations[number], label)
+    rotations, root = _ours(rig, turns, places)
+    with tempfile.TemporaryDirectory() as folder:
+        write_bvh(Path(folder) / "clip.bvh", rig.skeleton, rotations, root, fps)
+        return (Path(folder) / "clip.bvh").read_bytes()
+
+
+def _ours(rig: Rig, turns: Floats, places: Floats) -> tuple[Floats, Floats]:
+    """Local rotations [T, J, 3, 3] and root [T, 3] of world rotations [T, N, 3, 3] and places of the hips."""
+    parents, names = rig.skeleton.parents, rig.skeleton.joints
+    world = np.empty((len(turns), len(names), 3, 3))
+    for joint, name in enumerate(names):
+        if (node := rig.nodes.get(name)) is None:
+            world[:, joint] = world[:, parents[joint]]
+        else:
+            change = rig.ahead @ turns[:, node] @ rig.turns[node].T @ rig.ahead.T
+            world[:, joint] = change @ rig.laid[joint]
+    local = world.copy()
+    local[:, 1:] = world[:, list(parents[1:])].swapaxes(-1, -2) @ world[:, 1:]
+    return local, places @ rig.ahead.T / rig.unit
+
+
+def _played(rig: Rig, animation: dict[str, Any], label: str) -> tuple[Floats, Floats, float]:
+    """World rotations of all nodes [T, N, 3, 3], places of the hips [T, 3], and the frame rate."""
+    gltf = rig.gltf
+    try:
+        tracks = [
+            (int(one["target"]["node"]), str(one["target"]["path"]), animation["samplers"][one["sampler"]])
+            for one in animation["channels"]
+            if one["target"].get("path") in ("rotation", "translation") and "node" in one["target"]
+        ]
+        read = {
+            (node, path): (
+                gltf.values(int(sampler["input"]))[:, 0],
+                gltf.values(int(sampler["output"])),
+                sampler,
+            )
+            for node, path, sampler in tracks
+        }
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        raise UserError(f"{label}: an animation that cannot be read ({type(error).__name__})") from None
+    longest = max((times for times, _, _ in read.values()), key=len, default=np.zeros(1))
+    if len(longest) < 2 or not np.ptp(longest) > 0:
+        raise UserError(f"{label}: an animation in which nothing moves")
+    fps = float(np.clip(round(1 / float(np.median(np.diff(longest)).clip(1e-4))), *_RATES))
+    seconds = min(float(max(times.max() for times, _, _ in read.values())), _MOST_SECONDS)
+    at = np.arange(int(seconds * fps + 1e-6) + 1) / fps
+    if len(at) * len(gltf.parents) > _MOST_POSES:
+        raise UserError(f"{label}: {len(at)} frames of {len(gltf.parents)} nodes are too many; cut it")
+    turned = np.empty((len(gltf.parents), len(at), 3, 3))
+    worlds = np.empty((len(gltf.parents), len(at), 4, 4))
+    for node in gltf.in_order():
+        place, turn, scale = gltf.local(node)
+        matrix = np.tile(np.eye(4), (len(at), 1, 1))
+        local = np.broadcast_to(turn, (len(at), 3, 3))
+        if (node, "rotation") in read:
+            local = Rotation.from_quat(_sampled(*read[node, "rotation"], at, 4)).as_matrix()
+        matrix[:, :3, :3] = local * scale
+        matrix[:, :3, 3] = (
+            _sampled(*read[node, "translation"], at, 3) if (node, "translation") in read else place
+        )
+        parent = gltf.parents[node]
+        turned[node] = turned[parent] @ local if parent >= 0 else local
+        worlds[node] = worlds[parent] @ matrix if parent >= 0 else matrix
+    return turned.swapaxes(0, 1), worlds[rig.nodes["pelvis"], :, :3, 3], fps
+
+
+def _sampled(times: Floats, keys: Floats, sampler: dict[str, Any], at: Floats, width: int) -> Floats:
+    """Keys at times [T]: [T, W]; quaternions on the straight way, which is near for keys of a recording."""
+    if sampler.get("interpolation") == "CUBICSPLINE":
+        keys = keys[1::3]  # between its two tangents
+    times, keys = times[: len(keys)], keys[: len(times)]
+    if keys.shape[1] != width or not len(keys) or (np.diff(times) < 0).any():
+        raise UserError("an animation whose keys do not fit its times")
+    if width == 4:
+        signs = np.where(np.einsum("tq,tq->t", keys[1:], keys[:-1]) < 0, -1.0, 1.0)
+        keys = keys * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
+    if sampler.get("interpolation") == "STEP":
+        return keys[np.searchsorted(times, at, side="right").clip(1) - 1]
+    return np.stack([np.interp(at, times, column) for column in keys.T], axis=-1)
