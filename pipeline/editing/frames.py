@@ -151,27 +151,28 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     drawn = clip.figure if clip.joints.shape[1] == layout.num_joints else None
     drawn = None if drawn is None else at_rate(drawn, clip.fps, layout.fps)
     joints = resample(clip.joints, clip.fps, layout.fps) if drawn is None else drawn.joints
-    posed = None if clip.posed is None else at_rate(clip.posed, clip.fps, layout.fps)
+    own_turns = clip.posed or clip.figure
+    turned = None if own_turns is None else at_rate(own_turns, clip.fps, layout.fps)
     face = None if clip.face is None else resample(clip.face, clip.fps, layout.fps)
     hands = layout.num_joints > BODY_JOINTS
     if not hands:
         joints = joints[:, :BODY_JOINTS]
     elif not clip.has_hands:
-        if posed is None:
+        if turned is None:
             joints = with_resting_hands(joints)
         else:
-            posed = with_hands(posed)
-            joints = np.concatenate([joints, posed.joints[:, BODY_JOINTS:]], axis=1)
+            turned = with_hands(turned)
+            joints = np.concatenate([joints, turned.joints[:, BODY_JOINTS:]], axis=1)
         remarks.append("hands are not recorded in the clip: they rest where it is kept")
     origin = complex(ground(joints[0, 0]))
     turn = float(facing(joints[:1])[0])
     floor = float(joints[..., 1].min())
     # The clip as its first frame sees it.
     if drawn is None:
-        if posed is None or len(posed.skeleton) != layout.num_joints:
+        if turned is None or len(turned.skeleton) != layout.num_joints:
             figure = fit_rigid(canonicalize(joints), layout.skeleton)
         else:
-            figure = moved(posed, -turn, -origin * np.exp(-1j * turn), -floor)
+            figure = moved(turned, -turn, -origin * np.exp(-1j * turn), -floor)
         world = World(origin, turn, 0.0)
     else:
         figure = moved(drawn, -turn, -origin * np.exp(-1j * turn), -floor)

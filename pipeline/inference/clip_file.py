@@ -183,6 +183,7 @@ def _read_smpl(path: Path) -> RecordedClip:
         raise UserError(f"{path}: no mocap_frame_rate, so its frame rate is not known")
     given = read_smpl(path, str(path), hands=header.hands)
     body = BodyModel.neutral("smplx52" if header.hands else "smpl22")
+    assert given.rotations is not None and given.trans is not None  # a motion of parameters has both
     vectors, trans = upright(given.rotations, given.trans, body)
     local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
     root, skeleton = body.rest_joints()[0] + trans, body.skeleton

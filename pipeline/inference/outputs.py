@@ -86,8 +86,9 @@ def write_motions(
             if writer.together and (len(clips) > 1 or not writer.alone):
                 out.append(new / writer.together)
                 said.update(dict.fromkeys(writer.write(out[-1], Outputs(clips, title, note)) or ()))
-        for line in said if say is not None else ():
-            say(line)
+        if say is not None:
+            for line in said:
+                say(line)
         paths = [folder / path.name for path in out]
         if made_from is not None and any(path.exists() and path.samefile(made_from) for path in paths):
             raise UserError(f"{made_from}: would be replaced by a motion made from it; choose another folder")

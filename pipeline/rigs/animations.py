@@ -26,7 +26,7 @@ SUFFIX = ".animation"
 ENDINGS = (".glb", ".vrm", ".vrma")
 _RATES = (10.0, 120.0)
 _MOST_SECONDS, _MOST_POSES = 3600.0, 10_000_000
-"""Length of a clip, and its frames times the file's nodes: ten minutes of 150 nodes at 120 frames a second."""
+"""Length of a clip, and its frames times the file's nodes: ten minutes of 150 nodes at 120 a second."""
 
 
 def clips_in(path: Path) -> dict[str, str]:
@@ -36,7 +36,8 @@ def clips_in(path: Path) -> dict[str, str]:
     for number, animation in enumerate(animations):
         name = str(animation.get("name") or "")[:200]
         words = re.sub(r"(?<=[a-z])(?=[A-Z])|[_|.]+", " ", name).strip()
-        out[f"{path.name}/{number:02d}-{re.sub(r'[^0-9A-Za-z]+', '-', name)[:40].strip('-')}{SUFFIX}"] = words
+        plain = re.sub(r"[^0-9A-Za-z]+", "-", name)[:40].strip("-")
+        out[f"{path.name}/{number:02d}-{plain}{SUFFIX}"] = words
     return out
 
 
@@ -125,5 +126,5 @@ def _sampled(times: Floats, keys: Floats, sampler: dict[str, Any], at: Floats, w
         signs = np.where(np.einsum("tq,tq->t", keys[1:], keys[:-1]) < 0, -1.0, 1.0)
         keys = keys * np.concatenate([[1.0], np.cumprod(signs)])[:, None]
     if sampler.get("interpolation") == "STEP":
-        return keys[np.searchsorted(times, at, side="right").clip(1) - 1]
+        return np.asarray(keys[np.searchsorted(times, at, side="right").clip(1) - 1])
     return np.stack([np.interp(at, times, column) for column in keys.T], axis=-1)

@@ -208,4 +208,4 @@ class Gltf:
 def _without_flips(turns: Floats) -> Floats:
     """Quaternions [T, 4] with signs such that players take the short way between two of them."""
     signs = np.sign(np.einsum("tq,tq->t", turns[1:], turns[:-1]))
-    return turns * np.concatenate([[1.0], np.cumprod(np.where(signs < 0, -1.0, 1.0))])[:, None]
+    return np.asarray(turns * np.concatenate([[1.0], np.cumprod(np.where(signs < 0, -1.0, 1.0))])[:, None])

@@ -32,7 +32,7 @@ def t_pose(skeleton: Skeleton) -> NDArray[np.float64]:
         side = np.array([1.0 if name.startswith("left") else -1.0, 0.0, 0.0])
         length = np.linalg.norm(out[joint])
         if name.endswith(("knee", "ankle")):
-            out[joint] = [0.0, -length, 0.0]
+            out[joint] = np.array([0.0, -float(length), 0.0])
             continue
         finger = joint >= BODY_JOINTS and "thumb" not in name and parent[-1] in "12"
         if finger or name.endswith(("elbow", "wrist")):

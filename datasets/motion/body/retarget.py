@@ -47,6 +47,8 @@ _BENT = 0.15
 _CARRIED = ("hip", "spine1", "collar")
 _UPRIGHT = 0.7
 """Cosine to the vertical that head and legs of a standing figure have at least."""
+_AHEAD = 0.3
+"""Share of a foot's bone that points ahead at least in such a figure."""
 _ALONG = 0.97
 """Cosine to one of its axes of a bone that lies along it."""
 _AXES = np.array(
@@ -156,9 +158,9 @@ def posed_by(
             weights[joint] = 1.0
     local, root = solve_poses(targets, skeleton.offsets, skeleton.parents, local, targets[:, 0], weights)
     _, now = forward_kinematics(local, root, skeleton.offsets, skeleton.parents)
-    for joint in np.flatnonzero(known):
-        if joint not in parents:
-            local[:, joint] = now[:, parents[joint]].swapaxes(-1, -2) @ world[:, joint]
+    for end in np.flatnonzero(known):
+        if end not in parents:
+            local[:, end] = now[:, parents[end]].swapaxes(-1, -2) @ world[:, end]
     return RigidMotion.posed(skeleton, local, root, joints)
 
 
@@ -246,12 +248,12 @@ def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, 
     for joint in range(len(own)):
         ends = [child for child, parent in enumerate(own.parents) if parent == joint]
         if len(ends) == 1:
-            bone = np.einsum("tji,tj->ti", turns[:, joint], points[:, ends[0]] - points[:, joint])
+            way = np.einsum("tji,tj->ti", turns[:, joint], points[:, ends[0]] - points[:, joint])
             # Axes that are not along the bone are nobody's convention.
-            usable[joint] &= np.abs(_unit(np.median(bone, axis=0))).max() > _ALONG
+            usable[joint] &= np.abs(_unit(np.median(way, axis=0))).max() > _ALONG
     for chain in _CHAINS:
         left = [own.index(name) for name in chain]
-        right = own.mirror[left]
+        right = own.mirror[left].tolist()
         if not usable[[*left, *right]].all():
             continue
         scores = np.einsum("kij,ij->k", _AXES, axes[left].sum(axis=0))
@@ -286,7 +288,8 @@ def _stands(rest: Floats, skeleton: Skeleton) -> bool:
 
     legs = [bone(f"{side}_{joint}") for side in ("left", "right") for joint in ("knee", "ankle")]
     feet = [bone(f"{side}_foot")[2] for side in ("left", "right")]
-    return min(bone("head")[1], bone("neck")[1], *(-leg[1] for leg in legs)) > _UPRIGHT and min(feet) > 0.3
+    upright = min(bone("head")[1], bone("neck")[1], *(-leg[1] for leg in legs))
+    return bool(upright > _UPRIGHT and min(feet) > _AHEAD)
 
 
 def _laid(bones: Floats, aims: Floats) -> Floats:
