@@ -197,6 +197,8 @@ class StageModule(L.LightningModule, ABC):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raise `OtherNetworkError` where the checkpoint's weights do not fit."""
+        if "state_dict" not in checkpoint:  # FSDP has loaded it already
+            return
         there = {name: tuple(value.shape) for name, value in checkpoint["state_dict"].items()}
         here = {name: tuple(value.shape) for name, value in self.state_dict().items()}
         differs = [name for name in {**here, **there} if there.get(name) != here.get(name)]

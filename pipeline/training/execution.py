@@ -96,6 +96,8 @@ def make_trainer(
         callbacks=list(callbacks),
         profiler=profiler,
         limit_val_batches=0,
+        check_val_every_n_epoch=None,  # what looks at validations looks behind each, not at an epoch's end
+        val_check_interval=config.steps,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,

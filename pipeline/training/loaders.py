@@ -15,6 +15,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
+from typing import Any
 
 import torch
 from lightning.pytorch.utilities import move_data_to_device
@@ -120,6 +121,7 @@ class Loader:
         self.waiting: Callable[[], AbstractContextManager[object]] = nullcontext
         """Gives a context around each wait for a batch."""
         self._opened: DataLoader[Batch] | None = None
+        self._packed: Any = None
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -144,9 +146,10 @@ class Loader:
         """End the workers now, which ignore signals; without this they end with the last reference to their
         iterator. An error that came from a worker holds its own traceback, and so the iterator, in a circle.
         """
-        if self._opened is not None and self._opened._iterator is not None:
-            self._opened._iterator._shutdown_workers()  # type: ignore[attr-defined]
-            self._opened._iterator = None
+        if self._packed is not None:
+            self._packed._shutdown_workers()
+            self._packed = None
+        self._opened = None
 
     def _ready(self) -> Iterator[Batch]:
         if self._opened is None:
@@ -157,8 +160,8 @@ class Loader:
         # Started with the first process of all, it would let SIGTERM through to that one.
         resource_tracker.ensure_running()
         with signals_blocked():
-            packed = iter(self._opened)
-        yield from map(Packed.unpacked, packed)  # type: ignore[arg-type]
+            self._packed = iter(self._opened)
+        yield from map(Packed.unpacked, self._packed)
 
     def _open(self) -> DataLoader[Batch]:
         first, last = self.steps.span()

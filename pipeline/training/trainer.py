@@ -81,7 +81,7 @@ def fit(
         training = Training(context, config, data, writer, average, extra, signals, at_peak)
         callbacks = [*([] if average is None else [average]), *extra, training]
         trainer = make_trainer(hardware, config, module, callbacks, writer, training.metrics.folder)
-        resume = lead_finds(partial(_find_resume_point, context))
+        training.resume = resume = lead_finds(partial(_find_resume_point, context))
         try:
             with deterministic(hardware):
                 trainer.fit(module, data, ckpt_path=resume, weights_only=True)
@@ -121,6 +121,8 @@ class Training(L.Callback):
     failures: FailureGuard
     agreement: Agreement
     stall: StallTimer
+    resume: Path | None = None
+    """The checkpoint that the training goes on from."""
     _step: int
     """Steps that are done and seen to."""
 
@@ -226,7 +228,7 @@ class Training(L.Callback):
         text = str(error)
         if isinstance(error, OtherNetworkError):
             return UserError(
-                f"{self.folder}: {text}, another network than {name} has now; give the settings that it "
+                f"{self.resume}: {text}, another network than {name} has now; give the settings that it "
                 f"began with, or begin anew with --from {name}"
             )
         if isinstance(error, OSError) and error.errno is not None and error.filename is None:

@@ -76,6 +76,18 @@ def test_a_validation_is_cut_short_and_made_up_for(training: Train, tmp_path: Pa
     assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
 
 
+def test_ctrl_c_ends_at_once_and_is_not_turned_off(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            train(tmp_path / "hit", signalled={8: signal.SIGINT}, **FULL)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    again, whole = train(tmp_path / "hit", **FULL), train(tmp_path / "whole", **FULL)
+    assert_same_stage(tmp_path / "whole", tmp_path / "hit", whole, again)
+
+
 def test_signals_are_noted_and_the_first_counts() -> None:
     before = {number: signal.getsignal(number) for number in SIGNALS}
     with Signals() as signals:

@@ -18,14 +18,14 @@ from lightning.pytorch.tuner import Tuner
 from plain_training import take_steps
 from rank_cases import CASES
 from same_stage import assert_equal
-from tiny_adversaries import Duel, Vectors
+from tiny_adversaries import Duel, Vectors, train
 from torch.utils.data import DataLoader
 from two_ranks import pair_of, work
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.stage_module import StageModule
-from motionloom.pipeline.training.config import TrainConfig
+from motionloom.pipeline.training.config import CALLBACKS, TrainConfig, TrainingCallback
 from motionloom.pipeline.training.lightning_data import StageData
 from motionloom.pipeline.training.trained_stage import Batches
 
@@ -346,6 +346,17 @@ def test_an_average_leaves_tables_and_codebooks_alone(tmp_path: Path) -> None:
         assert_equal(dict(plain.named_buffers()), dict(net.named_buffers()))
         for param, before in zip(net.parameters(), first.parameters(), strict=True):
             torch.testing.assert_close(param, before, rtol=0, atol=1e-9)
+
+
+def test_a_recipe_names_callbacks_and_a_profiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A callback sees validations as under any Trainer, and ends the training behind the second."""
+    early = TrainingCallback("early", lambda _: given.EarlyStopping("val/loss", min_delta=1e9, patience=1))
+    monkeypatch.setitem(CALLBACKS, "early", early)
+    duel = train(tmp_path, validate_every=6, callbacks=("early",), profiler="simple")
+    assert duel.step == 12
+    assert "run_training_batch" in next((tmp_path / "logs").glob("*profile*")).read_text()
+    with pytest.raises(ValueError, match="did you mean 'early'"):
+        TrainConfig(callbacks=("earli",))
 
 
 def worker(folder: Path) -> None:
