@@ -1,7 +1,7 @@
 """Networks, losses and LightningModules of the two papers, and the figures that judge motion.
 
 The public names are in `__init__.pyi`; each is imported on first use. Networks, losses and figures need torch
-alone; the `...Module` classes bring in Lightning.
+alone; the `...Module` classes and `AveragedWeights` bring in Lightning.
 """
 
 import lazy_loader

@@ -15,7 +15,6 @@ from .runs.api import run_recipe as run_recipe
 from .runs.recipe import Recipe as Recipe
 from .runs.recipe import load_recipe as load_recipe
 from .runs.training import finish as finish
-from .runs.training import training as training
 from .training.config import TrainingCallback as TrainingCallback
-from .training.lightning_data import StageData as StageData
+from .training.loaders import StageData as StageData
 from .training.trained_stage import TrainedStage as TrainedStage

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import GradientAccumulationScheduler, WeightAveraging
 from lightning.pytorch.strategies import DDPStrategy, ModelParallelStrategy, SingleDeviceStrategy
-from torch import Tensor
+from lightning.pytorch.trainer.states import TrainerFn
+from torch import Tensor, nn
 
 from motionloom.datasets.base.errors import UserError
-
-if TYPE_CHECKING:
-    from motionloom.models.training.stage_module import Batch, StageModule
 
 PRECISIONS = ("32-true", "bf16-mixed", "64-true")
 """Others round the weights themselves, or need losses scaled that several terms share."""
@@ -25,11 +23,15 @@ REFUSED: dict[type[L.Callback], str] = {
 """Callbacks, with their subclasses, that train a stage's module wrongly."""
 
 
-def require_trainer(module: StageModule, trainer: L.Trainer, stage: str) -> None:
+class OtherNetworkError(UserError):
+    """A checkpoint is of another network."""
+
+
+def require_trainer(module: L.LightningModule, trainer: L.Trainer, stage: str, *, shardable: bool) -> None:
     """Raise `UserError` where a Trainer would train, validate or test `module` wrongly or not at all."""
     if stage in ("test", "predict"):
         raise UserError(
-            f"trainer.{trainer.state.fn.value}: a stage's module is trained and validated; take "
+            f"trainer.{TrainerFn(stage).value}: a stage's module is trained and validated; take "
             f"trainer.validate, and MotionModel for motions"
         )
     if module._compiler_ctx is not None:
@@ -39,7 +41,7 @@ def require_trainer(module: StageModule, trainer: L.Trainer, stage: str) -> None
     strategy = trainer.strategy
     if not isinstance(strategy, SingleDeviceStrategy | DDPStrategy | ModelParallelStrategy):
         raise UserError(f"strategy {type(strategy).__name__}: take ddp, which keeps codebooks whole")
-    if isinstance(strategy, ModelParallelStrategy) and not module.shardable:
+    if isinstance(strategy, ModelParallelStrategy) and not shardable:
         raise UserError(f"strategy ModelParallelStrategy: {type(module).__name__} must be whole; take ddp")
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         for kind, why in REFUSED.items():
@@ -47,9 +49,9 @@ def require_trainer(module: StageModule, trainer: L.Trainer, stage: str) -> None
                 raise UserError(f"callback {type(callback).__name__}: {why}")
 
 
-def require_batch(batch: Batch, module: StageModule) -> None:
-    """Raise `UserError` where a batch's numbers or lengths cannot be meant."""
-    own = next((param.dtype for param in module.net.parameters()), torch.float32)
+def require_batch(batch: Mapping[str, object], net: nn.Module) -> None:
+    """Raise `UserError` where a batch's numbers or lengths cannot be meant for `net`."""
+    own = next((param.dtype for param in net.parameters()), torch.float32)
     for name, value in batch.items():
         if isinstance(value, Tensor) and value.dtype == torch.float64 != own:
             raise UserError(f"batch: '{name}' is float64 and the network {own}; give {name}.float()")
@@ -61,3 +63,13 @@ def require_batch(batch: Batch, module: StageModule) -> None:
         raise UserError("batch: 'length' must be numbers of frames from 0 on, and one of them above 0")
     if most is not None and int(length.max()) > most:
         raise UserError(f"batch: 'length' says {int(length.max())} frames and 'motion' has {most}")
+
+
+def require_weights(there: Mapping[str, Tensor], here: Mapping[str, Tensor]) -> None:
+    """Raise `OtherNetworkError` where the weights of a checkpoint are not of the network that is here."""
+    for name in dict.fromkeys([*here, *there]):
+        sizes = [tuple(side[name].shape) if name in side else "nothing" for side in (there, here)]
+        if sizes[0] != sizes[1]:
+            raise OtherNetworkError(
+                f"the checkpoint does not fit: {name} is {sizes[0]} there and {sizes[1]} here"
+            )

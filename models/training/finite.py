@@ -4,19 +4,34 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple, Protocol
 
 import lightning as L
 import torch
+from torch import Tensor
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.training.distributed import world_size
 
-if TYPE_CHECKING:
-    from motionloom.models.training.stage_module import StageModule
-
 LOG_EVERY = 10
 """Steps that a row of the log averages."""
+
+
+class StepFigures(NamedTuple):
+    """Losses and metrics of one part of a step, still on the device."""
+
+    step: int
+    """Counted from 1, as in the log."""
+    names: tuple[str, ...]
+    values: Tensor
+    """float32 [len(names)]."""
+
+
+class Recorder(Protocol):
+    """What notes the figures of a training: a `StageModule`."""
+
+    figures: list[StepFigures]
+    norms: list[tuple[int, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -40,7 +55,7 @@ class Failure:
         return f"in step {self.step} the loss is not finite ({terms})"
 
 
-def first_failure(module: StageModule) -> Failure | None:
+def first_failure(module: Recorder) -> Failure | None:
     """Return the first failure among the figures of the latest steps, which are cleared."""
     figures, norms = module.figures[:], module.norms[:]
     module.figures.clear()
@@ -68,17 +83,16 @@ def _is_loss(name: str) -> bool:
     return name == "loss" or name.endswith("_loss")
 
 
-def check_is_due(module: StageModule) -> bool:
+def check_is_due(step: int, device: torch.device) -> bool:
     """Whether to look after this step: reading a figure waits for a GPU, and ranks for each other."""
-    alone = world_size() == 1 and module.device.type == "cpu"
-    return alone or module.step % LOG_EVERY == 0
+    return (world_size() == 1 and device.type == "cpu") or step % LOG_EVERY == 0
 
 
 class StopNotFinite(L.Callback):
     """Ends a training with `UserError` where its loss or gradient is not finite."""
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: object) -> None:
-        if check_is_due(module):
+        if check_is_due(module.step, module.device):
             self._check(module)
 
     def on_save_checkpoint(self, trainer: L.Trainer, module: Any, checkpoint: dict[str, Any]) -> None:
@@ -87,7 +101,7 @@ class StopNotFinite(L.Callback):
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         self._check(module)
 
-    def _check(self, module: StageModule) -> None:
+    def _check(self, module: Recorder) -> None:
         failure = first_failure(module)
         if failure is not None:
             raise UserError(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field
 from torch import nn
 from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from motionloom.datasets.base.config import Config
 
@@ -60,3 +61,22 @@ class OptimConfig(Config):
             return 1.0
         done = (step - self.warmup_steps) / max(1, max_steps - self.warmup_steps)
         return 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+
+
+class StepSchedule(LambdaLR):
+    """Learning-rate schedule that depends on the step alone, as a factor of `lr`."""
+
+    def set_step(self, step: int) -> float:
+        """Set and return the learning rate of a step, whichever step came before."""
+        self.last_epoch, factor = step, self.lr_lambdas[0](step)
+        for group, first in zip(self.optimizer.param_groups, self.base_lrs, strict=True):
+            group["lr"] = first * factor
+        self._last_lr = [group["lr"] for group in self.optimizer.param_groups]
+        return float(self._last_lr[0])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the step, which is all that a rate depends on."""
+        return {"last_epoch": self.last_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Nothing: a training sets the step that it goes on from."""

@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import IO, Any, NamedTuple, Self, TypedDict
+from typing import IO, Any, Self, TypedDict
 
 import lightning as L
 import torch
@@ -28,18 +28,19 @@ from lightning.pytorch.utilities.types import OptimizerLRSchedulerConfig
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LambdaLR
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.layers.frozen import Frozen
-from motionloom.models.layers.transformer import Block
-from motionloom.models.training.any_trainer import require_batch, require_trainer
+from motionloom.models.training.any_trainer import require_batch, require_trainer, require_weights
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.compiled import Compiled
 from motionloom.models.training.distributed import alone, rank
 from motionloom.models.training.finite import LOG_EVERY as LOG_EVERY
+from motionloom.models.training.finite import StepFigures as StepFigures
 from motionloom.models.training.finite import StopNotFinite
 from motionloom.models.training.optim import OptimConfig as OptimConfig
+from motionloom.models.training.optim import StepSchedule as StepSchedule
+from motionloom.models.training.sharding import cut_over, whole_weights
 
 Batch = dict[str, Any]
 """Tensors, and conditions of tensors, by name (`datasets/loading`)."""
@@ -51,39 +52,6 @@ class Means(TypedDict):
     names: list[str]
     sums: Tensor
     count: int
-
-
-class StepFigures(NamedTuple):
-    """Losses and metrics of one part of a step, still on the device."""
-
-    step: int
-    """Counted from 1, as in the log."""
-    names: tuple[str, ...]
-    values: Tensor
-    """float32 [len(names)]."""
-
-
-class StepSchedule(LambdaLR):
-    """Learning-rate schedule that depends on the step alone, as a factor of `lr`."""
-
-    def set_step(self, step: int) -> float:
-        """Set and return the learning rate of a step, whichever step came before."""
-        self.last_epoch, factor = step, self.lr_lambdas[0](step)
-        for group, first in zip(self.optimizer.param_groups, self.base_lrs, strict=True):
-            group["lr"] = first * factor
-        self._last_lr = [group["lr"] for group in self.optimizer.param_groups]
-        return float(self._last_lr[0])
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the step, which is all that a rate depends on."""
-        return {"last_epoch": self.last_epoch}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Nothing: a training sets the step that it goes on from."""
-
-
-class OtherNetworkError(UserError):
-    """A checkpoint is of another network."""
 
 
 class StageModule(L.LightningModule, ABC):
@@ -139,7 +107,7 @@ class StageModule(L.LightningModule, ABC):
 
     def setup(self, stage: str) -> None:
         """Take `accumulate_grad_batches` over from a Trainer; `UserError` where it would train wrongly."""
-        require_trainer(self, self.trainer, stage)
+        require_trainer(self, self.trainer, stage, shardable=self.shardable)
         self._seen = set()
         if self.automatic_optimization:
             self.accumulate = self.trainer.accumulate_grad_batches
@@ -151,21 +119,11 @@ class StageModule(L.LightningModule, ABC):
         return [*([AveragedWeights(self.ema)] if self.ema else []), StopNotFinite()]
 
     def configure_model(self) -> None:
-        """Under FSDP, replace the network by a copy that is cut over the ranks.
-
-        Every transformer block is one unit, gathered when it runs and resharded after it; the rest
-        (embeddings, heads) is the last unit. Gradients are averaged over ranks as in DDP, and nothing is
-        gathered in a lower precision than it is kept in, so training equals DDP up to the order of sums.
-        """
-        if self._trainer is None or not isinstance(self.trainer.strategy, ModelParallelStrategy):
-            return
-        from torch.distributed.fsdp import fully_shard  # imported where it is used: it takes a second
-
-        assert self.device_mesh is not None
-        self._whole.append(self.net)
-        self.net = copy.deepcopy(self.net)
-        for part in [*(part for part in self.net.modules() if isinstance(part, Block)), self.net]:
-            fully_shard(part, mesh=self.device_mesh["data_parallel"])
+        """Under FSDP, replace the network by a copy that is cut over the ranks."""
+        if self._trainer is not None and isinstance(self.trainer.strategy, ModelParallelStrategy):
+            assert self.device_mesh is not None
+            self._whole.append(self.net)
+            self.net = cut_over(copy.deepcopy(self.net), self.device_mesh["data_parallel"])
 
     def on_fit_start(self) -> None:
         """Move frozen networks to the device of `net`."""
@@ -184,28 +142,16 @@ class StageModule(L.LightningModule, ABC):
 
     def on_fit_end(self) -> None:
         """Give the whole network back its weights, where a cut copy was trained; a collective."""
-        if not self._whole:
-            return
-        from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict
-
-        state = get_model_state_dict(
-            self.net, options=StateDictOptions(full_state_dict=True, cpu_offload=True)
-        )
-        self.net = self._whole.pop()
-        if rank() == 0:
-            self.net.load_state_dict(state)
+        if self._whole:
+            weights = whole_weights(self.net)
+            self.net = self._whole.pop()
+            if rank() == 0:
+                self.net.load_state_dict(weights)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Raise `OtherNetworkError` where the checkpoint's weights do not fit."""
-        if "state_dict" not in checkpoint:  # FSDP has loaded it already
-            return
-        there = {name: tuple(value.shape) for name, value in checkpoint["state_dict"].items()}
-        here = {name: tuple(value.shape) for name, value in self.state_dict().items()}
-        differs = [name for name in {**here, **there} if there.get(name) != here.get(name)]
-        if differs:
-            name = differs[0]
-            sizes = f"{there.get(name, 'nothing')} there and {here.get(name, 'nothing')} here"
-            raise OtherNetworkError(f"the checkpoint does not fit: {name} is {sizes}")
+        if "state_dict" in checkpoint:  # FSDP has loaded it already
+            require_weights(checkpoint["state_dict"], self.state_dict())
 
     @classmethod
     def load_from_checkpoint(
@@ -340,7 +286,7 @@ class StageModule(L.LightningModule, ABC):
         """Context in which losses read a batch: `UserError` where it lacks a key, or the first is wrong."""
         if self._trainer is not None and self.training not in self._seen:
             self._seen.add(self.training)
-            require_batch(batch, self)
+            require_batch(batch, self.net)
         try:
             yield
         except KeyError as error:

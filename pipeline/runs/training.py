@@ -16,7 +16,8 @@ from motionloom.pipeline.runs.plan import Selection, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
 from motionloom.pipeline.store.run_folder import identity_of, stage_folder
 from motionloom.pipeline.store.weights import save_model
-from motionloom.pipeline.training.lightning_data import StageData, open_training
+from motionloom.pipeline.training.lightning_data import open_training
+from motionloom.pipeline.training.loaders import StageData
 from motionloom.pipeline.training.trained_stage import TrainedStage
 
 

@@ -19,16 +19,18 @@ import re
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, BinaryIO, TypedDict, cast
 
 import torch
 import torch.distributed as dist
 from lightning.pytorch.plugins.io import CheckpointIO
+from rich.console import Console
 from torch import Tensor
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import HashingFile, atomic_file, sync_folder
+from motionloom.datasets.base.files import HashingFile, atomic_file, remove_temporaries, sync_folder
 from motionloom.datasets.base.json_doors import require_plain
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.stage_module import Means, StageModule
@@ -219,6 +221,18 @@ def readable(folder: Path, say: Callable[[str], None] = warnings.warn) -> Iterat
             say(f"{path}: {error}; passed over for the checkpoint before it")
             continue
         yield path, content
+
+
+def find_resume_point(folder: Path, console: Console) -> Path | None:
+    """Return the newest checkpoint that can be read; temporary and damaged files are deleted."""
+    if folder.is_dir():
+        remove_temporaries(folder)
+    say = partial(console.print, style="yellow", markup=False, soft_wrap=True)
+    newest = next((path for path, _ in readable(folder, say)), None)
+    for path in folder.glob("*.ckpt"):
+        if newest is not None and (step_of(path) or 0) > (step_of(newest) or 0):
+            path.unlink()  # damaged: the training writes this step again
+    return newest
 
 
 class _Sink(HashingFile):

@@ -38,6 +38,14 @@ EvalSource = Callable[[], SizedBatches]
 
 
 @dataclass(frozen=True)
+class Batches:
+    """Sources of a training's batches."""
+
+    train: BatchSource
+    validation: EvalSource | None
+
+
+@dataclass(frozen=True)
 class TrainingCallback:
     """A callback of Lightning's by its name in recipes; `make` is called when the training of a stage begins.
 

@@ -21,7 +21,9 @@ import torch.distributed as dist
 from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.os_errors import full_place
 from motionloom.datasets.shards.checksums import state_of
+from motionloom.models.training.any_trainer import OtherNetworkError
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.finite import first_failure
 from motionloom.models.training.stage_module import StageModule
@@ -104,6 +106,34 @@ class ShardWatch:
             f"{list(self._states)[number]}: the shard has changed, or is gone, since this training began to "
             f"read it; put it back, or run again from the stage that made it; its checkpoints are kept"
         )
+
+
+def explained(error: Exception, name: str, logs: Path, resume: Path | None) -> Exception:
+    """Return the error that says what happened to stage `name` in the user's words; or `error` itself.
+
+    `logs` is the folder of stacks, `resume` the checkpoint that the training went on from.
+    """
+    text = str(error)
+    if isinstance(error, OtherNetworkError):
+        return UserError(
+            f"{resume}: {text}, another network than {name} has now; give the settings that it began with, "
+            f"or begin anew with --from {name}"
+        )
+    if isinstance(error, OSError) and error.errno is not None and error.filename is None:
+        error.filename = full_place(error, logs.parent / "checkpoints")
+    if not isinstance(error, RuntimeError):
+        return error
+    if isinstance(error, dist.DistBackendError) or "by peer" in text or "imed out" in text:
+        return TeamError.lost(logs)
+    if "killed by signal: Killed" in text:
+        return UserError(
+            f"stage {name}: a loader worker was killed, as systems do that are short of memory; "
+            f"lower hardware.workers and run the same command, which goes on from the last checkpoint"
+        )
+    if "does not have a deterministic implementation" in text:
+        what = text.partition(",")[0]
+        return UserError(f"stage {name}: {what}; set hardware.deterministic: false")
+    return error
 
 
 class StallTimer:

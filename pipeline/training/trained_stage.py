@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
 from inspect import signature
 from os.path import relpath
 from pathlib import Path
@@ -45,7 +44,8 @@ from motionloom.pipeline.store.weights import (
     load_weights,
     save_model,
 )
-from motionloom.pipeline.training.config import CALLBACKS, BatchSource, EvalSource, TrainedStageConfig
+from motionloom.pipeline.training.config import CALLBACKS, TrainedStageConfig
+from motionloom.pipeline.training.config import Batches as Batches
 
 if TYPE_CHECKING:
     from motionloom.models.training.stage_module import Batch, StageModule
@@ -56,14 +56,6 @@ Log = Callable[[str], None]
 C = TypeVar("C", bound=TrainedStageConfig)
 I = TypeVar("I", bound=Inputs)  # noqa: E741
 N = TypeVar("N", bound=nn.Module)
-
-
-@dataclass(frozen=True)
-class Batches:
-    """Sources of a training's batches."""
-
-    train: BatchSource
-    validation: EvalSource | None
 
 
 class Example(NamedTuple):

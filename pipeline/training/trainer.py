@@ -12,7 +12,6 @@ import signal
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -21,26 +20,23 @@ import torch.distributed as dist
 from torch import Tensor
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.files import remove_temporaries
-from motionloom.datasets.base.os_errors import full_place
 from motionloom.datasets.loading.plan import Share
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.distributed import rank, world_size
 from motionloom.models.training.finite import check_is_due
-from motionloom.models.training.stage_module import LOG_EVERY, OtherNetworkError, StageModule
+from motionloom.models.training.stage_module import LOG_EVERY, StageModule
 from motionloom.pipeline.contract.stage import StageContext
 from motionloom.pipeline.launch.process import Interrupted, TeamError
 from motionloom.pipeline.launch.team import lead_finds
 from motionloom.pipeline.store.training_log import optional, rise_of_loss
 from motionloom.pipeline.training.checkpointing import (
     BackgroundWriter,
+    find_resume_point,
     load_row,
     name_of,
-    readable,
     rows_of_ranks,
-    step_of,
 )
-from motionloom.pipeline.training.config import CALLBACKS, BatchSource, EvalSource, TrainConfig
+from motionloom.pipeline.training.config import CALLBACKS, Batches, BatchSource, EvalSource, TrainConfig
 from motionloom.pipeline.training.execution import (
     compile_module,
     deterministic,
@@ -48,12 +44,11 @@ from motionloom.pipeline.training.execution import (
     prepare_module,
     set_threads,
 )
-from motionloom.pipeline.training.failures import FailureGuard, ShardWatch, StallTimer
-from motionloom.pipeline.training.lightning_data import StageData
+from motionloom.pipeline.training.failures import FailureGuard, ShardWatch, StallTimer, explained
+from motionloom.pipeline.training.loaders import StageData
 from motionloom.pipeline.training.metric_log import MetricLog
 from motionloom.pipeline.training.preemption import Agreement, Signals
 from motionloom.pipeline.training.telemetry import SampleProcess, StepProgress, Telemetry
-from motionloom.pipeline.training.trained_stage import Batches
 from motionloom.pipeline.training.utilization import pass_flops, peak_flops
 
 
@@ -81,7 +76,7 @@ def fit(
         training = Training(context, config, data, writer, average, extra, signals, at_peak)
         callbacks = [*([] if average is None else [average]), *extra, training]
         trainer = make_trainer(hardware, config, module, callbacks, writer, training.metrics.folder)
-        training.resume = resume = lead_finds(partial(_find_resume_point, context))
+        resume = lead_finds(partial(find_resume_point, training.folder, context.console))
         try:
             with deterministic(hardware):
                 trainer.fit(module, data, ckpt_path=resume, weights_only=True)
@@ -90,7 +85,7 @@ def fit(
                 raise KeyboardInterrupt from None
             raise
         except Exception as error:
-            told = training.explain(error)
+            told = explained(training.shards.explain(error), context.name, training.metrics.folder, resume)
             if told is error:
                 raise
             raise told from (None if isinstance(told, TeamError) else error)
@@ -121,8 +116,6 @@ class Training(L.Callback):
     failures: FailureGuard
     agreement: Agreement
     stall: StallTimer
-    resume: Path | None = None
-    """The checkpoint that the training goes on from."""
     _step: int
     """Steps that are done and seen to."""
 
@@ -177,7 +170,7 @@ class Training(L.Callback):
             return
         self._step = step
         self.telemetry.end_step()
-        if check_is_due(module):
+        if check_is_due(step, module.device):
             self.failures.check()
         if step % LOG_EVERY == 0:
             self._log_row()
@@ -221,31 +214,6 @@ class Training(L.Callback):
         with suppress(UserError, OSError):  # the error says more than one of the writing
             self._finish_writing()
         self.metrics.fail()
-
-    def explain(self, error: Exception) -> Exception:
-        """Return the error that says what happened in the user's words; `error` itself where it does."""
-        name, error = self.context.name, self.shards.explain(error)
-        text = str(error)
-        if isinstance(error, OtherNetworkError):
-            return UserError(
-                f"{self.resume}: {text}, another network than {name} has now; give the settings that it "
-                f"began with, or begin anew with --from {name}"
-            )
-        if isinstance(error, OSError) and error.errno is not None and error.filename is None:
-            error.filename = full_place(error, self.folder)
-        if not isinstance(error, RuntimeError):
-            return error
-        if isinstance(error, dist.DistBackendError) or "by peer" in text or "imed out" in text:
-            return TeamError.lost(self.metrics.folder)
-        if "killed by signal: Killed" in text:
-            return UserError(
-                f"stage {name}: a loader worker was killed, as systems do that are short of memory; "
-                f"lower hardware.workers and run the same command, which goes on from the last checkpoint"
-            )
-        if "does not have a deterministic implementation" in text:
-            what = text.partition(",")[0]
-            return UserError(f"stage {name}: {what}; set hardware.deterministic: false")
-        return error
 
     def close(self) -> None:
         """End what shows and watches the steps."""
@@ -395,16 +363,3 @@ def _numbers(values: dict[str, Tensor] | dict[str, float | Tensor]) -> dict[str,
 
 def _at_least_float32(value: Tensor) -> Tensor:
     return value if value.dtype in (torch.float32, torch.float64) else value.float()
-
-
-def _find_resume_point(context: StageContext) -> Path | None:
-    """Return the newest checkpoint that can be read, in the lead; temporary and damaged files are deleted."""
-    folder = context.folder / "checkpoints"
-    if folder.is_dir():
-        remove_temporaries(folder)
-    say = partial(context.console.print, style="yellow", markup=False, soft_wrap=True)
-    newest = next((path for path, _ in readable(folder, say)), None)
-    for path in folder.glob("*.ckpt"):
-        if newest is not None and (step_of(path) or 0) > (step_of(newest) or 0):
-            path.unlink()  # damaged: the training writes this step again
-    return newest

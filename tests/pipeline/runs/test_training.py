@@ -23,7 +23,7 @@ from motionloom.pipeline.runs.plan import make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
 from motionloom.pipeline.runs.training import finish, training
 from motionloom.pipeline.store.artifact import Artifact
-from motionloom.pipeline.training.lightning_data import StageData
+from motionloom.pipeline.training.loaders import StageData
 
 SMALL = ["tokenizer", "face_tokenizer", "tma", "gpt", "face_gpt", "face_vae", "face_diffusion"]
 

@@ -26,7 +26,7 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.models.training.averaging import AveragedWeights
 from motionloom.models.training.stage_module import StageModule
 from motionloom.pipeline.training.config import CALLBACKS, TrainConfig, TrainingCallback
-from motionloom.pipeline.training.lightning_data import StageData
+from motionloom.pipeline.training.loaders import StageData
 from motionloom.pipeline.training.trained_stage import Batches
 
 STEPS = 6

@@ -26,8 +26,7 @@ from motionloom.datasets.loading.steps import Steps
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training import loaders
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.lightning_data import StageData
-from motionloom.pipeline.training.loaders import SharedBatches, on_device
+from motionloom.pipeline.training.loaders import SharedBatches, StageData, on_device
 from motionloom.pipeline.training.trained_stage import Batches
 
 GIB = 2**30
