@@ -29,9 +29,9 @@ from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.runs.cluster.launch import launch_recipe
 from motionloom.pipeline.runs.dry_run import estimate
+from motionloom.pipeline.runs.layers import shipped_recipes
 from motionloom.pipeline.runs.plan import make_plan
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.store.yaml import read_yaml
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.launch.hardware import Hardware
-from motionloom.pipeline.runs.resolve import shipped_recipes
+from motionloom.pipeline.runs.layers import shipped_recipes
 from motionloom.pipeline.store.yaml import read_yaml
 
 _LIBRARIES = (

@@ -142,6 +142,9 @@ def run(
 
     Example: `motionloom run humantomato-tiny --set gpt.optim.lr=1e-4 --go-on gpt`
     """
+    from motionloom.pipeline.runs.layers import require_recipe
+
+    require_recipe(recipe, sets or ())  # before all that trains is imported
     from motionloom.pipeline.runs.api import run_recipe
     from motionloom.pipeline.runs.plan import Selection
 

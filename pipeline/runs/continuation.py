@@ -21,7 +21,7 @@ from pydantic import JsonValue
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.stage import Stage
-from motionloom.pipeline.runs.resolve import Tree
+from motionloom.pipeline.runs.layers import Tree
 from motionloom.pipeline.store.artifact import Change
 from motionloom.pipeline.store.files import fingerprint_of
 from motionloom.pipeline.store.yaml import flatten, setting_text

@@ -14,7 +14,7 @@ from pathlib import Path
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.pipeline.contract.lookup import outside_stage
 from motionloom.pipeline.contract.stage import CompletedStage, Every, Role, Stage
-from motionloom.pipeline.runs.resolve import place_name
+from motionloom.pipeline.runs.layers import place_name
 from motionloom.pipeline.store.artifact import Artifact, require_consistent
 from motionloom.pipeline.store.run_folder import in_export, is_place, label_of, owner_of, stage_folder
 

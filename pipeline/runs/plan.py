@@ -26,8 +26,8 @@ from motionloom.pipeline.contract.stage import Every, NotThereError, Stage, fing
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.continuation import Continuation, Started, continuation, training_facts
 from motionloom.pipeline.runs.inputs import require_elsewhere
+from motionloom.pipeline.runs.layers import Tree
 from motionloom.pipeline.runs.recipe import Recipe
-from motionloom.pipeline.runs.resolve import Tree
 from motionloom.pipeline.store.artifact import Artifact, InputStage, Terms
 from motionloom.pipeline.store.data import Data
 from motionloom.pipeline.store.files import fingerprint_of, read_record

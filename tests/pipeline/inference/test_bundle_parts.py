@@ -10,8 +10,8 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.lookup import finished_stages, generators_of
 from motionloom.pipeline.contract.stage import GENERATOR
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.runs.layers import shipped_recipes
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
-from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.store.artifact import Artifact, InputStage
 
 

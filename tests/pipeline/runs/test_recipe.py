@@ -12,9 +12,9 @@ from rich.console import Console
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
 from motionloom.pipeline.runs.api import run_recipe
+from motionloom.pipeline.runs.layers import shipped_recipes
 from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe
-from motionloom.pipeline.runs.resolve import shipped_recipes
 from motionloom.pipeline.store.yaml import read_yaml
 
 QUIET = Console(quiet=True)

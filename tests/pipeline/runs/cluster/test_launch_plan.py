@@ -11,9 +11,9 @@ import pytest
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.launch.cluster import ClusterOptions
 from motionloom.pipeline.runs.cluster.launch_plan import LaunchPlan, make_launch_plan
+from motionloom.pipeline.runs.layers import shipped_recipes
 from motionloom.pipeline.runs.plan import Selection, selected
 from motionloom.pipeline.runs.recipe import load_recipe
-from motionloom.pipeline.runs.resolve import shipped_recipes
 
 
 def plan_of(name: str | Path, *overrides: str, nodes: int = 1, gpus: int = 1, parts: int = 1) -> LaunchPlan:
