@@ -1,14 +1,10 @@
 """Is a real song followed? Dances on their own songs, on the same beats shifted, and on each other's songs.
 
-    python benchmarks/real_songs.py MODEL song.ogg another.mp3 third.wav
-    python benchmarks/real_songs.py MODEL songs... --train SHARDS --record real_songs
-    python benchmarks/real_songs.py MODEL songs... --measures --record song_measures
+    python benchmarks/real_songs.py MODEL /usr/share/games/fretsonfire/data/songs --train SHARDS
 
-Stretches of every song are danced to, from several seeds. The beats are those of a file beside the song
-(`song.beats`, a line of seconds each) or librosa's of the whole song, whatever the model itself hears, and no
-part of any choice. librosa's come late by what `benchmarks/beats.py` measures on songs whose beats are
-known, which is taken off (`--late 0` leaves it). Beat Align is UDE's (each of the music's beats looks for
-the nearest of the dance's), at 60 frames a second.
+Stretches of every song are danced to, from several seeds. The beats are charted by hand (`charted.py` says
+where such songs are), and the model does not know them. Beat Align is UDE's (each of the music's beats looks
+for the nearest of the dance's), at 60 frames a second.
 
 - *own against shifted*: the score over that of the same beats moved by a random part of a beat; 1 is a dance
   that does not hear. *any octave* takes the best of the beats, every second one and twice as many, for both.
@@ -19,27 +15,23 @@ the nearest of the dance's), at 60 frames a second.
   recorded dances that are chosen at random (1 is as varied as a medley of them).
 - *skating*: share of steps in which a foot slides.
 
-With `--measures` the dances are judged by another measure too (librosa's beats as they are, minima of the
-speed at 20 frames a second without smoothing, shifts by any time), one change at a time.
-
-Rivals: a recorded training dance stretched to the tempo of our tracker with its beats on the song's and
-repeated, a random training dance, and standing still.
+Rivals, with `--train`: a recorded training dance stretched to the tempo of our tracker with its beats on the
+song's and repeated, a random training dance, and standing still.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from bench import Column, arguments, command_line, report
+from charted import charted
 from numpy.typing import NDArray
-from scipy.signal import argrelextrema
 from scipy.stats import spearmanr
 
-from motionloom.datasets.audio.features import beats as librosa_beats
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.audio.tracker import track
 from motionloom.datasets.motion.canonical import resample
@@ -58,8 +50,6 @@ RATE = 60.0
 SIGMA = 3 / RATE
 """Seconds, of UDE's formula."""
 SHIFTS = 20
-LATE = 0.028
-"""Seconds that librosa's beats are behind the true ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +59,7 @@ class Stretch:
     song: str
     sound: Sound
     beats: Array
-    """Seconds, the judge's of the whole song."""
+    """Seconds, as they are charted."""
     heard: Array
     """Seconds, our tracker's."""
 
@@ -78,26 +68,18 @@ class Stretch:
         return float(np.median(np.diff(self.beats)))
 
 
-def judged(path: Path, song: Sound, late: float) -> Array:
-    """Seconds of a song's beats."""
-    known = path.with_suffix(".beats")
-    if known.is_file():
-        return np.loadtxt(known, ndmin=1)
-    return librosa_beats(song.samples, song.rate) - late
-
-
-def stretches(path: Path, most: int, seconds: float, late: float) -> list[Stretch]:
-    """Parts of a song from its third second on, spread evenly; those without four beats are left out."""
-    song = Sound.read(path)  # not `read_music`: beats beside the song are for judging alone
-    times, heard = judged(path, song, late), track(song).times
-    room = max(0.0, song.seconds - seconds - 3.0)
-    count = min(most, 1 + int(room // seconds))
+def stretches(place: Path, most: int, seconds: float) -> list[Stretch]:
+    """Parts of each song of a place, spread evenly; those without four beats are left out."""
     out = []
-    for k in range(count):
-        begin = 3.0 + room * k / max(1, count - 1)
-        inside = [of[(of >= begin) & (of < begin + seconds)] - begin for of in (times, heard)]
-        if len(inside[0]) > 3:
-            out.append(Stretch(path.name, song.slice(begin, begin + seconds), *inside))
+    for name, song, times in charted(place):
+        heard = track(song).times
+        room = max(0.0, song.seconds - seconds)
+        count = min(most, 1 + int(room // seconds))
+        for k in range(count):
+            begin = room * k / max(1, count - 1)
+            inside = [of[(of >= begin) & (of < begin + seconds)] - begin for of in (times, heard)]
+            if len(inside[0]) > 3:
+                out.append(Stretch(name, song.slice(begin, begin + seconds), *inside))
     return out
 
 
@@ -187,7 +169,7 @@ class Training:
 
 
 def figures(
-    parts: Sequence[Stretch], dances: Sequence[Array], fps: float, training: Training, seed: int
+    parts: Sequence[Stretch], dances: Sequence[Array], fps: float, training: Training | None, seed: int
 ) -> dict[str, float]:
     """All figures of one dance for each stretch."""
     rng = np.random.default_rng(seed)
@@ -207,100 +189,50 @@ def figures(
     out["own song wins"] = float(np.mean(ahead)) if ahead else float("nan")
     with_sound = [energy(dance, fps, part.sound) for part, dance in zip(parts, dances, strict=True)]
     out["energy"] = float(np.nanmean(with_sound)) if np.isfinite(with_sound).any() else 0.0
-    varied = [spread(rows, training.scale) for dance in dances if len(rows := kinetics(dance, fps)) > 1]
-    out["variety"] = float(np.mean(varied)) / training.variety
+    if training is not None:
+        varied = [spread(rows, training.scale) for dance in dances if len(rows := kinetics(dance, fps)) > 1]
+        out["variety"] = float(np.mean(varied)) / training.variety
     out["skating"] = float(np.mean([foot_skating(dance, fps) for dance in dances]))
     return out
-
-
-MEASURES: dict[str, dict[str, float]] = {
-    "ours": {},
-    "20 frames a second": {"fps": 20.0},
-    "speed not smoothed, 20 frames a second": {"fps": 20.0, "smoothed": 0.0},
-    "librosa's beats as they are": {"late": LATE},
-    "shifts by any time, 200": {"room": 30.0, "shifts": 200},
-    "beats that the model hears": {"heard": 1.0},
-    "the other measure": {"fps": 20.0, "smoothed": 0.0, "late": LATE, "room": 30.0, "shifts": 200},
-}
-"""Changes of our measure: the dance's frames a second, its speed smoothed or not, seconds that the beats are
-later, the range of the shifts (of one beat where none is named) and their number, and whose beats."""
-
-
-def measured(
-    parts: Sequence[Stretch], dances: Sequence[Array], danced_at: float, seed: int, **how: float
-) -> float:
-    """The score over that of shifted beats by a changed measure."""
-    rng, own, moved = np.random.default_rng(seed), list[float](), list[float]()
-    for part, dance in zip(parts, dances, strict=True):
-        rate = how.get("fps", RATE)
-        joints = resample(dance[:, :BODY_JOINTS], danced_at, rate)
-        danced = motion_beats(joints, rate)
-        if how.get("smoothed") == 0:
-            speed = np.linalg.norm(np.diff(joints, axis=0), axis=-1).mean(1)
-            danced = argrelextrema(speed, np.less)[0] / rate
-        beats = (part.heard if "heard" in how else part.beats) + how.get("late", 0.0)
-        moves = rng.uniform(0, how.get("room", part.beat), int(how.get("shifts", SHIFTS)))
-        own.append(score(beats, danced, False))
-        later = [np.sort((beats + move) % part.sound.seconds) for move in moves]
-        moved.append(float(np.mean([score(one, danced, False) for one in later])))
-    return float(np.mean(own) / np.mean(moved))
 
 
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("model", help="a run, an export, or a model of the package")
-    parser.add_argument("songs", type=Path, nargs="+")
+    parser.add_argument("places", type=Path, nargs="+", help="of charted songs")
     parser.add_argument("--train", type=Path, help="shards of dances that it was trained on")
-    parser.add_argument("--measures", action="store_true", help="compare measures on its dances")
-    parser.add_argument("--stretches", type=int, default=4, help="of each song, at most")
+    parser.add_argument("--stretches", type=int, default=2, help="of each song, at most")
     parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--late", type=float, default=LATE, help="seconds that librosa's beats are late")
     parser.add_argument("--seeds", type=int, default=3)
     args = arguments(parser)
     model = MotionModel.from_pretrained(args.model)
-    parts = [part for song in args.songs for part in stretches(song, args.stretches, args.seconds, args.late)]
+    parts = [part for place in args.places for part in stretches(place, args.stretches, args.seconds)]
     sounds = [part.sound for part in parts]
 
     def generated(seed: int) -> list[Array]:
         made = model.generate(sounds=sounds, seconds=[sound.seconds for sound in sounds], seed=seed)
         return [np.asarray(motion.joints, np.float64) for motion in made]
 
-    if args.measures:
-        made = [generated(seed) for seed in range(args.seeds)]
-        rows_of = {"all": parts} | {
-            song.stem: [p for p in parts if p.song == song.name] for song in args.songs
-        }
-        found = []
-        for title, how in MEASURES.items():
-            cells: dict[str, list[float]] = {}
-            for name, some in rows_of.items():
-                for seed, dances in enumerate(made):
-                    own = [dance for part, dance in zip(parts, dances, strict=True) if part in some]
-                    cells.setdefault(name, []).append(measured(some, own, model.fps, seed, **how))
-            found.append({"title": title, "cells": cells, "seeds": list(range(args.seeds))})
-        report("Own over shifted, by two measures", [Column(n, n, 2) for n in rows_of], found, args.record)
-        return
-    training = Training(ShardDataset.open(args.train, "train"))
+    training = Training(ShardDataset.open(args.train, "train")) if args.train else None
 
     def rival(make: Callable[[Stretch, np.random.Generator], Array]) -> Callable[[int], list[Array]]:
         return lambda seed: [make(part, np.random.default_rng([seed, k])) for k, part in enumerate(parts)]
 
-    rows: Mapping[str, Callable[[int], list[Array]]] = {
-        "generated": generated,
-        "training dance, stretched": rival(training.stretched),
-        "random training dance": rival(training.random),
-        "standing": rival(training.standing),
-    }
-    sizes = {"songs": len(args.songs), "stretches": len(parts)}
-    protocol = sizes | {"seconds each": args.seconds, "late": args.late}
+    rows = {"generated": generated}
+    if training is not None:
+        rows["training dance, stretched"] = rival(training.stretched)
+        rows["random training dance"] = rival(training.random)
+        rows["standing"] = rival(training.standing)
+    protocol = {"songs": len({part.song for part in parts}), "stretches": len(parts)}
+    protocol["seconds each"] = args.seconds
     found = []
     for name, make in rows.items():
-        each = [figures(parts, make(seed), training.fps, training, seed) for seed in range(args.seeds)]
+        each = [figures(parts, make(seed), model.fps, training, seed) for seed in range(args.seeds)]
         cells = {figure: [one[figure] for one in each] for figure in each[0]}
         found.append({"title": name, "cells": cells, "seeds": list(range(args.seeds)), "protocol": protocol})
     hidden = ("own, any octave", "shifted, any octave")  # their ratio is shown
     columns = [Column(figure, figure, 2) for figure in found[0]["cells"] if figure not in hidden]
-    report("Dances to real songs", columns, found, args.record)
+    report("Dances to charted songs", columns, found, args.record)
 
 
 if __name__ == "__main__":

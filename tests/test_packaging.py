@@ -29,8 +29,6 @@ BROUGHT = {
     "tokenizers": "transformers",
     "soxr": "librosa",
     "lazy-loader": "librosa",
-    "numba": "librosa",
-    "llvmlite": "numba",
     "pydantic-core": "pydantic",
 }
 """Imported by us too, and required by a package that we require."""

@@ -39,6 +39,7 @@ DOCUMENTS = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.
 DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
 DOCUMENTS += sorted((ROOT / "models" / "pretrained").glob("*/README.md"))
 DOCUMENTS += sorted((ROOT / "pipeline" / "baselines").glob("*/README.md"))
+DOCUMENTS.append(ROOT / "pipeline" / "songs" / "README.md")
 OTHER_PROGRAMS = {".", "diff", "export", "hf", "module", "pip", "python", "pre-commit", "uv"}
 LAUNCHERS = {"srun", "torchrun"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -161,14 +162,26 @@ def instruments(song: Song, rng: np.random.Generator) -> dict[int, int]:
     return line_up.programs | {DRUMS: int(rng.choice([0, 8, 16, 24, 25, 32, 40]))}
 
 
+def _loaded(font: Path, rate: int) -> tuple[Any, int]:
+    """A synthesiser without effects, and the number of its sound font."""
+    dry = {"synth.reverb.active": 0, "synth.chorus.active": 0}
+    synth = _fluidsynth().Synth(gain=0.5, samplerate=rate, channels=16, **dry)
+    return synth, synth.sfload(str(font))
+
+
+@lru_cache(maxsize=1)
+def _kept(font: Path) -> object:
+    """Holds a sound font in memory: FluidSynth reads 140 MB anew where nobody has it."""
+    return _loaded(font, 44_100)
+
+
 def perform(
     notes: Iterable[Note], programs: Mapping[int, int], seconds: float, rate: int
 ) -> NDArray[np.float32]:
     """Notes played by instruments, by channel, as dry mono samples [seconds * rate]; 1 is usual, not most."""
     font = sound_font()
-    dry = {"synth.reverb.active": 0, "synth.chorus.active": 0}
-    synth = _fluidsynth().Synth(gain=0.5, samplerate=rate, channels=16, **dry)
-    number = synth.sfload(str(font))
+    _kept(font)
+    synth, number = _loaded(font, rate)
     for channel, program in programs.items():
         synth.program_select(channel, number, _DRUM_BANK if channel == DRUMS else 0, program)
     strokes: list[tuple[int, bool, Note]] = []

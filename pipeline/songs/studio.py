@@ -22,10 +22,13 @@ def play(song: Song, rate: int) -> NDArray[np.float32]:
     return record(play_band(song, rate), rate, np.random.default_rng([song.seed, song.number, 257]))
 
 
-def record(dry: NDArray[np.float32], rate: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def record(
+    dry: NDArray[np.float32], rate: int, rng: np.random.Generator, coded: bool = True
+) -> NDArray[np.float32]:
     """Dry samples [n], loudest 1 -> a recording of them [n] in -1..1, at the same times.
 
-    Each step is drawn; none moves a beat by more than the room's first reflections.
+    Each step is drawn, the last one, a lossy codec, only where `coded`; none moves a beat by more than the
+    room's first reflections.
     """
     out = np.asarray(dry, dtype=np.float64)
     if rng.random() < 0.6:
@@ -40,7 +43,7 @@ def record(dry: NDArray[np.float32], rate: int, rng: np.random.Generator) -> NDA
     gain = 10 ** (rng.uniform(-20.0, 0.0) / 20)
     out = gain * out / max(1e-9, float(np.abs(out).max()))
     samples = np.asarray(np.clip(out, -1.0, 1.0), dtype=np.float32)
-    return _coded(samples, rate, rng) if rng.random() < 0.5 else samples
+    return _coded(samples, rate, rng) if coded and rng.random() < 0.5 else samples
 
 
 def _room(sound: Array, rate: int, rng: np.random.Generator) -> Array:

@@ -7,3 +7,4 @@ from motionloom.datasets.base.register import declare
 _FOLDER = "motionloom.pipeline.songs"
 
 declare("player of songs", {"played": f"{_FOLDER}.studio"})
+declare("stage kind", {"songs": f"{_FOLDER}.songs", "beats": f"{_FOLDER}.stage"})
