@@ -41,13 +41,14 @@ _RUST = re.compile(r"\(os error (\d+)\)")
 _NUMPY_SHORT = re.compile(r"\d+ requested and \d+ written")
 SHARED_MEMORY = "/dev/shm"
 _SHARED_FULL = (
-    f"shared memory ({SHARED_MEMORY}), where loader workers put batches, is full; give the container "
-    f"more of it, or set hardware.workers: 0; {_AGAIN}"
+    f"shared memory ({SHARED_MEMORY}), where loader workers put batches and all workers their locks, is "
+    f"full; give the container more of it, or set hardware.workers: 0 and convert_workers: 1; {_AGAIN}"
 )
 _OF_SHARED_MEMORY = ("shared memory", "unable to write to file </torch", "unable to resize file </torch")
 """In torch's messages, those about loader workers that died of it included."""
 _SPARE = 2**26
 """Bytes with less than which a file system counts as full."""
+_A_LOCK = 2**16
 _TORCH = ("PytorchStreamWriter", "PytorchStreamReader", "inline_container")
 
 
@@ -72,6 +73,10 @@ def sentence_of(error: BaseException) -> str | None:
     """
     if isinstance(error, OSError):
         if error.errno in _NO_MORE and str(error.filename).startswith(SHARED_MEMORY):
+            return _SHARED_FULL
+        # Locks of processes lie there too, and what cannot be made of one names no file.
+        nameless = error.errno == errno.ENOSPC and error.filename is None
+        if nameless and Path(SHARED_MEMORY).is_dir() and shutil.disk_usage(SHARED_MEMORY).free < _A_LOCK:
             return _SHARED_FULL
         if error.errno in _WORDS:
             return _named(error, _WORDS[error.errno])

@@ -21,6 +21,9 @@ R = TypeVar("R")
 MAX_TEXT_BYTES = 64 << 20
 """A text file beyond this is refused unread; the longest split list of a release has a few MB."""
 
+_LONGEST = 240
+"""Bytes of a part of a name, with room for a suffix: file systems have 255."""
+
 _BOM = b"\xef\xbb\xbf"
 
 
@@ -56,7 +59,10 @@ def check_id(clip_id: str, where: str) -> str:
         not clip_id
         or "\\" in clip_id
         or not clip_id.isprintable()
-        or any(part in ("", ".", "..") for part in parts)
+        or any(
+            part in ("", ".", "..") or len(part.encode("utf-8", "surrogateescape")) > _LONGEST
+            for part in parts
+        )
         or ":" in parts[0]
     ):
         raise UserError(f"{where}: clip id '{clip_id[:80]!s}' is not a plain relative name")
