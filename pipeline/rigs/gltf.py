@@ -172,11 +172,13 @@ class Gltf:
         """Add an animation: values [T, W] of nodes' `rotation` (quaternions), `translation` or `weights`."""
         frames = max(len(values) for values in tracks.values())
         every = self.add(np.arange(frames)[:, None] / fps, bounds=True)
-        first = self.add(np.zeros((1, 1)), bounds=True)
+        first: list[int] = []
         animation: dict[str, Any] = {"name": name, "channels": [], "samplers": [], "extras": {"fps": fps}}
         for (node, path), values in tracks.items():
             still = not (values != values[:1]).any()
             kept = values[:1] if still else values
+            if still and not first:
+                first.append(self.add(np.zeros((1, 1)), bounds=True))
             if path == "rotation":
                 kept = _without_flips(kept)
             output = self.add(kept.reshape(-1, 1) if path == "weights" else kept)
@@ -184,7 +186,7 @@ class Gltf:
                 {"sampler": len(animation["samplers"]), "target": {"node": node, "path": path}}
             )
             animation["samplers"].append(
-                {"input": first if still else every, "output": output, "interpolation": "LINEAR"}
+                {"input": first[0] if still else every, "output": output, "interpolation": "LINEAR"}
             )
         self.json.setdefault("animations", []).append(animation)
 

@@ -252,18 +252,18 @@ def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, 
             # Axes that are not along the bone are nobody's convention.
             usable[joint] &= np.abs(_unit(np.median(way, axis=0))).max() > _ALONG
     for chain in _CHAINS:
-        left = [own.index(name) for name in chain]
-        right = own.mirror[left].tolist()
-        if not usable[[*left, *right]].all():
+        here = [own.index(name) for name in chain]
+        there = own.mirror[here].tolist()
+        if not usable[[*here, *there]].all():
             continue
-        scores = np.einsum("kij,ij->k", _AXES, axes[left].sum(axis=0))
-        if right[0] == left[0]:
-            axes[left] = _AXES[scores.argmax()]
+        scores = np.einsum("kij,ij->k", _AXES, axes[here].sum(axis=0))
+        if there[0] == here[0]:
+            axes[here] = _AXES[scores.argmax()]
             continue
-        both = scores[:, None] + np.einsum("kdij,ij->kd", _MIRRORED, axes[right].sum(axis=0))
+        both = scores[:, None] + np.einsum("kdij,ij->kd", _MIRRORED, axes[there].sum(axis=0))
         best = np.unravel_index(int(both.argmax()), both.shape)
-        axes[left] = _AXES[best[0]]
-        axes[right] = _MIRRORED[best]
+        axes[here] = _AXES[best[0]]
+        axes[there] = _MIRRORED[best]
     return axes, False
 
 

@@ -185,7 +185,7 @@ class _Scene:
         frames, count = figure.rotations.shape[:2]
         animation = Animation(name=name, extras={"fps": clip.fps, **clip.facts})
         every = self._add((np.arange(frames) / clip.fps)[:, None], bounds=True)
-        first = self._add(np.zeros((1, 1)), bounds=True)
+        first: list[int] = []
 
         def channel(node: int, path: str, values: Values) -> None:
             # One key is enough for what does not move, such as the fingers of a body without hands.
@@ -193,8 +193,10 @@ class _Scene:
             kept = values[:1] if still else values
             if path == "weights":
                 kept = kept.reshape(-1, 1)
+            if still and not first:
+                first.append(self._add(np.zeros((1, 1)), bounds=True))
             sampler = AnimationSampler(
-                input=first if still else every, output=self._add(kept), interpolation="LINEAR"
+                input=first[0] if still else every, output=self._add(kept), interpolation="LINEAR"
             )
             target = AnimationChannelTarget(node=node, path=path)
             animation.channels.append(AnimationChannel(sampler=len(animation.samplers), target=target))
