@@ -139,6 +139,8 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
                 joints = joints_of(clip.motion, layout)
                 table.add(number, place, clip.meta, joints)
                 figures.add(clip.meta, joints)
+                for fault in clip.meta.faults or ():
+                    findings.warn("doubtful motion", where, f"{fault.kind}: {fault.text}")
                 for kind, message in clip.oddities:
                     findings.warn(kind, where, message)
                 _against_manifest(where, clip, manifest, widths, findings)

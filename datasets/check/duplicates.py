@@ -1,8 +1,9 @@
 """Clips that are in a set twice: by id, by motion, or as the mirror image of a clip of another split.
 
-A signature of each clip is kept while the shards are read: heights at eight moments, which a mirror image
-shares. Near signatures only point out candidates: each pair is read again and compared, joint by joint,
-before anything is said.
+Signatures of each clip's seconds, in the figure's own frame, are kept while the shards are read; a mirror
+image shares them, and a copy that was cut, slowed by a little or made noisy has nearly the same. Near
+signatures only point out candidates: each pair is read again and compared, joint by joint, before anything is
+said, with the seconds that both have in common.
 
 What counts:
 - the same id twice, or the same recording in two splits, mirrored or not: an error (the test split would be
@@ -23,18 +24,26 @@ from numpy.typing import NDArray
 from motionloom.datasets.base.json_doors import open_plain
 from motionloom.datasets.base.records import ClipMeta, ShardInfo
 from motionloom.datasets.check.findings import Findings
-from motionloom.datasets.motion.canonical import mirror
+from motionloom.datasets.motion.canonical import facing, ground, mirror, resample
 from motionloom.datasets.motion.features.joints import joints_of
-from motionloom.datasets.motion.layout import MotionLayout
+from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
 
-SAME_METRES = 0.005
-"""Mean distance of joints below which two motions are the same recording."""
-MOMENTS = 8
-"""Frames of a clip, evenly spread, that its signature is of."""
-NEIGHBOURS = 4
-"""Clips of near signatures that each is compared with."""
+SAME_METRES = 0.015
+"""Mean distance of joints, seen from the figure, below which two seconds are of one recording."""
+LEAST_SECONDS, LEAST_SHARE = 2.0, 0.8
+"""What two clips have in common at least, or the share of the shorter one."""
+STILL_METRES = 0.05
+"""Somebody of whom no joint moves so far in a second says nothing."""
+REACH_METRES = 0.015
+"""Deviation of near signatures, a value."""
+MOMENTS, NEIGHBOURS, _AXES = 5, 6, 12
+"""Moments of a second, seconds that each is compared with, and axes in which that is done."""
+WHOLE = 0.9
+"""Share of the shorter clip from which it is the same motion again."""
+_RATE, _WINDOW, _HOP, _AROUND = 20, 20, 2, 4
+"""Samples a second, of a window, and from one window to the next; windows around that are tried."""
 
 _NAMED = Skeleton.named("smpl22")
 _PAIRS = [
@@ -70,7 +79,7 @@ class ClipTable:
         """Remember a clip of shard number `shard`, with joints [T, N, 3]."""
         motion = clip.members["motion.npy"]
         self._clips.append(_Seen(meta.id, meta.mirror_of or meta.id, shard, clip.key, motion))
-        self._signatures.append(signature(joints))
+        self._signatures.append(signature(joints, self.layout.fps))
 
     def report(self, findings: Findings) -> None:
         first: dict[str, _Seen] = {}
@@ -99,21 +108,18 @@ class ClipTable:
 
     def _same_motions(self, findings: Findings) -> None:
         told: set[tuple[int, bool]] = set()
-        for earlier, later in near(self._signatures):
+        for earlier, later, shift in near(self._signatures):
             one, two = self._clips[earlier], self._clips[later]
             split, other = self._split(two), self._split(one)
             apart = split != other
             # A family in two splits has been reported already.
             if one.id == two.id or (later, apart) in told or (apart and one.family == two.family):
                 continue
-            first, second = self._motion(one), self._motion(two)
-            if apart:
-                how = likeness(
-                    joints_of(first, self.layout), joints_of(second, self.layout), self.layout.skeleton
-                )
-            else:
-                how = "the same motion as" if np.array_equal(first, second) else ""
-            if not how:
+            layout = self.layout
+            first, second = (joints_of(self._motion(clip), layout) for clip in (one, two))
+            how, _, share = likeness(first, second, layout.fps, shift)
+            # Overlapping stretches of one recording are usual within a split.
+            if not how or (not apart and (share < WHOLE or one.family == two.family)):
                 continue
             told.add((later, apart))
             message = f"'{two.id}' is {how} '{one.id}' ({self._where(one)})"
@@ -137,35 +143,118 @@ class ClipTable:
             return npy_from_bytes(file.read(size), f"{path}: '{clip.key}.motion.npy'")
 
 
-def signature(joints: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return what a clip of joints [T, N, 3] shares with its mirror image and no other: its length in frames,
-    and heights of the pelvis and of the higher and the lower of pairs of joints at some moments [S].
+def signature(joints: NDArray[np.floating], fps: float) -> NDArray[np.float32]:
+    """Return what each second of a clip of joints [T, N, 3] shares with its copies and mirror images and no
+    other: heights, and places ahead of the pelvis, of the further and the nearer of pairs of joints, in the
+    figure's own frame at some moments [n, S]; the seconds begin every tenth of one.
     """
-    heights = joints[np.linspace(0, len(joints) - 1, MOMENTS).round().astype(int), :, 1]
-    pairs = np.sort(heights[:, _PAIRS], axis=-1)
-    return np.concatenate([[len(joints)], heights[:, 0], pairs.ravel()]).astype(np.float32)
+    body = _sampled(joints, fps)
+    if len(body) < _WINDOW:
+        body = np.concatenate([body, np.repeat(body[-1:], _WINDOW - len(body), axis=0)])
+    turned = ground(body - body[:, :1]) * np.exp(-1j * facing(body))[:, None]
+    measured = [
+        np.sort(values[:, _PAIRS], axis=-1).reshape(len(body), -1) for values in (body[..., 1], turned.real)
+    ]
+    rows = np.concatenate([body[:, :1, 1], *measured], axis=1)
+    starts = np.arange(0, len(body) - _WINDOW + 1, _RATE // 10)
+    moments = starts[:, None] + np.arange(0, _WINDOW, _WINDOW // MOMENTS)[None, :MOMENTS]
+    return rows[moments].reshape(len(starts), -1).astype(np.float32)
 
 
-def near(signatures: list[NDArray[np.float32]]) -> Iterator[tuple[int, int]]:
-    """Pairs (earlier, later) of signatures [S] that hardly differ, by the later."""
+def _sampled(joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
+    """The 22 joints of the body `_RATE` times a second."""
+    return resample(np.asarray(joints[:, :BODY_JOINTS], dtype=np.float64), fps, float(_RATE))
+
+
+def near(signatures: list[NDArray[np.float32]]) -> Iterator[tuple[int, int, int]]:
+    """Pairs (earlier, later) of clips of which several seconds, as far apart in both, hardly differ; and the
+    tenths of a second by which those of the later one begin later.
+    """
     from scipy.spatial import KDTree
 
     if not signatures:
         return
-    points = np.array(signatures)
-    reach = SAME_METRES * np.sqrt(points.shape[1])
-    most = min(NEIGHBOURS + 1, len(points))
-    _, neighbours = KDTree(points).query(points, k=most, distance_upper_bound=reach)
-    for later, others in enumerate(neighbours.reshape(len(points), -1).tolist()):
-        yield from ((other, later) for other in sorted(others) if other < later)
+    counts = [len(one) for one in signatures]
+    owner = np.repeat(np.arange(len(counts)), counts)
+    place = np.concatenate([np.arange(count) for count in counts])
+    points = np.concatenate(signatures)
+    # Still seconds are alike in everybody; a second is told by its changes.
+    moving = np.flatnonzero(
+        np.ptp(points.reshape(len(points), MOMENTS, -1), axis=1).max(axis=1) > STILL_METRES
+    )
+    if not len(moving):
+        return
+    few = points[moving] - points[moving].mean(axis=0)
+    axes = np.linalg.eigh(few[:: max(1, len(few) // 20_000)].T @ few[:: max(1, len(few) // 20_000)])[1]
+    few = few @ axes[:, -_AXES:]
+    # Every fifth second of each clip is looked up among all of them.
+    asked = np.flatnonzero(place[moving] % 5 == 0)
+    most = min(NEIGHBOURS, len(few))
+    reach = REACH_METRES * np.sqrt(points.shape[1])
+    _, found = KDTree(few).query(few[asked], k=most, distance_upper_bound=reach)
+    rows, columns = np.nonzero(found.reshape(len(asked), -1) < len(few))
+    one, other = moving[asked[rows]], moving[found.reshape(len(asked), -1)[rows, columns]]
+    apart = owner[one] != owner[other]
+    first, second = np.minimum(one, other)[apart], np.maximum(one, other)[apart]
+    pairs, votes = np.unique(
+        np.stack([owner[first], owner[second], (place[second] - place[first]) // 4], axis=1),
+        axis=0,
+        return_counts=True,
+    )
+    best: dict[tuple[int, int], tuple[int, int]] = {}
+    for (earlier, later, shift), count in zip(pairs.tolist(), votes.tolist(), strict=True):
+        if count >= min(2, counts[earlier] // 5 + 1, counts[later] // 5 + 1):
+            best[earlier, later] = max(best.get((earlier, later), (0, 0)), (count, 4 * shift + 2))
+    for (earlier, later), (_, shift) in sorted(best.items(), key=lambda pair: pair[0][::-1]):
+        yield earlier, later, shift
 
 
-def likeness(first: NDArray[np.float64], second: NDArray[np.float64], skeleton: Skeleton) -> str:
-    """Return how joints `second` [T, N, 3] repeat those `first`, as the beginning of a phrase, or ""."""
-    if _distance(first, second) < SAME_METRES:
-        return "the same recording as"
-    return "the mirror image of" if _distance(mirror(first, skeleton), second) < SAME_METRES else ""
+class Likeness(NamedTuple):
+    """How a motion repeats another."""
+
+    how: str
+    """The beginning of a phrase; empty if it does not."""
+    seconds: float = 0.0
+    share: float = 0.0
+    """Of the shorter of both."""
 
 
-def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(a - b, axis=-1).mean())
+def likeness(first: NDArray[np.float64], second: NDArray[np.float64], fps: float, shift: int) -> Likeness:
+    """Return how joints `second` [T, N, 3], whose seconds begin `shift` tenths of one later, repeat those
+    `first`, each second seen from itself.
+    """
+    one, other = _sampled(first, fps), _sampled(second, fps)
+    best = Likeness("")
+    for how, figure in (("the same recording as", one), ("the mirror image of", mirror(one, _NAMED))):
+        seconds = _repeated(figure, other, shift)
+        share = seconds * _RATE / min(len(one), len(other))
+        if seconds > best.seconds and (seconds >= LEAST_SECONDS or share > LEAST_SHARE):
+            best = Likeness(how if share > LEAST_SHARE else f"{seconds:.1f} s of {how}", seconds, share)
+    return best
+
+
+def _repeated(first: NDArray[np.float64], second: NDArray[np.float64], shift: int) -> float:
+    """Seconds of the second joints that are in the first, `shift` tenths of a second before or nearly so."""
+    window = min(_WINDOW, len(first), len(second))
+    here, there = (_windows(joints, window) for joints in (first, second))
+    apart = np.full(len(there), np.inf)
+    for near_by in range(-_AROUND, _AROUND + 1):
+        at = np.arange(len(there)) - shift + near_by
+        both = np.flatnonzero((at >= 0) & (at < len(here)))
+        far = np.linalg.norm(here[at[both]] - there[both], axis=-1).mean(axis=(1, 2))
+        apart[both] = np.minimum(apart[both], far)
+    same = apart < SAME_METRES
+    moves = np.ptp(there, axis=1).max(axis=(1, 2)) > STILL_METRES
+    count = int(same.sum())
+    return (count + window // _HOP - 1) * _HOP / _RATE if (same & moves).any() else 0.0
+
+
+def _windows(joints: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """Windows [n, W, N, 3] that begin every `_HOP` samples, each in the frame of its middle."""
+    starts = np.arange(0, len(joints) - window + 1, _HOP)
+    taken = joints[starts[:, None] + np.arange(window)]
+    middle = taken[:, window // 2]
+    plane = (ground(taken) - ground(middle)[:, :1][:, None]) * np.exp(-1j * facing(middle[:, None]))[
+        ..., None
+    ]
+    return np.stack([plane.imag, taken[..., 1], plane.real], axis=-1)

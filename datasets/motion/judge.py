@@ -30,9 +30,9 @@ _BALLS, _ANKLES, _HIPS, _SHOULDERS = (
 
 RESTS = 0.3
 """Metres a second below which a foot rests."""
-OFF_FLOOR = 0.08
+OFF_FLOOR = 0.1
 """Metres that a resting foot is from the floor, or anything below a resting foot: 0.03 at most of people who
-walk, wave and kick; dancers on their toes were recorded 0.12 m below."""
+walk and wave, 0.09 of who kicks; dancers on their toes were recorded 0.12 m below."""
 LEAST_RESTING = 0.1
 """Seconds that feet must rest to say anything of them."""
 LEAP, LEAP_ACCELERATION = 0.02, 30.0
@@ -63,28 +63,28 @@ _SIDES = [
 UNLIKE, _SHORT = 1.15, 0.1
 """Ratio of a left bone of a limb and the right one, at most (1.06 was recorded), and metres from which it is
 looked at."""
-STRAIGHT = 0.9
+STRAIGHT = 0.8
 """Cosine between trunk and legs, and length of the mean way of the trunk, of a figure that stands."""
 _HINGES = {
     f"{side}_{joint}": tuple(_NAMED.index(f"{side}_{name}") for name in (first, joint, last))
     for side in ("left", "right")
     for first, joint, last in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist"))
 }
-STUCK, STUCK_MOVES = 0.003, 0.1
-"""Radians that the angle of a knee or elbow changes over a clip in which the bone above it turns by the
-second, at least: 0.01 was recorded."""
-ROOTED, WALKS = 0.001, 0.3
-"""Metres that a pelvis moves over a clip in which an ankle moves by the second, seen from it, at least."""
-SWING, STEP, STEPS = (0.3, 0.85), 0.45, 3
-"""Seconds for which a foot swings forward in the median of so many steps of that share of the height, at
-least: 0.36 to 0.7 were recorded."""
+STUCK = 5e-4
+"""Radians that the angle of a knee or elbow changes over a clip, at least: 0.006 was recorded."""
+ROOTED, WALKS = 0.001, 0.02
+"""Metres that a pelvis moves over a clip in which an ankle moves by the second, seen from it, at least: 0.007
+was recorded."""
+SWING, STEP, STEPS = (0.33, 0.8), 0.3, 4
+"""Seconds for which a foot swings forward, in the median of so many steps of that share of the height at
+least, over the fourth root of the step in heights: 0.36 to 0.75 in 98 of 100 clips that step."""
 FALL, FALLS = 1.6, 0.06
 """How much faster than a stone nobody falls, and the metres of a fall that are looked at."""
 REPEATS, _MOVING = 0.02, 10
 """Share of the frames that repeat the one before, in the midst of motion that is so many times `STILL`."""
-GLIDES, LOW, GLIDES_SECONDS = 0.35, 0.03, 0.5
-"""Metres a second at which the lower foot goes in half of the frames in which it
-is that near its floor, for so many seconds."""
+GLIDES, LOW, LOW_SECONDS = 0.35, 0.03, 0.5
+"""Metres a second at which the lower foot goes in half of the frames, of so many seconds, in which it is that
+near to its floor: 0.3 was recorded, of who lies down."""
 STRETCH = 0.3
 """Share by which a bone's length differs from its median; of recorded people at most 0.1."""
 
@@ -135,7 +135,9 @@ def _bones(body: NDArray[np.float64]) -> Iterator[Fault]:
         ratio = float(usual[left - 1] / max(usual[right - 1], 1e-6))
         if usual[left - 1] > _SHORT and not 1 / UNLIKE < ratio < UNLIKE:
             name = _NAMED.joints[left].removeprefix("left_")
-            text = f"the left bone to the {name} is {ratio:.2f} times the right one, not 1/{UNLIKE:g} to {UNLIKE:g}"
+            text = (
+                f"the left bone to the {name} is {ratio:.2f} times the right one, not 1/{UNLIKE} to {UNLIKE}"
+            )
             yield _fault("uneven limbs", text, max(ratio, 1 / max(ratio, 1e-6)) / UNLIKE)
 
 
@@ -145,9 +147,9 @@ def _axis(body: NDArray[np.float64]) -> Iterator[Fault]:
     trunk /= np.maximum(np.linalg.norm(trunk, axis=-1, keepdims=True), 1e-9)
     legs = body[:, _HIPS].mean(axis=1) - body[:, _ANKLES].mean(axis=1)
     legs /= np.maximum(np.linalg.norm(legs, axis=-1, keepdims=True), 1e-9)
-    way = np.median(trunk, axis=0)
-    straight = float(np.median((trunk * legs).sum(axis=-1)))
-    if np.abs(trunk[:, 1]).max() < UPRIGHT and np.linalg.norm(way) > STRAIGHT and straight > STRAIGHT:
+    way, straight = np.median(trunk, axis=0), float(np.median((trunk * legs).sum(axis=-1)))
+    level = float(np.percentile(np.abs(trunk[:, 1]), 90))
+    if level < UPRIGHT and np.linalg.norm(way) > STRAIGHT and straight > STRAIGHT:
         axis = "xyz"[int(np.abs(way).argmax())]
         yield _fault(
             "stands along the ground", f"stands along {axis}, not up, all the time", straight / STRAIGHT
@@ -159,26 +161,33 @@ def _feet(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
     upright = trunk[:, 1] > UPRIGHT * np.linalg.norm(trunk, axis=-1)
     speed = np.linalg.norm(np.gradient(balls, axis=0), axis=-1) * fps
     lower = balls[..., 1] <= balls[..., 1].min(axis=-1, keepdims=True)  # the other may be held in the air
+    flat = np.linalg.norm(np.gradient(balls[..., [0, 2]], axis=0), axis=-1) * fps
+    near = (balls[..., 1] < np.percentile(balls[..., 1].min(axis=1), 20) + LOW) & lower & upright[:, None]
+    glide = float(np.median(flat[near])) if near.sum() > LOW_SECONDS * fps else 0.0
+    if glide > GLIDES:
+        text = f"the lower foot glides at {glide:.2f} m/s along the floor, not at most {GLIDES:g} m/s"
+        yield _fault("slides", text, glide / GLIDES, int(near.any(axis=1).argmax()))
     rests = (speed < RESTS) & lower & upright[:, None]
     if rests.sum() < LEAST_RESTING * fps:
         return
     level = float(np.median(balls[..., 1][rests]))
-    near = (balls[..., 1] < level + LOW) & lower & upright[:, None]
-    flat = np.linalg.norm(np.gradient(balls[..., [0, 2]], axis=0), axis=-1) * fps
-    glide = float(np.median(flat[near])) if near.sum() > GLIDES_SECONDS * fps else 0.0
-    if glide > GLIDES:
-        text = f"the lower foot glides at {glide:.2f} m/s along the floor, not at most {GLIDES:g} m/s"
-        yield _fault("slides", text, glide / GLIDES, int(np.flatnonzero(near.any(axis=1))[0]))
     first = int(rests.any(axis=1).argmax())
     bottom = body[..., 1].min(axis=-1)
     lowest = np.where(upright, bottom, np.inf)
     under = level - float(lowest.min())
     # Who lies on the floor sinks a little lower than the balls of the feet stand, and that is its height 0.
     lies = bool((bottom[~upright] < OFF_FLOOR / 2).any())
-    if under > OFF_FLOOR:  # then the floor of a clip that was moved to 0 is wrong too
+    # Ground of several levels: feet rest on the lowest too, and nothing has brought them there at once.
+    falls = np.abs(np.diff(np.median(body[..., 1], axis=1))).max()
+    uneven = (
+        under > OFF_FLOOR
+        and float(balls[..., 1][rests].min()) < float(lowest.min()) + OFF_FLOOR
+        and falls < OFF_FLOOR / 2
+    )
+    if under > OFF_FLOOR and not uneven:  # then the floor of a clip that was moved to 0 is wrong too
         text = f"goes {under:.2f} m below where its feet rest, not at most {OFF_FLOOR:g} m"
         yield _fault("sinks", text, under / OFF_FLOOR, int(lowest.argmin()))
-    elif level < -OFF_FLOOR or (level > OFF_FLOOR and not lies):
+    elif not uneven and (level < -OFF_FLOOR or (level > OFF_FLOOR and not lies)):
         kind, side = ("floats", "above") if level > 0 else ("sinks", "below")
         text = f"feet rest {abs(level):.2f} m {side} the floor, not at most {OFF_FLOOR:g} m"
         yield _fault(kind, text, abs(level) / OFF_FLOOR, first)
@@ -251,20 +260,22 @@ def _still(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
         yield _fault("frozen", text, seconds / FROZEN + 1e-3, start)
 
 
-_GRAVITY = 9.81
+_GRAVITY, _USUAL = 9.81, 0.54
+_LEAST_FPS = 24
+"""Steps of fewer frames a second are counted too coarsely."""
 
 
-def _swings(body: NDArray[np.float64], fps: float, least: float) -> NDArray[np.float64]:
-    """Seconds that each step of at least `least` metres takes: of people they depend little on their pace."""
+def _swings(body: NDArray[np.float64], fps: float, height: float) -> list[float]:
+    """The seconds of each step, as `SWING` counts them: at any pace they are nearly the same."""
     times = []
     for ankle in _ANKLES:
-        places = body[:, ankle][:, [0, 2]]
+        places = body[:, ankle][:, [0, 2]] / height
         speed = np.linalg.norm(np.gradient(places, axis=0), axis=-1)
         for start, end in runs(speed > 0.25 * np.percentile(speed, 95)):
-            inside = start > 0 and end < len(body)
-            if inside and np.linalg.norm(places[end] - places[start - 1]) > least:
-                times.append((end - start) / fps)
-    return np.array(times)
+            if start > 0 and end < len(body):
+                step = float(np.linalg.norm(places[end] - places[start - 1]))
+                times += [(end - start) / fps / step**0.25] if step > STEP else []
+    return times
 
 
 def _falls(body: NDArray[np.float64], fps: float) -> Iterator[tuple[int, int, float]]:
@@ -286,11 +297,12 @@ def _stuck(body: NDArray[np.float64]) -> Iterator[Fault]:
     for name, (first, joint, last) in _HINGES.items():
         above, below = body[:, joint] - body[:, first], body[:, last] - body[:, joint]
         sizes = np.linalg.norm(above, axis=-1) * np.linalg.norm(below, axis=-1)
-        angle = np.arccos(np.clip((above * below).sum(axis=-1) / np.maximum(sizes, 1e-9), -1, 1))
-        ways = above / np.maximum(np.linalg.norm(above, axis=-1, keepdims=True), 1e-9)
-        if np.ptp(angle) < STUCK and np.ptp(ways, axis=0).max() > STUCK_MOVES:
-            text = f"the {name.replace('_', ' ')} never bends, by more than {np.ptp(angle):.4f} rad"
-            yield _fault("stuck", text, STUCK / max(float(np.ptp(angle)), STUCK / 10))
+        bend = float(
+            np.ptp(np.arccos(np.clip((above * below).sum(axis=-1) / np.maximum(sizes, 1e-9), -1, 1)))
+        )
+        if bend < STUCK:
+            text = f"the {name.replace('_', ' ')} keeps its angle within {bend:.4f} rad, under {STUCK:g}"
+            yield _fault("stuck", text, STUCK / max(bend, STUCK / 10))
     moves = float(np.ptp(body[:, _PELVIS], axis=0).max())
     swings = float(np.ptp(body[:, _ANKLES] - body[:, :1], axis=0).max())
     if moves < ROOTED and swings > WALKS:
@@ -306,11 +318,11 @@ def _time(body: NDArray[np.float64], fps: float, height: float) -> Iterator[Faul
     if len(again) > max(REPEATS * len(body), 2):
         text = f"{len(again)} of {len(body)} frames repeat the one before in the midst of motion"
         yield _fault("repeated frames", text, len(again) / max(REPEATS * len(body), 2), int(again[0]) + 2)
-    times = _swings(body, fps, STEP * height)
-    usual = float(np.median(times)) if len(times) >= STEPS else 0.5
+    times = _swings(body, fps, height)
+    usual = float(np.median(times)) if len(times) >= STEPS and fps >= _LEAST_FPS else _USUAL
     if not SWING[0] <= usual <= SWING[1]:
-        factor = usual / 0.5
-        text = f"feet swing for {usual:.2f} s a step, not {SWING[0]:g} to {SWING[1]:g} s: is the frame rate right?"
+        factor = usual / _USUAL
+        text = f"steps take {factor:.1f} times as long as people's: is the frame rate right?"
         yield _fault("frame rate", text, max(factor, 1 / factor))
     for start, end, pull in _falls(body, fps):
         if pull > FALL * _GRAVITY:

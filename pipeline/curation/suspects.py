@@ -1,7 +1,7 @@
 """The clips of a data set that look wrong, for a person to decide about: what `motionloom data clean` shows.
 
-Motions as the conversion's judge saw them (`motion/judge.py`), and clips that are another one again, as they are or mirrored (`duplicates.py`).
-Mirror images that are declared (`mirror_of`) in the split of their original are meant.
+Motions as the conversion's judge saw them (`motion/judge.py`), and clips that are another one again, as they
+are or mirrored (`duplicates.py`). Mirror images that are declared (`mirror_of`) in the split of their original are meant.
 
 Decisions about them lie in `cleaned.json` beside the shards, so that they last when the set is converted
 again, and the manifest lists what is left out. Since the manifest's checksum is what a run knows a data set
@@ -31,7 +31,7 @@ from motionloom.datasets.base.records import (
     Manifest,
     Split,
 )
-from motionloom.datasets.check.duplicates import likeness, near, signature
+from motionloom.datasets.check.duplicates import WHOLE, likeness, near, signature
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.motion.features.joints import joints_of
 from motionloom.datasets.motion.judge import judge
@@ -77,16 +77,16 @@ def find_suspects(
             for clip in range(len(dataset)):
                 joints, fps = floored_joints(dataset, clip), dataset.layout.fps
                 places.append(Place(split, clip))
-                signatures.append(signature(joints))
+                signatures.append(signature(joints, fps))
                 stored = dataset.meta(clip).faults
                 found = list(judge(joints, fps) if stored is None else stored)
                 if found:
                     faults[places[-1]] = found
                 meter.advance()
     twins: dict[Place, Place] = {}
-    for first, second in near(signatures):
+    for first, second, shift in near(signatures):
         one, other = places[first], places[second]
-        again = None if other in twins else _again(splits, one, other)
+        again = None if other in twins else _again(splits, one, other, shift)
         if again is not None:
             twins[other] = one
             faults.setdefault(other, []).append(again)
@@ -110,7 +110,7 @@ def floored_joints(dataset: ShardDataset, clip: int) -> NDArray[np.float64]:
     return canonicalize(joints) if dataset.layout.family == "raw" else joints
 
 
-def _again(splits: Splits, one: Place, other: Place) -> Fault | None:
+def _again(splits: Splits, one: Place, other: Place, shift: int) -> Fault | None:
     """Return the fault of a clip `other` that repeats `one`; None where it does not, or is meant to."""
     first, second = splits[one.split], splits[other.split]
     original, copy = first.meta(one.clip), second.meta(other.clip)
@@ -118,8 +118,8 @@ def _again(splits: Splits, one: Place, other: Place) -> Fault | None:
     if declared and one.split == other.split:
         return None
     joints = floored_joints(first, one.clip), floored_joints(second, other.clip)
-    how = likeness(*joints, first.layout.skeleton)
-    if not how:
+    how, _, share = likeness(*joints, first.layout.fps, shift)
+    if not how or (one.split == other.split and share < WHOLE):
         return None
     kind = "mirrored twin" if "mirror" in how else "duplicate"
     where = f" of split {one.split}" if one.split != other.split else ""

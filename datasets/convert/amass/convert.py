@@ -254,8 +254,8 @@ class Amass(Release[AmassConfig]):
         turned = np.ptp(figure.rotations[:, BODY_JOINTS:], axis=0)
         hands = not raw and float(turned.max(initial=0.0)) > FINGERS_MOVE
         meta = self.meta(
-            clip, features, seen=SourceJoints(posed, clip.fps), source=clip.entry.file, licence=clip.licence, hands=hands,
-            mirror_of=clip.entry.mirror_of,
+            clip, features, seen=SourceJoints(posed, clip.fps), source=clip.entry.file,
+            licence=clip.licence, hands=hands, mirror_of=clip.entry.mirror_of,
         )  # fmt: skip
         return Sample(meta, features, texts=list(clip.entry.texts))
 

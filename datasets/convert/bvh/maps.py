@@ -19,8 +19,9 @@ from motionloom.datasets.convert.bvh.config import BvhClip, BvhConfig
 from motionloom.datasets.convert.bvh.joint_guess import guess_joint_map, summary
 from motionloom.datasets.convert.bvh.read import FoundFile
 from motionloom.datasets.convert.bvh.settle import added_frames, settled
+from motionloom.datasets.convert.common.look import CHILD_METRES
 from motionloom.datasets.convert.common.plan import ConversionPlan
-from motionloom.datasets.motion.bvh.joint_map import JointMap, UnfinishedMapError, metres
+from motionloom.datasets.motion.bvh.joint_map import METRES, JointMap, UnfinishedMapError, metres
 from motionloom.datasets.motion.bvh.motion import BvhMotion
 from motionloom.datasets.motion.skeleton import Skeleton
 
@@ -160,9 +161,16 @@ def _settle(
     measured = replace(stated, unit=unit, up=up, measured=stated.unit is None)
     name = motions[0].name
     if stated.unit is None:
-        named = f"{metres(unit):.4g} m ({unit if isinstance(unit, str) else 'no known unit fits'})"
         tall = f"the figures are then {height:.2f} m tall"
-        plan.notes.append(f"unit by body size, from {name}: {named}; {tall}")
+        if isinstance(unit, str):
+            plan.notes.append(f"unit by body size, from {name}: {metres(unit):.4g} m ({unit}); {tall}")
+        else:
+            sizes = {one: height * size / unit for one, size in METRES.items()}
+            near = [f"{size:.2f} m in {one}" for one, size in sizes.items() if CHILD_METRES < size < 3]
+            plan.notes.append(
+                f"unit by body size, from {name}: no known unit fits, so {unit:.4g} m is guessed; {tall}, "
+                f"but {' or '.join(near) or 'of no size in any unit'}: is it a child? --set unit=NAME states it"
+            )
     if up != "y" and stated.up is None:
         plan.notes.append(f"upward axis by where heads are, from {name}: {up}")
     if any(added_frames(measured.apply(motion)) for motion in motions):

@@ -168,7 +168,8 @@ class _Matches:
 
     def match(self, row: CaptionRow, prefix: str) -> None:
         """Find the file of a row."""
-        refused, path = "", None
+        refused = ""
+        path: str | None
         if row.catalogue:
             path = self.names.find_end(row.file or row.id) or self.names.find_end(row.id)
         else:

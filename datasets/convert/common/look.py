@@ -230,6 +230,7 @@ def look_at(
     clips: dict[str, list[SourceJoints]] = {name: [] for name, _ in chosen}
     rates: dict[str, set[float]] = defaultdict(set)
     failed: list[tuple[str, Dropped]] = []
+    doubts: list[Dropped] = []
     for name, item in chosen:
         if len(clips[name]) == each:
             continue
@@ -240,6 +241,7 @@ def look_at(
         except Exception as error:  # whatever a bad file makes of the libraries below; the conversion says it
             failed.append((name, drop(label(item), error)))
             continue
+        doubts += [Dropped(source=label(item), reason=fault.text) for fault in seen.faults(seen.fps)]
         # Ten frames a second are enough for medians, and keep hundreds of clips in memory.
         step = max(1, round(seen.fps / _FRAMES_A_SECOND))
         body = np.asarray(seen.joints[::step, :BODY_JOINTS], dtype=np.float64)
@@ -251,6 +253,8 @@ def look_at(
     oddities = stats_of(all_clips).oddities()
     problems = [oddity.text for oddity in oddities if oddity.is_error]
     warnings = [oddity.text for oddity in oddities if not oddity.is_error]
+    # Of figures that are no people, single joints say nothing.
+    warnings += [] if problems else map(str, grouped(doubts))
     suggestions = _suggest(all_clips, config) if problems else []
     # One reason for every clip is a wrong option or map; several reasons are damaged files.
     groups = grouped([drop for _, drop in failed])

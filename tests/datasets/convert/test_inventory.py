@@ -47,8 +47,8 @@ def built(name: str, root: Path, shared: Path) -> Path:
 
 def spoil(folder: Path, ending: str, outside: Path) -> None:
     """Put one of each hostile entry into a folder."""
-    links = {"circle": f"circle{ending}", "nowhere": "gone", "outside": str(outside), "up": str(folder.parent),
-             "again": str(folder)}  # fmt: skip
+    links = {"circle": f"circle{ending}", "nowhere": "gone", "outside": str(outside),
+             "up": str(folder.parent), "again": str(folder)}  # fmt: skip
     for name, target in links.items():
         (folder / f"{name}{ending}").symlink_to(target)
     os.mkfifo(folder / f"pipe{ending}")
