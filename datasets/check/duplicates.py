@@ -30,20 +30,20 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.datasets.shards.tar import TarClip, npy_from_bytes
 
-SAME_METRES = 0.015
+SAME_METRES = 0.008
 """Mean distance of joints, seen from the figure, below which two seconds are of one recording."""
 LEAST_SECONDS, LEAST_SHARE = 2.0, 0.8
 """What two clips have in common at least, or the share of the shorter one."""
 STILL_METRES = 0.05
 """Somebody of whom no joint moves so far in a second says nothing."""
-REACH_METRES = 0.015
+REACH_METRES = 0.025
 """Deviation of near signatures, a value."""
-MOMENTS, NEIGHBOURS, _AXES = 5, 6, 12
+MOMENTS, NEIGHBOURS, _AXES = 5, 16, 12
 """Moments of a second, seconds that each is compared with, and axes in which that is done."""
 WHOLE = 0.9
 """Share of the shorter clip from which it is the same motion again."""
-_RATE, _WINDOW, _HOP, _AROUND = 20, 20, 2, 4
-"""Samples a second, of a window, and from one window to the next; windows around that are tried."""
+_RATE, _WINDOW, _HOP, _AROUND = 20, 20, 2, 8
+"""Samples a second, of a window, and from one window to the next; samples around that are tried."""
 
 _NAMED = Skeleton.named("smpl22")
 _PAIRS = [
@@ -119,7 +119,7 @@ class ClipTable:
             first, second = (joints_of(self._motion(clip), layout) for clip in (one, two))
             how, _, share = likeness(first, second, layout.fps, shift)
             # Overlapping stretches of one recording are usual within a split.
-            if not how or (not apart and (share < WHOLE or one.family == two.family)):
+            if not how or (not apart and (share < WHOLE or "mirror" in how or one.family == two.family)):
                 continue
             told.add((later, apart))
             message = f"'{two.id}' is {how} '{one.id}' ({self._where(one)})"
@@ -158,7 +158,7 @@ def signature(joints: NDArray[np.floating], fps: float) -> NDArray[np.float32]:
     rows = np.concatenate([body[:, :1, 1], *measured], axis=1)
     starts = np.arange(0, len(body) - _WINDOW + 1, _RATE // 10)
     moments = starts[:, None] + np.arange(0, _WINDOW, _WINDOW // MOMENTS)[None, :MOMENTS]
-    return rows[moments].reshape(len(starts), -1).astype(np.float32)
+    return np.asarray(rows[moments].reshape(len(starts), -1), dtype=np.float32)
 
 
 def _sampled(joints: NDArray[np.floating], fps: float) -> NDArray[np.float64]:
@@ -187,8 +187,8 @@ def near(signatures: list[NDArray[np.float32]]) -> Iterator[tuple[int, int, int]
     few = points[moving] - points[moving].mean(axis=0)
     axes = np.linalg.eigh(few[:: max(1, len(few) // 20_000)].T @ few[:: max(1, len(few) // 20_000)])[1]
     few = few @ axes[:, -_AXES:]
-    # Every fifth second of each clip is looked up among all of them.
-    asked = np.flatnonzero(place[moving] % 5 == 0)
+    # Every third second of each clip is looked up among all of them.
+    asked = np.flatnonzero(place[moving] % 3 == 0)
     most = min(NEIGHBOURS, len(few))
     reach = REACH_METRES * np.sqrt(points.shape[1])
     _, found = KDTree(few).query(few[asked], k=most, distance_upper_bound=reach)
@@ -203,7 +203,7 @@ def near(signatures: list[NDArray[np.float32]]) -> Iterator[tuple[int, int, int]
     )
     best: dict[tuple[int, int], tuple[int, int]] = {}
     for (earlier, later, shift), count in zip(pairs.tolist(), votes.tolist(), strict=True):
-        if count >= min(2, counts[earlier] // 5 + 1, counts[later] // 5 + 1):
+        if count >= min(2, counts[earlier] // 6 + 1, counts[later] // 6 + 1):
             best[earlier, later] = max(best.get((earlier, later), (0, 0)), (count, 4 * shift + 2))
     for (earlier, later), (_, shift) in sorted(best.items(), key=lambda pair: pair[0][::-1]):
         yield earlier, later, shift
@@ -236,10 +236,10 @@ def likeness(first: NDArray[np.float64], second: NDArray[np.float64], fps: float
 def _repeated(first: NDArray[np.float64], second: NDArray[np.float64], shift: int) -> float:
     """Seconds of the second joints that are in the first, `shift` tenths of a second before or nearly so."""
     window = min(_WINDOW, len(first), len(second))
-    here, there = (_windows(joints, window) for joints in (first, second))
+    here, there = _windows(first, window, 1), _windows(second, window, _HOP)
     apart = np.full(len(there), np.inf)
     for near_by in range(-_AROUND, _AROUND + 1):
-        at = np.arange(len(there)) - shift + near_by
+        at = _HOP * (np.arange(len(there)) - shift) + near_by
         both = np.flatnonzero((at >= 0) & (at < len(here)))
         far = np.linalg.norm(here[at[both]] - there[both], axis=-1).mean(axis=(1, 2))
         apart[both] = np.minimum(apart[both], far)
@@ -249,9 +249,9 @@ def _repeated(first: NDArray[np.float64], second: NDArray[np.float64], shift: in
     return (count + window // _HOP - 1) * _HOP / _RATE if (same & moves).any() else 0.0
 
 
-def _windows(joints: NDArray[np.float64], window: int) -> NDArray[np.float64]:
-    """Windows [n, W, N, 3] that begin every `_HOP` samples, each in the frame of its middle."""
-    starts = np.arange(0, len(joints) - window + 1, _HOP)
+def _windows(joints: NDArray[np.float64], window: int, hop: int) -> NDArray[np.float64]:
+    """Windows [n, W, N, 3] that begin every `hop` samples, each in the frame of its middle."""
+    starts = np.arange(0, len(joints) - window + 1, hop)
     taken = joints[starts[:, None] + np.arange(window)]
     middle = taken[:, window // 2]
     plane = (ground(taken) - ground(middle)[:, :1][:, None]) * np.exp(-1j * facing(middle[:, None]))[

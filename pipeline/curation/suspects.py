@@ -1,7 +1,8 @@
 """The clips of a data set that look wrong, for a person to decide about: what `motionloom data clean` shows.
 
 Motions as the conversion's judge saw them (`motion/judge.py`), and clips that are another one again, as they
-are or mirrored (`duplicates.py`). Mirror images that are declared (`mirror_of`) in the split of their original are meant.
+are or mirrored (`duplicates.py`). Mirror images that are declared (`mirror_of`) in the split of
+their original are meant.
 
 Decisions about them lie in `cleaned.json` beside the shards, so that they last when the set is converted
 again, and the manifest lists what is left out. Since the manifest's checksum is what a run knows a data set

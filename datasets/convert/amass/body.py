@@ -173,7 +173,7 @@ class BodyRelease(Release[Cfg]):
                 content = content_of(self.sound_folder / clip.entry.sound)
                 heard.setdefault(content, {}).setdefault(clip.entry.sound, split)
         return [
-            f"{' and '.join(names)} are one piece of music, of clips in {', '.join(sorted(set(names.values())))}"
+            f"{' and '.join(names)} are one piece of music, in {', '.join(sorted(set(names.values())))}"
             for names in heard.values()
             if len(names) > 1
         ] + super().copies(plan)

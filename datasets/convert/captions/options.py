@@ -226,15 +226,15 @@ def list_clips(
             f"split files name files in '{prefix}', which the source does not have: it is taken for that"
         )
     for name, split in listed.splits.items() if listed else ():
-        path, refused = names.find(name, prefix)
+        place, refused = names.find(name, prefix)
         if refused:
             raise UserError(f"{split}.txt: {refused}")
-        matches.files.setdefault(name, path or "")
-        if path is None:
+        matches.files.setdefault(name, place or "")
+        if place is None:
             missing.setdefault(name, bare(name))
-        elif splits.setdefault(path, split) != split:
+        elif splits.setdefault(place, split) != split:
             raise UserError(
-                f"'{name}' in {split}.txt means {path}, which is in {splits[path]}.txt too; that leaks"
+                f"'{name}' in {split}.txt means {place}, which is in {splits[place]}.txt too; that leaks"
             )
     # An empty split would train, or test, on nothing without a word.
     for split in dict.fromkeys(listed.splits.values() if listed else ()):
