@@ -68,7 +68,7 @@ def hub_is_away() -> bool:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a file of that name, which may be one that no file can have, of 5,000 letters."""
+    """Whether a file can be found: also where its folder may not be read, or no file can have such a name."""
     try:
         return path.is_file()
     except OSError:

@@ -21,10 +21,11 @@ from pydantic import Field, model_validator
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import whole
 from motionloom.datasets.base.licences import CMU
+from motionloom.datasets.base.places import is_file
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.captions.options import CaptionConfig
-from motionloom.datasets.convert.common.files import check_id, is_there
+from motionloom.datasets.convert.common.files import check_id
 from motionloom.datasets.convert.common.plan import C, ConversionPlan
 from motionloom.datasets.convert.common.splits import (
     hash_split,
@@ -193,7 +194,7 @@ class HumanmlConfig(CaptionConfig):
         self, clip_id: str, seconds: float | None, notes: list[str]
     ) -> tuple[tuple[Caption, ...], str]:
         """Captions of a clip of the index, and why it must be left out."""
-        if self.humanml_texts is None or not is_there(path := self.humanml_texts / f"{clip_id}.txt"):
+        if self.humanml_texts is None or not is_file(path := self.humanml_texts / f"{clip_id}.txt"):
             return (), ""
         try:
             captions, wrong = read_humanml_captions(path, seconds=seconds, name=path.name)

@@ -162,14 +162,6 @@ def walk_files(root: Path) -> list[str]:
     return walk(root).files
 
 
-def is_there(path: Path) -> bool:
-    """Whether a file can be found, also where its folder may not be read."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
-
-
 def files_in(folder: Path, suffix: str) -> list[str]:
     """Return the sorted names of a folder's own entries that end so, whether or not they can be read, without
     hidden ones. `UserError` for a folder that may not be read.

@@ -24,12 +24,13 @@ from pydantic import Field
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import content_of
+from motionloom.datasets.base.places import is_file
 from motionloom.datasets.base.records import Caption
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.features import features_of, require_human
-from motionloom.datasets.convert.common.files import check_id, files_in, inside, is_there
+from motionloom.datasets.convert.common.files import check_id, files_in, inside
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
@@ -138,7 +139,7 @@ class HumanMl3d(Release[HumanMl3dConfig]):
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
         frames, other = _frames(path, label), _other(label)
-        if is_there(self.path_of(other)) and (there := _frames(self.path_of(other), other)) != frames:
+        if is_file(self.path_of(other)) and (there := _frames(self.path_of(other), other)) != frames:
             raise UserError(
                 f"{label}: {frames} frames, but {other}, which holds the same motion, has {there}"
             )
@@ -167,12 +168,12 @@ class HumanMl3d(Release[HumanMl3dConfig]):
 
     def depends_on(self, clip: ReleaseClip) -> list[object]:
         other = self.path_of(_other(clip.entry.file))
-        return [*super().depends_on(clip), content_of(other) if is_there(other) else ""]
+        return [*super().depends_on(clip), content_of(other) if is_file(other) else ""]
 
     def _load(self, file: str) -> NDArray[np.floating]:
         """A motion file; `UserError` where the release's other copy of it shows another motion."""
         stored, other = _load(self.path_of(file), file), _other(file)
-        if is_there(self.path_of(other)):
+        if is_file(self.path_of(other)):
             beside = _load(self.path_of(other), other)
             apart = np.abs(_joints(stored[:_COMPARED]) - _joints(beside[:_COMPARED])).max()
             if not apart < SAME_METRES:

@@ -15,12 +15,13 @@ import numpy as np
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import number
+from motionloom.datasets.base.places import is_file
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.amass.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.arrays import check_values
 from motionloom.datasets.convert.common.facts import Fact
-from motionloom.datasets.convert.common.files import files_in, is_there, read_text_file
+from motionloom.datasets.convert.common.files import files_in, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.tables import BadRows, captions_of, read_csv
@@ -72,7 +73,7 @@ class Beat2(BodyRelease[Beat2Config]):
         for folder in folders:
             below = "" if folder == source else f"{folder.name}/"
             listed = {}
-            if is_there(folder / LISTS):
+            if is_file(folder / LISTS):
                 draft.known.beside.add(f"{below}{LISTS}")
                 bad: BadRows = {}
                 rows = read_csv(folder / LISTS, ("id", "type"), bad)
@@ -105,14 +106,14 @@ class Beat2(BodyRelease[Beat2Config]):
         sound, texts = f"{below}{SPEECH}/{name}.wav", tuple(self._words(below, name, draft))
         return Entry(
             f"{below}{name}", f"{below}{MOTION}/{name}.npz", texts, split, name, facts,
-            sound if is_there(self.config.source / sound) else None, problem=problem,
+            sound if is_file(self.config.source / sound) else None, problem=problem,
         )  # fmt: skip
 
     def _words(self, below: str, name: str, draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:
         """Yield the transcript, a caption for each phrase between two pauses."""
         file = f"{below}{WORDS}/{name}.TextGrid"
         path = self.config.source / file
-        if not is_there(path):
+        if not is_file(path):
             return
         words: list[tuple[float, float, str]] = []
         with draft.reading(file):

@@ -13,12 +13,13 @@ from typing import Literal
 import numpy as np
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.places import is_file
 from motionloom.datasets.base.records import Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.amass.body import SOURCE_FPS, BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.facts import Fact
-from motionloom.datasets.convert.common.files import files_in, is_there
+from motionloom.datasets.convert.common.files import files_in
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
@@ -74,7 +75,7 @@ class FineDance(BodyRelease[FineDanceConfig]):
             facts: dict[str, Fact] = {}
             label = f"{LABELS}/{number}.json"
             with draft.reading(label):
-                if is_there(source / label):
+                if is_file(source / label):
                     stated = require_record(read_json(source / label, label), label)
                     facts = {
                         key: str(value) for key, value in stated.items() if not isinstance(value, dict | list)
@@ -93,7 +94,7 @@ class FineDance(BodyRelease[FineDanceConfig]):
                 ),
                 self._split(number),
                 facts=facts,
-                sound=sound if is_there(source / sound) else None,
+                sound=sound if is_file(source / sound) else None,
                 problem="on the authors' list of unusable dances" if _is(number, _UNPAIRED) else "",
             )
 

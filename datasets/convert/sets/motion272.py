@@ -24,12 +24,13 @@ from pydantic import Field
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import whole
+from motionloom.datasets.base.places import is_file
 from motionloom.datasets.base.records import SPLITS, Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.common.arrays import check_array_header, load_array
 from motionloom.datasets.convert.common.facts import Fact
-from motionloom.datasets.convert.common.files import files_in, is_there, read_text_file, walk_files
+from motionloom.datasets.convert.common.files import files_in, read_text_file, walk_files
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, Figure, Release, ReleaseClip, ReleaseConfig
 from motionloom.datasets.convert.common.splits import original_of
@@ -102,7 +103,7 @@ class Motion272(Release[Motion272Config]):
     def _texts(self, file: str, draft: ConversionPlan[ReleaseClip]) -> Iterator[Caption]:
         """Captions in HumanML3D's grammar, two in a row of BABEL's stream, or plain lines."""
         path = self.config.source / file
-        if not is_there(path):
+        if not is_file(path):
             return
         with draft.reading(file):
             lines = [line for line in read_text_file(path, file).split("\n") if line.strip()]

@@ -14,11 +14,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.places import is_file
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.amass.body import BodyConfig, BodyRelease
 from motionloom.datasets.convert.common.facts import Fact
-from motionloom.datasets.convert.common.files import inside, is_there, read_text_file
+from motionloom.datasets.convert.common.files import inside, read_text_file
 from motionloom.datasets.convert.common.plan import ConversionPlan
 from motionloom.datasets.convert.common.release import Entry, ReleaseClip
 from motionloom.datasets.convert.common.splits import hash_share
@@ -100,7 +101,7 @@ class MotionHub(BodyRelease[MotionHubConfig]):
         for task, split in lists:
             name = f"annotations/{task}/{split}.json"
             path = self.config.source / name
-            if not is_there(path):
+            if not is_file(path):
                 draft.notes.append(f"no {name}")
                 continue
             draft.known.beside.add(name)
