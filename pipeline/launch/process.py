@@ -75,9 +75,10 @@ def _who_is_silent() -> str:
     Each that lost a connection answers for `_ANSWER` seconds; one that is dead or hangs does not.
     """
     missing = [*range(len(members))]
-    ask = threading.Thread(target=_call_roll, args=(missing,), daemon=True)
-    ask.start()
-    ask.join(2 * _ANSWER)  # a store whose process is stopped does not answer at all
+    if members:
+        ask = threading.Thread(target=_call_roll, args=(missing,), daemon=True)
+        ask.start()
+        ask.join(2 * _ANSWER)  # a store whose process is stopped does not answer at all
     silent = ", ".join(f"rank {rank} ({members[rank]})" for rank in missing)
     return f"{silent or 'another process of this run'} has stopped or hangs"
 
@@ -87,7 +88,7 @@ def _call_roll(missing: list[int]) -> None:
     import torch.distributed as dist
 
     others = [rank for rank in missing if rank != dist.get_rank()]
-    missing[:] = [0] if members else []
+    missing[:] = [0]
     store, end = dist.distributed_c10d._get_default_store(), time.monotonic() + _ANSWER
     with suppress(RuntimeError):
         store.set(f"lost/{dist.get_rank()}", "")

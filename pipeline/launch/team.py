@@ -64,6 +64,7 @@ class Team:
         _require_match(hardware)  # a launcher that disagrees would have processes wait for ever
         if hardware.world() == 1:
             return Team()
+        _meet_nodes(hardware)
         launcher = environment()
         fabric = Fabric(
             accelerator=hardware.lightning_accelerator(),
@@ -162,6 +163,33 @@ def lead_finds(find: Callable[[], Found]) -> Found:
 def _patient_group() -> dist.ProcessGroup:
     """Made once: every group is a connection of all with all, which may fail where a machine is busy."""
     return cast(dist.ProcessGroup, dist.new_group(backend="gloo", timeout=_PATIENCE))
+
+
+def _meet_nodes(hardware: Hardware) -> None:
+    """Refuse nodes that count other processes than the first, which no launcher has compared: they would wait
+    for each other until the time-out."""
+    env, nodes = os.environ, hardware.nodes
+    if nodes == 1 or env.keys() & {"RANK", "LOCAL_RANK"} or srun_tasks() > 1:
+        return
+    node, mine = int(env["NODE_RANK"]), f"{nodes} and hardware.devices {hardware.resolved_devices()}"
+    try:
+        store = _node_store(env["MASTER_ADDR"], int(env["MASTER_PORT"]), node == 0)
+        store.set(f"node/{node}", mine)
+        counts = [store.get(f"node/{other}").decode() for other in range(nodes)]
+    except RuntimeError:  # the first node has ended, or never came
+        raise TeamError.lost() from None
+    for other, count in enumerate(counts):
+        if count != counts[0]:
+            raise UserError(
+                f"node {other} has hardware.nodes {count}, node 0 {counts[0]}; start all with one command"
+            )
+
+
+@cache
+def _node_store(address: str, port: int, first: bool) -> dist.TCPStore:
+    """Made once, as long as the process lives: torch makes its own on the same server."""
+    patience = timedelta(seconds=_COLLECTIVE)
+    return dist.TCPStore(address, port, None, first, patience, wait_for_workers=False, multi_tenant=True)
 
 
 def environment() -> ClusterEnvironment | None:
