@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, TypeVar, cast
 
 import torch
 import torch.distributed as dist
+from torch._C._distributed_c10d import TCPStore
 
 from motionloom import datasets, models, pipeline
 from motionloom.datasets.base.errors import UserError
@@ -186,10 +187,10 @@ def _meet_nodes(hardware: Hardware) -> None:
 
 
 @cache
-def _node_store(address: str, port: int, first: bool) -> dist.TCPStore:
+def _node_store(address: str, port: int, first: bool) -> TCPStore:
     """Made once, as long as the process lives: torch makes its own on the same server."""
     patience = timedelta(seconds=_COLLECTIVE)
-    return dist.TCPStore(address, port, None, first, patience, wait_for_workers=False, multi_tenant=True)
+    return TCPStore(address, port, None, first, patience, wait_for_workers=False, multi_tenant=True)
 
 
 def environment() -> ClusterEnvironment | None:
