@@ -29,7 +29,7 @@ FENCE = (
     "datasets/convert/sets",
 )
 """Folders of what neither paper needs: nothing imports them, and each may be removed."""
-BOTTOM_LIBRARIES = {"numpy", "torch", "roma", "scipy", "pydantic", "motionloom"}
+BOTTOM_LIBRARIES = {"numpy", "torch", "roma", "scipy", "pydantic", "pydantic_core", "motionloom"}
 
 
 MODULE = re.compile(r"motionloom(\.\w+)+(:\w+)?")

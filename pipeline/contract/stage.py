@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 import torch
 from pydantic import BaseModel, model_validator
-from pydantic.config import JsonDict
 from rich.console import Console
 
 from motionloom.datasets.base.config import Config
@@ -394,19 +393,3 @@ def stage_kind(name: str, where: str, packages: Iterable[str] = ()) -> StageKind
             f"name the module that registers it in {VARIABLE}"
         )
     return kinds[name]
-
-
-RUNTIME: JsonDict = {"runtime": True}
-"""Marks a config field that changes how a stage runs, not what it makes: it is not fingerprinted."""
-
-
-def fingerprint_fields(config: BaseModel) -> dict[str, object]:
-    """The config as plain data without the fields marked RUNTIME."""
-    out: dict[str, object] = {}
-    for name, info in type(config).model_fields.items():
-        extra = info.json_schema_extra
-        if isinstance(extra, dict) and extra.get("runtime"):
-            continue
-        value = getattr(config, name)
-        out[name] = fingerprint_fields(value) if isinstance(value, BaseModel) else value
-    return out

@@ -22,7 +22,8 @@ from typing import Literal
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.licences import UNKNOWN
 from motionloom.datasets.base.register import code_of
-from motionloom.pipeline.contract.stage import Every, NotThereError, Stage, fingerprint_fields
+from motionloom.pipeline.contract.fingerprint import fingerprint_fields
+from motionloom.pipeline.contract.stage import Every, NotThereError, Stage
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.continuation import Continuation, Started, continuation, training_facts
 from motionloom.pipeline.runs.inputs import require_elsewhere

@@ -8,8 +8,9 @@ from pathlib import Path
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.training.distributed import rank
 from motionloom.models.training.stage_module import StageModule
+from motionloom.pipeline.contract.fingerprint import fingerprint_fields
 from motionloom.pipeline.contract.lookup import finished_stages
-from motionloom.pipeline.contract.stage import Stage, StageCache, fingerprint_fields
+from motionloom.pipeline.contract.stage import Stage, StageCache
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.execute import finish_stage, stage_inputs
 from motionloom.pipeline.runs.plan import Selection, make_plan

@@ -18,7 +18,8 @@ from motionloom.datasets.base.register import Table, discover
 from motionloom.datasets.loading.plan import Share
 from motionloom.datasets.loading.steps import Numbered
 from motionloom.models.training.optim import OptimConfig
-from motionloom.pipeline.contract.stage import RUNTIME, StageConfig, StageContext
+from motionloom.pipeline.contract.fingerprint import RUNTIME
+from motionloom.pipeline.contract.stage import StageConfig, StageContext
 from motionloom.pipeline.launch.hardware import Hardware, require_loggers
 
 if TYPE_CHECKING:

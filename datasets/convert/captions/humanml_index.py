@@ -26,7 +26,8 @@ from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.captions.options import CaptionConfig
 from motionloom.datasets.convert.common.files import check_id
-from motionloom.datasets.convert.common.plan import C, ConversionPlan
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.planned import C
 from motionloom.datasets.convert.common.splits import (
     hash_split,
     keep_mirrors_together,

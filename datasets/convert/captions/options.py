@@ -24,7 +24,8 @@ from motionloom.datasets.base.records import SPLITS, Caption, Split
 from motionloom.datasets.convert.captions.collect import Captions, caption_files, holds_captions
 from motionloom.datasets.convert.captions.read import CaptionRow, bare, joined, place_of
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.plan import C, ConversionPlan
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.planned import C
 from motionloom.datasets.convert.common.splits import (
     ListLine,
     SplitLists,

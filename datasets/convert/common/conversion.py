@@ -17,7 +17,8 @@ from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.converter import Converter, PlanSettings
 from motionloom.datasets.convert.common.files import read_in_threads
 from motionloom.datasets.convert.common.look import Look, look_at
-from motionloom.datasets.convert.common.plan import C, ConversionPlan
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.planned import C
 from motionloom.datasets.shards.index import load_index
 from motionloom.datasets.shards.left_out import grouped_notes
 from motionloom.datasets.shards.options import DatasetFacts, Part, WriteOptions

@@ -20,7 +20,8 @@ from motionloom.datasets.base.records import ClipMeta
 from motionloom.datasets.base.register import Table
 from motionloom.datasets.convert.common.config import ConvertConfig
 from motionloom.datasets.convert.common.look import SourceJoints
-from motionloom.datasets.convert.common.plan import C, ConversionPlan, facts_of
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.planned import C, facts_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.sample import Sample
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
+from typing import Generic, Literal, NamedTuple
 
 from rich.markup import escape
 from rich.table import Table
@@ -23,32 +23,12 @@ from motionloom.datasets.base.json_doors import number
 from motionloom.datasets.base.printable import printable
 from motionloom.datasets.base.records import SPLITS, Dropped, Split
 from motionloom.datasets.convert.common.config import ConvertConfig
-from motionloom.datasets.convert.common.facts import Facts, parse_where, require_known
+from motionloom.datasets.convert.common.facts import parse_where, require_known
 from motionloom.datasets.convert.common.files import Walk
 from motionloom.datasets.convert.common.look import Look
+from motionloom.datasets.convert.common.planned import C, facts_of, file_of, words_of
 from motionloom.datasets.convert.common.splits import ListLine
 from motionloom.datasets.shards.left_out import drop, grouped, grouped_notes
-
-
-class PlannedClip(Protocol):
-    """A clip of a plan: what a converter hands to its function from clip to sample. One whose label is not
-    the name of its motion file in the source says that as `file`.
-    """
-
-    @property
-    def id(self) -> str:
-        """Its name in the data set."""
-        ...
-
-    @property
-    def split(self) -> Split: ...
-
-    def label(self) -> str:
-        """Name in reports. A changed file must change it: name and size will do."""
-        ...
-
-
-C = TypeVar("C", bound=PlannedClip)
 
 Fate = Literal["skipped", "rejected", "unreadable", "missing"]
 """What becomes of one that is no clip; those that a conversion was to read, rejected or not, are lost."""
@@ -382,22 +362,6 @@ class ConversionPlan(Generic[C]):
     def require_settled(self) -> None:
         if self.stop:
             raise UserError(self.stop)
-
-
-def facts_of(clip: PlannedClip) -> Facts:
-    """Facts of a clip by name, for `where`: id, split, and the clip's own `facts`."""
-    facts: Facts = getattr(clip, "facts", {})
-    return {"id": clip.id, "split": clip.split, **facts}
-
-
-def file_of(clip: PlannedClip) -> str:
-    """The name of a clip's motion file in the source."""
-    return str(getattr(clip, "file", clip.label()))
-
-
-def words_of(clip: PlannedClip) -> frozenset[str]:
-    """The sentences of a clip."""
-    return frozenset(text.text for text in getattr(clip, "texts", ()))
 
 
 def _given(config: ConvertConfig, walked: Walk) -> set[str]:

@@ -20,8 +20,8 @@ from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.reader import manifest_layout, read_manifest
 from motionloom.datasets.shards.store import LocalStore, is_url, open_store
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.contract.fingerprint import RUNTIME
 from motionloom.pipeline.contract.stage import (
-    RUNTIME,
     CompletedStage,
     FunctionStage,
     Inputs,

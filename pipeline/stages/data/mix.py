@@ -16,8 +16,8 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import SPLITS
 from motionloom.datasets.check.leaks import Splits, find_leaks
 from motionloom.datasets.motion.layout import MotionLayout, require_layout
+from motionloom.pipeline.contract.fingerprint import RUNTIME
 from motionloom.pipeline.contract.stage import (
-    RUNTIME,
     CompletedStage,
     Every,
     Inputs,

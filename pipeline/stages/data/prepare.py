@@ -12,9 +12,9 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of
 from motionloom.datasets.base.records import Split
 from motionloom.datasets.loading.statistics import FeatureStats, compute
+from motionloom.pipeline.contract.fingerprint import RUNTIME
 from motionloom.pipeline.contract.stage import (
     CPU,
-    RUNTIME,
     CompletedStage,
     Inputs,
     StageConfig,

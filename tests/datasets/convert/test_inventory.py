@@ -19,7 +19,8 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.captions.collect import Captions
 from motionloom.datasets.convert.common import files
 from motionloom.datasets.convert.common.conversion import run_conversion
-from motionloom.datasets.convert.common.plan import ConversionPlan, file_of
+from motionloom.datasets.convert.common.plan import ConversionPlan
+from motionloom.datasets.convert.common.planned import file_of
 from motionloom.datasets.convert.registry import converter_named, prepare
 
 SETS = ("motionhub", "finedance", "bones_seed", "motion272", "snapmogen", "beat2", "style100")

@@ -15,7 +15,8 @@ from toy_stages import register_toys
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.lock import file_lock
-from motionloom.pipeline.contract.stage import RUNTIME, Every, FunctionStage, StageConfig, StageContext
+from motionloom.pipeline.contract.fingerprint import RUNTIME
+from motionloom.pipeline.contract.stage import Every, FunctionStage, StageConfig, StageContext
 from motionloom.pipeline.runs.execute import execute
 from motionloom.pipeline.runs.plan import REQUEST_FILE, Selection, make_plan
 from motionloom.pipeline.runs.recipe import Recipe, load_recipe

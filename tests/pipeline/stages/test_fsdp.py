@@ -30,7 +30,7 @@ from motionloom.models.gpt.tokens import interleave
 from motionloom.models.tma.network import Tma, TmaConfig
 from motionloom.models.tokenizer.body_hand import H2VQConfig
 from motionloom.models.training.stage_module import OptimConfig
-from motionloom.pipeline.contract.stage import fingerprint_fields
+from motionloom.pipeline.contract.fingerprint import fingerprint_fields
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.stages.networks.gpt import GptStageConfig
 from motionloom.pipeline.stages.networks.tma import TmaStageConfig
