@@ -1,10 +1,12 @@
-"""A training loop by hand: what any Trainer must come to."""
+"""A training loop by hand, what any Trainer must come to; and such a Trainer."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
+import lightning as L
 import torch
 from lightning.fabric import Fabric
 from torch import Tensor
@@ -41,3 +43,22 @@ def take_steps(
                 optimizer.step()  # type: ignore[union-attr,call-arg]
             module.step += 1
     return losses
+
+
+def trainer(folder: Path, **settings: Any) -> L.Trainer:
+    """A Trainer of six steps that prints and logs nothing."""
+    quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
+    base = {"max_steps": 6, "accelerator": "cpu", "default_root_dir": folder, **quiet, **settings}
+    return L.Trainer(**{"enable_checkpointing": False, **base})
+
+
+class StopAt(L.Callback):
+    """Ends a training at a step, as what watches it may; saves it there if told where."""
+
+    def __init__(self, step: int, path: Path | None = None) -> None:
+        self.step, self.path = step, path
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        trainer.should_stop = trainer.global_step == self.step
+        if trainer.should_stop and self.path is not None:
+            trainer.save_checkpoint(self.path)

@@ -10,6 +10,7 @@ from typing import Any
 import lightning as L
 import pytest
 import torch
+from plain_training import StopAt, trainer
 from rank_shares import require_rows
 from safetensors.torch import load_file
 
@@ -28,30 +29,11 @@ from motionloom.pipeline.training.loaders import StageData
 SMALL = ["tokenizer", "face_tokenizer", "tma", "gpt", "face_gpt", "face_vae", "face_diffusion"]
 
 
-class StopAt(L.Callback):
-    """Ends a training at a step, behind a validation."""
-
-    def __init__(self, step: int) -> None:
-        self.step = step
-
-    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        trainer.should_stop = trainer.global_step == self.step
-
-
 def fitted(module: StageModule, data: StageData, steps: int, folder: Path, start: Any = None) -> L.Trainer:
     """A Trainer that has trained for some steps of those that the recipe has, and validated."""
-    trainer = L.Trainer(
-        max_steps=module.max_steps,
-        callbacks=[StopAt(steps)],
-        accelerator="cpu",
-        default_root_dir=folder,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
-    trainer.fit(module, data, ckpt_path=start)
-    return trainer
+    one = trainer(folder, max_steps=module.max_steps, callbacks=[StopAt(steps)])
+    one.fit(module, data, ckpt_path=start)
+    return one
 
 
 @pytest.mark.parametrize("stage", [*SMALL, "utt", "dmd"])
@@ -62,8 +44,8 @@ def test_a_trainer_makes_the_weights_of_the_run(stage: str, request: Any, tmp_pa
     first = min((run / "stages" / stage / "checkpoints").glob("*.ckpt"))
     wanted = torch.load(first, weights_only=True)
     module, data = training(run, stage)
-    trainer = fitted(module, data, wanted["global_step"], tmp_path)
-    assert trainer.callback_metrics["val/loss"].isfinite()
+    one = fitted(module, data, wanted["global_step"], tmp_path)
+    assert one.callback_metrics["val/loss"].isfinite()
     averaged = {f"net{name[6:]}": value for name, value in (wanted["average"] or {}).items()}
     for name, value in module.state_dict().items():
         assert torch.equal(value, (wanted["state_dict"] | averaged)[name]), name
@@ -71,7 +53,7 @@ def test_a_trainer_makes_the_weights_of_the_run(stage: str, request: Any, tmp_pa
     fitted(again, same, again.max_steps, tmp_path, first)
     for name, value in load_file(run / "stages" / stage / "model.safetensors").items():
         assert torch.equal(value, again.net.state_dict()[name]), name
-    trainer.save_checkpoint(tmp_path / "trainer.ckpt")
+    one.save_checkpoint(tmp_path / "trainer.ckpt")
     batches = data.batches.train(8, ALONE)
     batch = batches[0]
     require_rows(batch, [pickle.loads(pickle.dumps(batches))[0]])  # a loader's worker gets a copy

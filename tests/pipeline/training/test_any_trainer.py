@@ -15,7 +15,7 @@ import ude_training
 from lightning.pytorch import callbacks as given
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.tuner import Tuner
-from plain_training import take_steps
+from plain_training import StopAt, take_steps, trainer
 from rank_cases import CASES
 from same_stage import assert_equal
 from tiny_adversaries import Duel, Vectors, train
@@ -44,13 +44,6 @@ def opened(name: str) -> Opened:
         return Duel(seed=3, max_steps=STEPS), Vectors(8).__getitem__
     clips = ude_training.Clips(8, dtype=torch.float32, dies_at=None)
     return ude_training.module_of(name, STEPS, dropout=0.1), clips.__getitem__
-
-
-def trainer(folder: Path, **settings: Any) -> L.Trainer:
-    """One that prints and logs nothing."""
-    quiet: dict[str, Any] = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False}
-    base = {"max_steps": STEPS, "accelerator": "cpu", "default_root_dir": folder, **quiet, **settings}
-    return L.Trainer(**{"enable_checkpointing": False, **base})
 
 
 def stage_data(name: str, parts: int = 1) -> StageData:
@@ -86,18 +79,6 @@ def test_in_half_precision(name: str, tmp_path: Path) -> None:
     data = DataLoader([same(k) for k in range(STEPS)], batch_size=None)
     trainer(tmp_path, precision="bf16-mixed").fit(module, data)
     assert_equal(own.state_dict(), module.state_dict())
-
-
-class StopAt(L.Callback):
-    """Ends a training at a step, as what watches it may; saves it there if told where."""
-
-    def __init__(self, step: int, path: Path | None = None) -> None:
-        self.step, self.path = step, path
-
-    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        trainer.should_stop = trainer.global_step == self.step
-        if trainer.should_stop and self.path is not None:
-            trainer.save_checkpoint(self.path)
 
 
 @pytest.mark.parametrize("name", ["mq", "utt", "actor_critic", "duel"])
