@@ -220,7 +220,9 @@ def page(text: str, records: Mapping[str, Record]) -> str:
 
 
 def read_records() -> dict[str, Record]:
-    return {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in RECORDS.glob("*.json")}
+    """The records that are tables, by name."""
+    found = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in RECORDS.glob("*.json")}
+    return {name: record for name, record in found.items() if "rows" in record}
 
 
 def rendered() -> str:

@@ -148,7 +148,7 @@ def test_a_new_metric_is_one_function(monkeypatch: pytest.MonkeyPatch) -> None:
     line = ClipMetric(
         "How far motions get", reach, (Metric("reach.root", "reach of the root", "higher", "m"),)
     )
-    monkeypatch.setitem(clip_metrics.CLIP_METRICS, line.name, line)
+    monkeypatch.setitem(clip_metrics.CLIP_METRICS._things, line.name, line)
     metrics, rng = clip_metrics.metrics_of("captions"), np.random.default_rng(0)
     real = [rng.normal(size=(20, 22, 3)) for _ in range(5)]
     rows = {

@@ -332,7 +332,7 @@ def test_an_average_leaves_tables_and_codebooks_alone(tmp_path: Path) -> None:
 def test_a_recipe_names_callbacks_and_a_profiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A callback sees validations as under any Trainer, and ends the training behind the second."""
     early = TrainingCallback("early", lambda _: given.EarlyStopping("val/loss", min_delta=1e9, patience=1))
-    monkeypatch.setitem(CALLBACKS, "early", early)
+    monkeypatch.setitem(CALLBACKS._things, "early", early)
     duel = train(tmp_path, validate_every=6, callbacks=("early",), profiler="simple")
     assert duel.step == 12
     assert "run_training_batch" in next((tmp_path / "logs").glob("*profile*")).read_text()
