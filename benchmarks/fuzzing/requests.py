@@ -39,8 +39,8 @@ EDIT = (
         "task": {
             "keep": [{"start": 0, "end": 0.5, "parts": ["all"], "but": ["left_hand"]}],
             "caption": "waves",
-            "seconds": 3,
-            "lead": 0.5,
+            "seconds": 2,
+            "lead": 0.2,
         },
         "seed": 1,
         "format": "joints",
@@ -48,7 +48,7 @@ EDIT = (
     {
         "clip": "",
         "task": {
-            "path": [{"at": 0.2, "x": 0, "z": 0}, {"at": 1.5, "x": 0.5, "z": 1}],
+            "path": [{"at": 0.2, "x": 0, "z": 0}, {"at": 1.2, "x": 0.5, "z": 1}],
             "pins": [{"at": 1, "joint": "left_wrist", "position": [0.3, 1.2, 0.2]}],
         },
         "format": "viewer",
@@ -106,7 +106,7 @@ def routes() -> list[str]:
 def _request(path: str, media: str, contents: Callable[[Path], list[tuple[str, bytes, Mutator]]]) -> None:
     def make(folder: Path) -> tuple[list[Seed], Read]:
         logging.disable(logging.CRITICAL)
-        sent = files.bvh_clip(folder, 60)
+        sent = files.bvh_clip(folder, 40)
 
         @cache
         def served(process: int) -> tuple[Site, str]:

@@ -56,11 +56,9 @@ def test_of_ctrl_c_and_of_a_program_on_standard_input(seconds: float, after: flo
 def test_what_killed_commands_left_goes_with_the_next_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Folders for the files of a motion, of an export, and of the system's place; not those of the living."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    others = (tmp_path / "out/.mine.0123456789abcdef.tmp", tmp_path / "out/.out.tmp")
-    for folder in others:
-        folder.mkdir(parents=True)
+    other = tmp_path / "out/.mine.0123456789abcdef.tmp"
+    other.mkdir(parents=True)
     for make in (
         lambda: new_files(tmp_path / "out"),
         lambda: new_folder(tmp_path / "export"),
@@ -80,4 +78,4 @@ def test_what_killed_commands_left_goes_with_the_next_one(
         assert left.exists()
         with make() as mine:
             assert mine.is_dir() and not left.exists()
-    assert all(map(Path.is_dir, others)), "what has another name is another's"
+    assert other.is_dir(), "what has another name is another's"

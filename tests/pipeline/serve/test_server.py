@@ -146,7 +146,6 @@ def test_a_slow_request_is_let_go(run_server: Callable[..., Any], quick: Any) ->
 
 
 def test_half_sent_headers_are_let_go(run_server: Callable[..., Any], quick: Any) -> None:
-    """Of new connections, silent ones, and of one that had an answer; the bytes that still come help none."""
     with run_server(quick, patience=1.0, connections=3) as served, contextlib.ExitStack() as held:
         slow = [held.enter_context(socket.create_connection(("127.0.0.1", served.port))) for _ in range(3)]
         slow[2].sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -164,7 +163,6 @@ def test_half_sent_headers_are_let_go(run_server: Callable[..., Any], quick: Any
 
 
 def test_uploads_over_the_limit_get_their_sentence(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also who sends far more than any buffer holds, and looks at the answer only then."""
     for path in ("/api/sounds", "/api/clips"):
         got = served.ask("POST", path, bytes(40 << 20))
         assert got.status == 413 and "larger than this server takes" in got.json["error"]

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.text.encoder import load_text_encoder
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.store.known_captions import (
     FALSE_ALARMS,
-    KNOWN_FILES,
     KnownCaptions,
     load_known,
     representatives,
@@ -100,19 +97,6 @@ def test_files_come_back(tmp_path: Path) -> None:
     assert found["body"].distances == body.distances
     np.testing.assert_allclose(found["body"].embeddings, body.embeddings, atol=2**-11)
     assert load_known(tmp_path / "none")[1] == {}
-
-
-@pytest.mark.parametrize("damage", ["cut", "other"])
-def test_damaged_files_are_named(tmp_path: Path, damage: str) -> None:
-    save_known(tmp_path, KnownCaptions(("a",), unit(1, 8, 4)), KnownCaptions(("b",), unit(1, 8, 6)))
-    path = tmp_path / KNOWN_FILES[1]
-    if damage == "cut":
-        path.write_bytes(path.read_bytes()[:40])
-    else:
-        save_known(tmp_path / "x", KnownCaptions(("a", "c"), unit(2, 8, 4)), KnownCaptions((), unit(0, 8, 6)))
-        shutil.copyfile(tmp_path / "x" / KNOWN_FILES[1], path)
-    with pytest.raises(UserError, match=r"known\.safetensors"):
-        load_known(tmp_path)
 
 
 def test_a_run_of_clips_with_a_truth_knows_their_actions(small_run: Any) -> None:

@@ -12,7 +12,6 @@ import torch
 from rich.console import Console
 from tiny_adversaries import DIM, Duel, Vectors, train
 
-from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import write_text
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.stages.results.report_parts import draw_flights
@@ -20,13 +19,6 @@ from motionloom.pipeline.store.run_state import RunState, StageState
 from motionloom.pipeline.store.training_log import read_flight, read_rows, read_starts, read_training_log
 from motionloom.pipeline.training.telemetry import WaitTimes, waited_in_steps
 from motionloom.pipeline.training.utilization import Utilization, pass_flops
-
-
-@pytest.mark.parametrize(("rows", "words"), [('{"st', "not a training log"), ("7\n", "line 1 is")])
-def test_a_damaged_log_is_named(rows: str, words: str, tmp_path: Path) -> None:
-    (tmp_path / "metrics.jsonl").write_text(rows)
-    with pytest.raises(UserError, match=rf"metrics\.jsonl: {words}"):
-        read_training_log(tmp_path)
 
 
 def test_a_training_notes_speed_and_waits(tmp_path: Path) -> None:
