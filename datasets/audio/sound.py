@@ -11,21 +11,18 @@ Notable choices:
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from threading import Thread
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.decoder_notes import unheard
+from motionloom.datasets.audio.mp3 import missing_bytes, require_no_frames, sending_pipe, unheard
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.places import is_file
 
@@ -293,45 +290,13 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
                 yield file
                 return
             # Its length is a guess unless the first frame states it: a pipe has none, so libsndfile reads on.
-            with _pipe(path) as end, soundfile.SoundFile(end, closefd=False) as piped:
+            with sending_pipe(path) as end, soundfile.SoundFile(end, closefd=False) as piped:
                 unstated = piped.frames == _UNKNOWN
                 yield piped if unstated else file
                 if unstated and not len(piped.read(1)):
-                    _require_no_frames(end, name)
+                    require_no_frames(end, name)
     except (soundfile.SoundFileError, RuntimeError, OSError) as error:
         raise UserError(f"{name}: not readable sound ({_reason(error)})") from None
-
-
-@contextmanager
-def _pipe(path: Path) -> Iterator[int]:
-    """The reading end of a pipe through which a thread sends an MP3, without its tag: of a pipe libsndfile
-    skips 50 kB of it at most.
-    """
-    out, into = os.pipe()
-
-    def send() -> None:
-        with suppress(BrokenPipeError), path.open("rb") as source, os.fdopen(into, "wb") as target:
-            source.seek(_tag_bytes(source))
-            shutil.copyfileobj(source, target)
-
-    thread = Thread(target=send)
-    thread.start()
-    try:
-        yield out
-    finally:
-        os.close(out)
-        thread.join()
-
-
-def _require_no_frames(end: int, name: str) -> None:
-    """`UserError` where a decoder has stopped at damage, so that frames are still in the pipe, whose heads
-    stand 1,441 bytes apart at most; a picture behind the sound has hardly any.
-    """
-    with open(end, "rb", closefd=False) as left:
-        rest = left.read()
-    heads = max(rest.count(bytes([0xFF, kind])) for kind in (0xFA, 0xFB, 0xF2, 0xF3, 0xE2, 0xE3))
-    if heads * 2000 > len(rest) > 4000:
-        raise UserError(f"{name}: damaged: its decoder stops {len(rest):,} bytes before the end")
 
 
 def _check_header(path: Path, name: str) -> None:
@@ -362,29 +327,8 @@ def _check_header(path: Path, name: str) -> None:
             raise UserError(f"{name}: no data chunk, or cut short before it")
         if head == b"version http":
             raise UserError(f"{name}: a Git LFS pointer in place of the sound; fetch it: git lfs pull")
-        if (missing := _missing_mp3_bytes(file, size)) > 0:
+        if (missing := missing_bytes(file, size)) > 0:
             raise UserError(f"{name}: cut short: {missing} bytes of the MP3 are missing")
-
-
-def _tag_bytes(file: BinaryIO) -> int:
-    """Length of the ID3 tag, which may hold a picture, before the first frame of an MP3; 0 without one."""
-    file.seek(0)
-    head = file.read(10)
-    # The length is four bytes of seven bits; the fourth flag says that the header is repeated at the end.
-    length = sum((byte & 127) << 7 * (3 - i) for i, byte in enumerate(head[6:]))
-    return 0 if head[:3] != b"ID3" or len(head) < 10 else 10 + length + (10 if head[5] & 16 else 0)
-
-
-def _missing_mp3_bytes(file: BinaryIO, size: int) -> int:
-    """Return the bytes an MP3 lacks of its stated length, or 0; libsndfile fills them with silence."""
-    start = _tag_bytes(file)
-    file.seek(start)
-    frame = file.read(256)
-    at = max(frame.find(b"Xing"), frame.find(b"Info"))
-    if at < 0 or frame[:1] != b"\xff" or len(frame) < at + 16:
-        return 0
-    flags, _, stated = struct.unpack(">III", frame[at + 4 : at + 16])
-    return int(stated) - (size - start) if flags & 3 == 3 else 0
 
 
 def _reason(error: Exception) -> str:

@@ -12,7 +12,7 @@ import pytest
 import soundfile
 
 from motionloom.datasets.audio import sound
-from motionloom.datasets.audio.decoder_notes import unheard
+from motionloom.datasets.audio.mp3 import unheard
 from motionloom.datasets.audio.sound import Sound, read_sound, resample_sound, sound_seconds
 from motionloom.datasets.base.errors import UserError
 
