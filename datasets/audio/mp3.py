@@ -17,8 +17,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from motionloom.datasets.base.errors import UserError
-
 _STDERR = 2
 _NOTE = re.compile(rb"\s*(Note|Warning|Error): |.{0,20}\[src/libmpg123/|\n")
 """How its lines begin; those of Python's own warnings name a file first."""
@@ -92,15 +90,14 @@ def sending_pipe(path: Path) -> Iterator[int]:
         thread.join()
 
 
-def require_no_frames(end: int, name: str) -> None:
-    """`UserError` where a decoder has stopped at damage, so that frames are still in the pipe, whose heads
-    stand 1,441 bytes apart at most; a picture behind the sound has hardly any.
+def bytes_left(end: int) -> int:
+    """Bytes in a pipe behind which a decoder has stopped at damage: frames, whose heads stand 1,441 bytes
+    apart at most. 0 where nothing is left, or a picture behind the sound, which has hardly any.
     """
     with open(end, "rb", closefd=False) as left:
         rest = left.read()
     heads = max(rest.count(bytes([0xFF, kind])) for kind in (0xFA, 0xFB, 0xF2, 0xF3, 0xE2, 0xE3))
-    if heads * 2000 > len(rest) > 4000:
-        raise UserError(f"{name}: damaged: its decoder stops {len(rest):,} bytes before the end")
+    return len(rest) if heads * 2000 > len(rest) > 4000 else 0
 
 
 def tag_bytes(file: BinaryIO) -> int:

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.datasets.audio.mp3 import missing_bytes, require_no_frames, sending_pipe, unheard
+from motionloom.datasets.audio.mp3 import bytes_left, missing_bytes, sending_pipe, unheard
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.places import is_file
+from motionloom.datasets.base.files import is_file
 
 MAX_SECONDS = 3600
 """Longest sound that is read."""
@@ -293,8 +293,8 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
             with sending_pipe(path) as end, soundfile.SoundFile(end, closefd=False) as piped:
                 unstated = piped.frames == _UNKNOWN
                 yield piped if unstated else file
-                if unstated and not len(piped.read(1)):
-                    require_no_frames(end, name)
+                if unstated and not len(piped.read(1)) and (left := bytes_left(end)):
+                    raise UserError(f"{name}: damaged: its decoder stops {left:,} bytes before the end")
     except (soundfile.SoundFileError, RuntimeError, OSError) as error:
         raise UserError(f"{name}: not readable sound ({_reason(error)})") from None
 

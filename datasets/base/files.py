@@ -152,6 +152,14 @@ def write_json(path: Path, data: object, *, sort_keys: bool = False, allow_nan: 
     write_text(path, re.sub("[\ud800-\udfff]", lambda half: f"\\\\u{ord(half[0]):x}", text) + "\n")
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is a file of that name, which may be one that no file can have, of 5,000 letters."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def sync_folder(folder: Path) -> None:
     """Make renames and deletions in `folder` survive a power cut."""
     handle = os.open(folder, os.O_RDONLY)

@@ -65,11 +65,3 @@ def hub_is_away() -> bool:
     except OSError:
         return True
     return False
-
-
-def is_file(path: Path) -> bool:
-    """Whether a file can be found: also where its folder may not be read, or no file can have such a name."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False

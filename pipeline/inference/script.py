@@ -23,7 +23,7 @@ from motionloom.datasets.audio.given_beats import take_beats
 from motionloom.datasets.audio.sound import Excerpt, Sound
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.places import is_file
+from motionloom.datasets.base.files import is_file
 from motionloom.pipeline.contract.generation import MotionGenerator, Prompt
 from motionloom.pipeline.render.sound import Segment
 from motionloom.pipeline.store.yaml import read_yaml

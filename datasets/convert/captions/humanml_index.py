@@ -19,9 +19,9 @@ from pathlib import Path, PurePosixPath
 from pydantic import Field, model_validator
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import is_file
 from motionloom.datasets.base.json_doors import whole
 from motionloom.datasets.base.licences import CMU
-from motionloom.datasets.base.places import is_file
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.convert.captions.humanml_text import read_humanml_captions
 from motionloom.datasets.convert.captions.options import CaptionConfig

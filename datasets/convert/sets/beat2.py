@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.files import is_file
 from motionloom.datasets.base.json_doors import number
-from motionloom.datasets.base.places import is_file
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.amass.body import BodyConfig, BodyRelease

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.places import is_file
+from motionloom.datasets.base.files import is_file
 from motionloom.datasets.base.records import Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.amass.body import SOURCE_FPS, BodyConfig, BodyRelease

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.places import is_file
+from motionloom.datasets.base.files import is_file
 from motionloom.datasets.base.records import Caption, Split
 from motionloom.datasets.base.register import register
 from motionloom.datasets.convert.amass.body import BodyConfig, BodyRelease
