@@ -48,7 +48,7 @@ def load_columns(path: Path, stage: str) -> tuple[Columns, Columns, int, dict[st
         frames = whole(about["frames"], f"{path}: frames")
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; run {stage}") from None
-    except (SafetensorError, OSError, KeyError, ValueError) as error:
+    except (SafetensorError, OSError, KeyError, ValueError, TypeError, AttributeError) as error:
         raise UserError(f"{path}: not a statistics file ({error}); run {stage} again") from None
     numbers = mean.ndim == 1 and mean.shape == std.shape and np.isfinite([mean, std]).all()
     if not numbers or not (std > 0).all():

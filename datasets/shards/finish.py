@@ -46,12 +46,12 @@ class Planned(Config):
     """Manifest without shards; `dropped` are the clips that the plan left out."""
     fingerprints: dict[str, str]
     """Fingerprint of every shard of all parts by its name, in the manifest's order."""
-    items: int
+    items: int = Field(ge=0)
     """Items of all shards."""
     not_ours: list[Dropped] = Field(default_factory=list)
     """As in `DatasetFacts`."""
     lost: list[Dropped]
-    most_lost: float
+    most_lost: float = Field(ge=0)
     """As in `DatasetFacts`."""
 
     def with_results(self, results: Sequence[Result]) -> Manifest:

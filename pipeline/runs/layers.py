@@ -14,6 +14,7 @@ from typing import Any
 
 from motionloom.datasets.base.config import require_local
 from motionloom.datasets.base.errors import UserError, nearest
+from motionloom.datasets.base.files import is_file
 from motionloom.pipeline.store.run_folder import is_place
 from motionloom.pipeline.store.yaml import load_yaml, merge, read_yaml
 
@@ -42,7 +43,7 @@ def find_recipe(name_or_path: str) -> Path:
     path = Path(name_or_path)
     require_local(path)
     if path.suffix in {".yaml", ".yml"}:
-        if not path.is_file():
+        if not is_file(path):
             raise UserError(f"{path}: no such recipe file")
         return path
     shipped, name = shipped_recipes(), name_or_path.replace("/", "-")
@@ -98,7 +99,7 @@ def _read(path: Path, depth: int = 0) -> Tree:
         raise UserError(f"{path}: 'extends' goes in a circle or more than four files deep")
     # A file next to this one goes before a shipped recipe of the same name.
     beside = path.parent / (str(base) if str(base).endswith((".yaml", ".yml")) else f"{base}.yaml")
-    extended = _read(beside if beside.is_file() else find_recipe(str(base)), depth + 1)
+    extended = _read(beside if is_file(beside) else find_recipe(str(base)), depth + 1)
     old, new = extended.get("stages"), data.get("stages")
     out = merge(extended, {key: value for key, value in data.items() if key != "stages"})
     if not isinstance(old, dict) or not isinstance(new, dict):

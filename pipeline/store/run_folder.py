@@ -10,6 +10,7 @@ weights.
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from motionloom.pipeline.store.yaml import read_yaml
 BUNDLE_FILE = "bundle.json"
 """At the top of an export."""
 
-STAGE_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]*$"
+STAGE_NAME = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,99}$"
 """A stage's name is that of its folder."""
 
 UNFINISHED = "unfinished"
@@ -76,7 +77,10 @@ def stages_of(run: Path) -> dict[str, dict[str, Any]]:
     path = run / "recipe.yaml"
     recipe = read_yaml(path)
     stages = recipe.get("stages") if isinstance(recipe, dict) else None
-    if not isinstance(stages, dict) or not all(isinstance(e, dict) and "kind" in e for e in stages.values()):
+    stages = stages if isinstance(stages, dict) else {"": None}
+    if not all(
+        re.fullmatch(STAGE_NAME, n) and isinstance(e, dict) and "kind" in e for n, e in stages.items()
+    ):
         raise UserError(f"{path}: holds no stages; run the recipe again into this folder")
     return stages
 

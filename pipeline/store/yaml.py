@@ -111,8 +111,8 @@ def load_yaml(text: str, where: str) -> Any:
         raise UserError(f"{where}: longer than {_MOST_BYTES:,} characters, which no recipe needs; shorten it")
     try:
         data = yaml.load(text, Loader=_Loader)
-    # ValueError: a value that its explicit tag does not allow. RecursionError: thousands of nested brackets.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+    # ValueError, LookupError: what its explicit tag does not allow. RecursionError: thousands of brackets.
+    except (yaml.YAMLError, ValueError, LookupError, RecursionError) as error:
         reason = " ".join(str(error).split()).replace('in "<unicode string>", ', "at ")
         raise UserError(f"{where}: not valid YAML: {reason}") from None
     _require_few(data, where)
