@@ -5,12 +5,11 @@ sentence that names the file, the key and the nearest valid name.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
 
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.json_doors import parse_json, read_plain
@@ -57,7 +56,7 @@ _SHOWN = 10
 """Problems of one record that are told; a file may have thousands."""
 
 
-def explain(problems: Sequence[ErrorDetails], model: type[BaseModel], where: str) -> str:
+def explain(problems: Sequence[Mapping[str, Any]], model: type[BaseModel], where: str) -> str:
     """One line per problem, with the nearest valid key for each unknown one; ten, and how many more."""
     lines = []
     for item in problems[:_SHOWN]:

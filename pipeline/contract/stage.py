@@ -22,7 +22,6 @@ from rich.console import Console
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
-from motionloom.datasets.base.json_doors import MOST
 from motionloom.datasets.base.register import VARIABLE, Table, discover
 from motionloom.datasets.base.register import register as register
 from motionloom.pipeline.contract.generation import MotionGenerator
@@ -35,6 +34,7 @@ from motionloom.pipeline.contract.showing import Curve, ModelCard, Showing
 from motionloom.pipeline.contract.units import WORK, Units
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.store.artifact import require_unchanged
+from motionloom.pipeline.store.yaml import require_counts
 
 if TYPE_CHECKING:
     from motionloom.pipeline.contract.captioning import MotionCaptioner
@@ -63,20 +63,6 @@ class NotThereError(UserError):
     def __init__(self, message: str, field: str) -> None:
         super().__init__(message)
         self.field = field
-
-
-def require_counts(settings: object, name: str = "") -> None:
-    """`ValueError` naming a whole number beyond `MOST` among settings and groups of them: nobody has so many
-    of anything, and a plan would take them for true. A seed may have 63 bits.
-    """
-    if isinstance(settings, Mapping):
-        for key, value in settings.items():
-            require_counts(value, f"{name}.{key}".removeprefix("."))
-    elif isinstance(settings, list | tuple):
-        for value in settings:
-            require_counts(value, name)
-    elif isinstance(settings, int) and settings > (2**63 - 1 if name.endswith("seed") else MOST):
-        raise ValueError(f"{name} = {settings}: at most {MOST:,.0f} of anything; give a smaller number")
 
 
 class StageConfig(Config):

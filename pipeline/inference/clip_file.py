@@ -38,6 +38,8 @@ ENDINGS = (".bvh", ".amc", ".npz", ".glb")
 _FIGURE = ("rotations", "offsets", "root")
 _SAME_MM = 0.1
 """Millimetres within which an npz's joints are those of its figure: both are rounded to float32."""
+_SQUARE = 1e-3
+"""By how much a rotation times its transpose may miss the identity."""
 Floats = NDArray[np.float64]
 LEAST_FRAMES = 4
 """Fewer have no motion in them."""
@@ -198,5 +200,8 @@ def _figure_of(joints: Floats, rotations: Floats, offsets: Floats, root: Floats)
     shapes = ((*joints.shape, 3), joints.shape[1:], (len(joints), 3))
     if (rotations.shape, offsets.shape, root.shape) != shapes:
         return None
+    turned = rotations @ np.swapaxes(rotations, -1, -2)
+    if not (np.abs(turned - np.eye(3)) < _SQUARE).all() or not (np.linalg.det(rotations) > 0).all():
+        return None  # those of a last joint turn nothing, and so may be anything
     figure = RigidMotion.posed(with_offsets(skeleton, offsets), rotations, root, joints)
     return replace(figure, joints=joints) if figure.error.max_mm < _SAME_MM else None

@@ -27,13 +27,13 @@ from pydantic import Field, field_validator
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.register import VARIABLE
-from motionloom.pipeline.contract.stage import CompletedStage, Every, Stage, require_counts, stage_kinds
+from motionloom.pipeline.contract.stage import CompletedStage, Every, Stage, stage_kinds
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.runs.inputs import Sources, as_stages
 from motionloom.pipeline.runs.layers import Tree, find_recipe
 from motionloom.pipeline.runs.resolve import resolve
 from motionloom.pipeline.store.run_folder import STAGE_NAME, place_from
-from motionloom.pipeline.store.yaml import dump_yaml
+from motionloom.pipeline.store.yaml import dump_yaml, require_counts
 
 
 class RecipeFile(Config):

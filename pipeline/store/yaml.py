@@ -19,6 +19,7 @@ from typing import Any
 import yaml
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.base.json_doors import MOST
 
 _CORE = (
     ("bool", re.compile(r"true|True|TRUE|false|False|FALSE"), "tTfF"),
@@ -171,6 +172,20 @@ def flatten(settings: Mapping[str, object], prefix: str = "") -> dict[str, objec
         else:
             out[name] = value
     return out
+
+
+def require_counts(settings: object, name: str = "") -> None:
+    """`ValueError` naming a whole number beyond `MOST` among settings and groups of them: nobody has so many
+    of anything, and a plan would take them for true. A seed may have 63 bits.
+    """
+    if isinstance(settings, Mapping):
+        for key, value in settings.items():
+            require_counts(value, f"{name}.{key}".removeprefix("."))
+    elif isinstance(settings, list | tuple):
+        for value in settings:
+            require_counts(value, name)
+    elif isinstance(settings, int) and settings > (2**63 - 1 if name.endswith("seed") else MOST):
+        raise ValueError(f"{name} = {settings}: at most {MOST:,.0f} of anything; give a smaller number")
 
 
 def setting_text(value: object) -> str:
