@@ -18,6 +18,7 @@ from fuzzing.mutations import damaged_json, damaged_text
 from fuzzing.sealed import damaged_glb, damaged_npy, damaged_pickle, damaged_zip
 from fuzzing.sounds import damaged_flac, damaged_mp3, damaged_ogg, damaged_wav
 from fuzzing.table import Read, Seed, of_files, of_tree, reader
+from motionloom.datasets.audio.given_beats import with_beats
 from motionloom.datasets.audio.sound import Sound, sound_seconds
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.aistpp.pickle_reader import read_aist_motion
@@ -33,10 +34,13 @@ from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.evaluation.reconstruction import expression_directions
 from motionloom.pipeline.inference.clip_file import read_clip
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.outputs import save
 from motionloom.pipeline.render.body.face import ARKIT, ArkitBases
+from motionloom.pipeline.rigs.rig import Rig
+from motionloom.pipeline.songs.songs import AnnotatedSong
 
 Made = tuple[list[Seed], Read]
 
@@ -200,6 +204,33 @@ def _face(folder: Path) -> Made:
     )
 
 
+@reader("face of a body model", "evaluation/reconstruction.py")
+def _expressions(folder: Path) -> Made:
+    np.savez(folder / "a.npz", shapedirs=np.random.default_rng(0).normal(size=(6, 3, 350)))
+    return of_files(folder, "a.npz", [(folder / "a.npz").read_bytes()], damaged_zip, expression_directions)
+
+
+@reader("character", "rigs/gltf.py", "rigs/names.py")
+def _character(folder: Path) -> Made:
+    tree = trees.glb(folder / "tree")
+    rig = Rig.read(tree / "turn.glb")
+    names = {joint: rig.gltf.names()[node] for joint, node in rig.nodes.items()}
+    (tree / "map.json").write_text(json.dumps(names))
+
+    def read(file: str) -> object:
+        return Rig.read(tree / "turn.glb", tree / "map.json" if file.endswith("json") else None)
+
+    return of_tree(tree, {".glb": damaged_glb, ".json": damaged_json}, read)
+
+
+@reader("song with beats", "songs/songs.py")
+def _song(folder: Path) -> Made:
+    AnnotatedSong(np.zeros((2, 90, 64), np.float16), np.array([0.2, 0.7]), np.array([True, False])).save(
+        folder / "song.npz"
+    )
+    return of_files(folder, "song.npz", [(folder / "song.npz").read_bytes()], damaged_zip, AnnotatedSong.load)
+
+
 @reader("vectors npy", "common/arrays.py")
 def _vectors(folder: Path) -> Made:
     contents = []
@@ -259,12 +290,22 @@ def _part(folder: Path) -> Made:
     return seeds, lambda _, content: Sound.read(content.decode("utf-8", "replace"))
 
 
+@reader("given beats", "given_beats.py")
+def _given_beats(folder: Path) -> Made:
+    heard = Sound(np.zeros(48000, np.float32), 16000)
+    contents = [b"0.1, 0.6, 1.1", b"[0.1, 0.6, 1.1]", b'{"beats": [0.1, 0.6]}', b"120@0.2", b"300@0.1"]
+    seeds = [Seed("beats", content, damaged_text) for content in contents]
+    return seeds, lambda _, content: with_beats(heard, content.decode("utf-8", "replace"))
+
+
 # Captions and lists.
 
 
 @reader(
     "captions",
-    "datasets/schema.py",
+    "base/config.py",
+    "base/json_doors.py",
+    "base/records.py",
     "captions/read.py",
     "captions/options.py",
     "humanml_text.py",
@@ -310,7 +351,7 @@ def _index(folder: Path) -> Made:
     return of_files(folder, "index.csv", [text.encode()], damaged_text, read)
 
 
-@reader("split files", "common/splits.py")
+@reader("split files", "common/splits.py", "sets/bvh_sets.py", "rigs/convert.py")
 def _splits(folder: Path) -> Made:
     tree = folder / "lists"
     tree.mkdir()

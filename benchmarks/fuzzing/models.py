@@ -23,6 +23,8 @@ from motionloom.datasets.text.build import build_with_encoder
 from motionloom.datasets.text.cache import TextCache
 from motionloom.pipeline.contract.lookup import open_exported
 from motionloom.pipeline.contract.stage import StageCache
+from motionloom.pipeline.evaluation.diagnosis import FILE_NAME as DETAILS
+from motionloom.pipeline.evaluation.diagnosis import showings
 from motionloom.pipeline.store.known_captions import load_known
 from motionloom.pipeline.store.published_evaluator import _vocabulary
 from motionloom.pipeline.store.tokens import TokenStore
@@ -112,6 +114,37 @@ def _known(folder: Path) -> Made:
     return of_tree(
         tree, {".json": damaged_json, ".safetensors": damaged_safetensors}, lambda _: load_known(tree)
     )
+
+
+@reader("diagnosis", "evaluation/diagnosis.py")
+def _diagnosis(folder: Path) -> Made:
+    from safetensors.numpy import save
+
+    case = {"of": "generated", "place": "worst 1", "id": "a", "caption": "walks", "error": 0.5}
+    facts = {
+        "fps": 20.0,
+        "skeleton": "smpl22",
+        "joints": {"pelvis": 1.0, "head": 12.5},
+        "actions": {"generated": {"walk": {"walk": 3, "run": 1}}},
+        "cases": [case],
+    }
+    joints = np.zeros((5, 22, 3), np.float32)
+    arrays = save({"0.recorded": joints, "0.generated": joints})
+    (folder / DETAILS).write_bytes(arrays)
+    seeds = [Seed(DETAILS, arrays, damaged_safetensors), Seed("metrics.json", _json(facts), damaged_json)]
+
+    def read(seed: Seed, content: bytes) -> object:
+        if seed.file == DETAILS:
+            (folder / DETAILS).write_bytes(content)
+            return showings(folder, facts)
+        (folder / DETAILS).write_bytes(arrays)
+        try:
+            details = json.loads(content)
+        except ValueError:
+            raise UserError("not JSON") from None
+        return showings(folder, details)
+
+    return seeds, read
 
 
 @reader("beat network", "beat_net.py")

@@ -78,7 +78,14 @@ def _shard(folder: Path) -> Made:
     return of_tree(root, {".tar": damaged_tar}, read)
 
 
-@reader("data set", "shards/reader.py", "shards/store.py", "shards/cache.py", "common/removed.py")
+@reader(
+    "data set",
+    "shards/reader.py",
+    "shards/store.py",
+    "shards/cache.py",
+    "common/removed.py",
+    "curation/clean_command.py",
+)
 def _data_set(folder: Path) -> Made:
     root = _shards(folder)
     (root / "cleaned.json").write_bytes(_json({"left_out": {"clip-a": "floats"}, "kept": ["clip-b"]}))
@@ -131,7 +138,7 @@ def _parts(folder: Path) -> Made:
     return [Seed("1-of-1.json", content, damaged_json)], read
 
 
-@reader("search vectors", "evaluation/search.py")
+@reader("search vectors", "curation/search.py")
 def _search(folder: Path) -> Made:
     np.savez(
         folder / "a.npz", made_from=np.frombuffer(b"x" * 64, np.uint8), vectors=np.ones((4, 8), np.float16)
@@ -148,7 +155,7 @@ def _search(folder: Path) -> Made:
 # Runs, recipes, scripts.
 
 
-@reader("recipe", "runs/resolve.py", "store/yaml.py")
+@reader("recipe", "runs/resolve.py", "runs/layers.py", "store/yaml.py")
 def _recipe(folder: Path) -> Made:
     small: dict[str, Any] = {
         "name": "small",
@@ -177,7 +184,7 @@ def _recipe(folder: Path) -> Made:
     return of_files(folder, "recipe.yaml", contents, damaged_yaml, load_recipe)
 
 
-@reader("edit task")
+@reader("edit task", "editing/command.py")
 def _task(folder: Path) -> Made:
     task = {
         "keep": [{"start": 0, "end": 1.5, "parts": ["lower"]}],

@@ -12,15 +12,17 @@ import amass_clips
 import numpy as np
 import release_trees
 from bvh_clips import write_source
+from rig_characters import character
 
 from fuzzing.mutations import Mutator, damaged_json, damaged_text
-from fuzzing.sealed import damaged_npy, damaged_pickle, damaged_zip
+from fuzzing.sealed import damaged_glb, damaged_npy, damaged_pickle, damaged_zip
 from fuzzing.sounds import damaged_wav
 from fuzzing.table import Read, Seed, of_tree, reader
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.convert.registry import converter_named, names, prepare
 from motionloom.datasets.motion.canonical import canonicalize
 from motionloom.datasets.shards.sample import DropClip
+from motionloom.pipeline.rigs.gltf import Gltf
 
 release_trees.SECONDS = 1.2  # small files are read often
 
@@ -37,6 +39,7 @@ _DAMAGES: dict[str, Mutator] = {
     ".asf": damaged_text,
     ".amc": damaged_text,
     ".wav": damaged_wav,
+    ".glb": damaged_glb,
 }
 
 
@@ -198,6 +201,20 @@ def acclaim(frames: int = 24) -> tuple[str, str]:
     return "\n".join(lines) + "\n", "\n".join(out) + "\n"
 
 
+def glb(root: Path) -> Path:
+    """A character of which one animation turns the hips, and moves them."""
+    root.mkdir()
+    nodes = character(root / "turn.glb", "unreal")
+    rig, angles = Gltf.read(root / "turn.glb"), np.linspace(0, 1, 31)
+    turns = np.stack([0 * angles, np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
+    moved = np.stack([angles, 1 + 0 * angles, 0 * angles], axis=1)
+    rig.animate(
+        "turns about", 20.0, {(nodes["pelvis"], "rotation"): turns, (nodes["pelvis"], "translation"): moved}
+    )
+    rig.write(root / "turn.glb")
+    return root
+
+
 TREES: dict[str, tuple[Callable[[Path], Path], dict[str, object]]] = {
     "aistpp": (aistpp, {"sound": "none"}),
     "amass": (amass, {"captions": ("captions.csv",), "uncaptioned": "keep"}),
@@ -208,6 +225,7 @@ TREES: dict[str, tuple[Callable[[Path], Path], dict[str, object]]] = {
         {"captions": ("captions.json",), "splits": "lists", "uncaptioned": "keep", "licence": "CC0-1.0"},
     ),
     "finedance": (release_trees.finedance, {"caption_genre": True}),
+    "glb": (glb, {"licence": "CC0-1.0"}),
     "humanml3d": (humanml3d, {}),
     "motion272": (release_trees.motion272, {}),
     "motionhub": (release_trees.motionhub, {}),
@@ -241,7 +259,7 @@ def source_of(name: str, folder: Path) -> tuple[list[Seed], Read]:
         for gone in conversion.plan.left_out():
             if _RAISED.match(gone.reason):
                 raise AssertionError(f"not a sentence: {gone.reason}")
-        is_motion = file.endswith((".npy", ".npz", ".pkl", ".bvh", ".amc", ".asf", ".wav"))
+        is_motion = file.endswith((".npy", ".npz", ".pkl", ".bvh", ".amc", ".asf", ".wav", ".glb"))
         stem = file.rsplit("/", 1)[-1].split(".")[0]
         wanted = [clip for _, clip in conversion.plan.items if is_motion and stem in clip.label()]
         for clip in wanted[:1]:

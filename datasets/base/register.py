@@ -53,9 +53,9 @@ class Table(Mapping[str, T]):
         return name in self._things or name in self._places
 
     def __iter__(self) -> Iterator[str]:
-        """Declared names first, then the others as they came."""
+        """What was registered without being declared first, a stranger's or the core's; then what is declared."""
         self._import_others()
-        return iter({**self._places, **self._things})
+        return iter({**{name: 0 for name in self._things if name not in self._places}, **self._places})
 
     def __len__(self) -> int:
         return sum(1 for _ in self)

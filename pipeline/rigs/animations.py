@@ -25,13 +25,17 @@ Floats = NDArray[np.float64]
 SUFFIX = ".animation"
 ENDINGS = (".glb", ".vrm", ".vrma")
 _RATES = (10.0, 120.0)
-_MOST_SECONDS, _MOST_POSES = 3600.0, 10_000_000
-"""Length of a clip, and its frames times the file's nodes: ten minutes of 150 nodes at 120 a second."""
+_MOST_SECONDS, _MOST_POSES, _POSES_A_KEY = 3600.0, 300_000, 100
+"""Length of a clip, and its frames times the file's nodes: 100 seconds of 150 nodes at 20 a second, and more
+the more keys it has, so that two keys hours apart take no memory."""
 
 
 def clips_in(path: Path) -> dict[str, str]:
     """Names of the clips of a file -> their captions, the animations' names."""
-    animations = Gltf.read(path).json.get("animations") or []
+    try:
+        animations = _animations(Gltf.read(path))
+    except UserError:  # the conversion counts it, and says why
+        return {f"{path.name}/00-{SUFFIX}": ""}
     out = {}
     for number, animation in enumerate(animations):
         name = str(animation.get("name") or "")[:200]
@@ -41,11 +45,19 @@ def clips_in(path: Path) -> dict[str, str]:
     return out
 
 
+def _animations(gltf: Gltf) -> list[dict[str, Any]]:
+    """The animations of a file; `UserError` where they are none."""
+    found = gltf.json.get("animations") or []
+    if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+        raise UserError(f"{gltf.where}: its animations cannot be read")
+    return found
+
+
 def read_animation(path: Path, label: str) -> bytes:
     """A clip's BVH text, on our joints, in centimetres."""
     rig = Rig.read(path.parent)
     number = int(re.match(r"\d+", path.name)[0]) if re.match(r"\d+", path.name) else -1  # type: ignore[index]
-    animations = rig.gltf.json.get("animations") or []
+    animations = _animations(rig.gltf)
     if not 0 <= number < len(animations):
         raise UserError(f"{label}: {path.parent.name} has {len(animations)} animations")
     turns, places, fps = _played(rig, animations[number], label)
@@ -95,7 +107,8 @@ def _played(rig: Rig, animation: dict[str, Any], label: str) -> tuple[Floats, Fl
     fps = float(np.clip(round(1 / float(np.median(np.diff(longest)).clip(1e-4))), *_RATES))
     seconds = min(float(max(times.max() for times, _, _ in read.values())), _MOST_SECONDS)
     at = np.arange(int(seconds * fps + 1e-6) + 1) / fps
-    if len(at) * len(gltf.parents) > _MOST_POSES:
+    most = _MOST_POSES + _POSES_A_KEY * sum(len(times) for times, _, _ in read.values())
+    if len(at) * len(gltf.parents) > most:
         raise UserError(f"{label}: {len(at)} frames of {len(gltf.parents)} nodes are too many; cut it")
     turned = np.empty((len(gltf.parents), len(at), 3, 3))
     worlds = np.empty((len(gltf.parents), len(at), 4, 4))

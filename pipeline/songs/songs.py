@@ -21,6 +21,7 @@ from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file
 from motionloom.datasets.base.pool import Workers
+from motionloom.datasets.motion.npz import NpzFile
 from motionloom.datasets.synth.music.song import draw_song
 from motionloom.pipeline.contract.stage import (
     CompletedStage,
@@ -104,11 +105,11 @@ class AnnotatedSong:
     @classmethod
     def load(cls, path: Path) -> AnnotatedSong:
         """Read what `save` wrote; `UserError` for a file that is missing or damaged."""
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                return cls(file["stems"], file["beats"], file["downbeats"])
-        except (OSError, ValueError, KeyError) as error:
-            raise UserError(f"{path}: no song ({error}); run the stage that made it again") from None
+        with NpzFile(path) as file:
+            stems, beats, downbeats = file.array("stems"), file.numbers("beats"), file.array("downbeats")
+        if stems.ndim != 3 or stems.dtype != np.float16 or beats.shape != downbeats.shape or beats.ndim != 1:
+            raise UserError(f"{path}: not a song; run the stage that made it again")
+        return cls(stems, beats, downbeats.astype(bool))
 
 
 @dataclass(frozen=True)

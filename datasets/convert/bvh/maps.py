@@ -169,8 +169,8 @@ def _settle(
             near = [f"{size:.2f} m in {one}" for one, size in sizes.items() if CHILD_METRES < size < 3]
             plan.notes.append(
                 f"unit by body size, from {name}: no known unit fits, so {unit:.4g} m is guessed; "
-                f"{tall}, but {' or '.join(near) or 'of no size in any unit'}: is it a child? --set unit=NAME "
-                f"states it"
+                f"{tall}, but {' or '.join(near) or 'of no size in any unit'}: is it a child? "
+                f"--set unit=NAME states it"
             )
     if up != "y" and stated.up is None:
         plan.notes.append(f"upward axis by where heads are, from {name}: {up}")

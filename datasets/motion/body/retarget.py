@@ -303,7 +303,7 @@ def _swing(bone: Floats, aim: Floats) -> Floats:
     """The smallest rotation that turns a bone where it aims; none for those without length."""
     if not (bone.any() and aim.any()):
         return np.eye(3)
-    return swing(_unit(bone), _unit(aim))
+    return swing(_unit(bone)[:, None], _unit(aim)[:, None])[..., 0]
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -36,7 +36,7 @@ from motionloom.pipeline.store.weights import exact_tensors, load_weights
 
 ROOT = Path(__file__).parents[3]
 FLOATS = ("float32", "float16", "bfloat16", "float64")
-FOLDERS = ("datasets/convert", "datasets/shards", "pipeline/serve", "pipeline/inference")
+FOLDERS = ("datasets/convert", "datasets/shards", "pipeline/serve", "pipeline/editing")
 LETTERS = st.text(st.characters(exclude_categories=()), max_size=6)
 LEAVES = st.none() | st.booleans() | st.integers() | st.floats() | LETTERS
 VALUES = st.recursive(LEAVES, lambda inner: st.lists(inner) | st.dictionaries(LETTERS, inner), max_leaves=8)
