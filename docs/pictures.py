@@ -29,12 +29,12 @@ from motionloom.pipeline.contract.lookup import finished_stages
 from motionloom.pipeline.contract.stage import StageCache
 from motionloom.pipeline.evaluation.dances import DanceClip, dances_of
 from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.files.outputs import clip_of
+from motionloom.pipeline.inference.files.writers import cell_of
 from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import clip_of
 from motionloom.pipeline.inference.request import Request
-from motionloom.pipeline.inference.writers import cell_of
 from motionloom.pipeline.render.viewer import ViewerMotion, write_viewer
 
 if TYPE_CHECKING:

@@ -256,7 +256,12 @@ def configs(base: type[Config]) -> Iterator[type[Config]]:
 
 
 assert converters() and stage_kinds()
-for module in ("serve.requests", "editing.task", "inference.display_figure", "runs.cluster.launch_plan"):
+for module in (
+    "serve.requests",
+    "editing.task",
+    "inference.files.display_figure",
+    "runs.cluster.launch_plan",
+):
     import_module(f"motionloom.pipeline.{module}")
 SETTINGS = {"face", "seed_motion", "seed", "kind", "extends", "start"}.union(
     *(kind.model_fields for kind in configs(Config))

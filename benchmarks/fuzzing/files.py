@@ -36,8 +36,8 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.evaluation.reconstruction import expression_directions
 from motionloom.pipeline.inference.clip_file import read_clip
+from motionloom.pipeline.inference.files.outputs import save
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import save
 from motionloom.pipeline.render.body.face import ARKIT, ArkitBases
 from motionloom.pipeline.rigs.rig import Rig
 from motionloom.pipeline.songs.songs import AnnotatedSong

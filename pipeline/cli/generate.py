@@ -12,7 +12,7 @@ from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.cli.options import At, Device, ModelFolder, Settings, settings_of
-from motionloom.pipeline.inference.writers import default_formats, figure_keys, figure_options, formats_help
+from motionloom.pipeline.inference.files.writers import default_formats, figure_keys, figure_options, formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
 
@@ -69,7 +69,7 @@ def generate(
     from motionloom.datasets.audio.sound import Excerpt
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.inference.model import MotionModel
-    from motionloom.pipeline.inference.outputs import page_note, page_title
+    from motionloom.pipeline.inference.files.outputs import page_note, page_title
     from motionloom.pipeline.inference.request import Request, require_words
     from motionloom.pipeline.inference.script import read_music
     from motionloom.pipeline.runs.snapshot import run_at
@@ -141,7 +141,7 @@ def _each(values: Sequence[Any], samples: int) -> list[Any] | None:
 
 def formats_of(formats: str | None) -> list[str]:
     """The formats of `--format`, in its words; the default ones without."""
-    from motionloom.pipeline.inference.outputs import require_formats
+    from motionloom.pipeline.inference.files.outputs import require_formats
 
     if formats is None:
         return default_formats()
@@ -159,7 +159,7 @@ def write_files(
     out: Path, motions: Sequence[GeneratedMotion], formats: Sequence[str], **options: Any
 ) -> None:
     """Write motions as `write_motions` does and list the files."""
-    from motionloom.pipeline.inference.outputs import write_motions
+    from motionloom.pipeline.inference.files.outputs import write_motions
 
     console, aside = make_console(), make_console(aside=True)
     paths = write_motions(out, motions, formats, **options)

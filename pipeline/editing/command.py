@@ -12,7 +12,7 @@ from motionloom.datasets.base.register import register
 from motionloom.pipeline.cli.generate import formats_of, print_note, write_files
 from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
 from motionloom.pipeline.contract.command import Command
-from motionloom.pipeline.inference.writers import figure_keys, figure_options, formats_help
+from motionloom.pipeline.inference.files.writers import figure_keys, figure_options, formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
 
@@ -48,7 +48,7 @@ def edit(
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.editing.task import EditTask
     from motionloom.pipeline.inference.model import MotionModel
-    from motionloom.pipeline.inference.outputs import page_note
+    from motionloom.pipeline.inference.files.outputs import page_note
     from motionloom.pipeline.store.yaml import read_yaml
 
     sampling, figure, fields = settings_of(

@@ -28,7 +28,7 @@ from motionloom.pipeline.editing.task import EditReport, EditTask
 from motionloom.pipeline.editing.timed import require_work
 from motionloom.pipeline.inference.bundle import Bundle
 from motionloom.pipeline.inference.clip_file import RecordedClip, features_for, read_clip, require_clip
-from motionloom.pipeline.inference.display_figure import shown
+from motionloom.pipeline.inference.files.display_figure import shown
 from motionloom.pipeline.inference.generation import encode
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from motionloom.pipeline.inference.motion_data import MotionData
+from motionloom.pipeline.inference.files.motion_data import MotionData
 
 
 @dataclass(frozen=True, repr=False)
@@ -14,7 +14,7 @@ class GeneratedMotion(MotionData):
 
     def save(self, path: Path | str) -> Path:
         """Write one file, of the format that its ending names (`writers.WRITERS`); returns its path."""
-        from motionloom.pipeline.inference.outputs import save
+        from motionloom.pipeline.inference.files.outputs import save
 
         path = Path(path)
         save(path, self)
@@ -22,6 +22,6 @@ class GeneratedMotion(MotionData):
 
     def _repr_html_(self) -> str:
         """The viewer, in a frame of its own that can reach neither the notebook nor the network."""
-        from motionloom.pipeline.inference.outputs import frame_of
+        from motionloom.pipeline.inference.files.outputs import frame_of
 
         return frame_of(self)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from motionloom.pipeline.inference.writers import OutputClip
+from motionloom.pipeline.inference.files.writers import OutputClip
 from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS, expression_weights
 from motionloom.pipeline.rigs.gltf import Gltf
 from motionloom.pipeline.rigs.names import shape_word

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from motionloom.datasets.base.register import register
-from motionloom.pipeline.inference.writers import Outputs, Writer
+from motionloom.pipeline.inference.files.writers import Outputs, Writer
 
 
 def _write_vrma(path: Path, outputs: Outputs) -> None:

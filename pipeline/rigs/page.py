@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from motionloom.datasets.base.files import write_text
-from motionloom.pipeline.inference.writers import Outputs
+from motionloom.pipeline.inference.files.writers import Outputs
 from motionloom.pipeline.render.viewer import fill, safe_json
 from motionloom.pipeline.rigs.rig_file import put_on, rig_of
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.pipeline.inference.writers import OutputClip, Outputs
+from motionloom.pipeline.inference.files.writers import OutputClip, Outputs
 from motionloom.pipeline.rigs.faces import face_tracks, face_values
 from motionloom.pipeline.rigs.rig import Rig
 

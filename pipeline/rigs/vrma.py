@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from motionloom.datasets.motion.body.retarget import on_bones
 from motionloom.datasets.motion.layout import BODY_JOINTS
 from motionloom.datasets.motion.skeleton import Skeleton
-from motionloom.pipeline.inference.writers import Outputs
+from motionloom.pipeline.inference.files.writers import Outputs
 from motionloom.pipeline.render.body.face import ARKIT
 from motionloom.pipeline.render.body.mesh import body_for
 from motionloom.pipeline.rigs.faces import face_values

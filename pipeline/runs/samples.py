@@ -22,8 +22,8 @@ from motionloom.pipeline.evaluation.dances import dance_to, dances_for
 from motionloom.pipeline.evaluation.estimate import row_estimates
 from motionloom.pipeline.evaluation.truth import perform, spread_truths
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.outputs import page_note, write_motions
-from motionloom.pipeline.inference.writers import default_formats
+from motionloom.pipeline.inference.files.outputs import page_note, write_motions
+from motionloom.pipeline.inference.files.writers import default_formats
 from motionloom.pipeline.runs.snapshot import NEWEST, run_at
 from motionloom.pipeline.store.artifact import Artifact
 from motionloom.pipeline.store.files import open_own

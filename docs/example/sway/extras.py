@@ -11,7 +11,7 @@ from motionloom.datasets.modalities.modality import FrameModality
 from motionloom.pipeline.contract.units import Row
 from motionloom.pipeline.evaluation.clip_metrics import ClipMetric, Performance
 from motionloom.pipeline.evaluation.figures import Metric
-from motionloom.pipeline.inference.writers import Outputs, Writer
+from motionloom.pipeline.inference.files.writers import Outputs, Writer
 
 
 def reach(performance: Performance) -> Row:

@@ -19,11 +19,11 @@ from motionloom.pipeline.contract.stage import (
 )
 from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_for, with_music
 from motionloom.pipeline.evaluation.truth import perform, spread_truths
-from motionloom.pipeline.inference.display_figure import FigureOptions
+from motionloom.pipeline.inference.files.display_figure import FigureOptions
 from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.request import Request
-from motionloom.pipeline.inference.writers import WRITERS, Format, default_formats
+from motionloom.pipeline.inference.files.writers import WRITERS, Format, default_formats
 from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
 from motionloom.pipeline.store.artifact import Terms
@@ -62,7 +62,7 @@ class GenerateStage(StageKind):
         return [*super().modules(config), *(WRITERS[name].write.__module__ for name in config.formats)]
 
     def run(self, context: StageContext) -> None:
-        from motionloom.pipeline.inference.outputs import page_note, write_motions
+        from motionloom.pipeline.inference.files.outputs import page_note, write_motions
 
         config: GenerateConfig = context.config
         (said, notes), danced = _performed(context), _danced(context)

@@ -32,7 +32,7 @@ from motionloom.pipeline.contract.stage import (
 from motionloom.pipeline.evaluation.dances import dance_to, dances_of, seed_frames, with_music
 from motionloom.pipeline.evaluation.truth import Truth, perform, reconstruct_all, spread_truths, truth_at
 from motionloom.pipeline.inference.bundle import Bundle
-from motionloom.pipeline.inference.display_figure import shown
+from motionloom.pipeline.inference.files.display_figure import shown
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.render.body.face import synthetic_face_controls
 from motionloom.pipeline.render.page import Page

@@ -30,10 +30,10 @@ from motionloom.datasets.motion.features.joints import joints_of, rotations_of
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.generation import Prompt
 from motionloom.pipeline.inference.checks import STANDS, standing
-from motionloom.pipeline.inference.display_figure import FAR_MM, FigureOptions, shown
+from motionloom.pipeline.inference.files.display_figure import FAR_MM, FigureOptions, shown
+from motionloom.pipeline.inference.files.outputs import write_motions
+from motionloom.pipeline.inference.files.writers import WRITERS, default_formats
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import write_motions
-from motionloom.pipeline.inference.writers import WRITERS, default_formats
 from motionloom.pipeline.serve.requests import MotionRequest
 from motionloom.pipeline.stages.results.generate import GenerateConfig
 

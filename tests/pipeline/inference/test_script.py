@@ -21,7 +21,7 @@ import soundfile
 from motionloom.datasets.audio.sound import Sound
 from motionloom.datasets.base.errors import UserError
 from motionloom.pipeline.contract.generation import Prompt
-from motionloom.pipeline.inference.display_figure import shown
+from motionloom.pipeline.inference.files.display_figure import shown
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.script import DrivenSegment, Script, sound_of
 from motionloom.pipeline.store.yaml import read_yaml
@@ -329,7 +329,7 @@ LONG = """
 import resource, sys
 from pathlib import Path
 from motionloom.datasets.audio.sound import Sound
-from motionloom.pipeline.inference.outputs import write_motions
+from motionloom.pipeline.inference.files.outputs import write_motions
 from motionloom.pipeline.inference.model import MotionModel
 
 model, folder = MotionModel.from_pretrained(sys.argv[1], device="cpu"), Path(sys.argv[2])

@@ -24,8 +24,8 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.files.outputs import score_of
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import score_of
 from motionloom.pipeline.render.charts import Line, histogram, line_chart
 from motionloom.pipeline.render.page import Page
 from motionloom.pipeline.render.sound import RATE, Score, Segment, embed_sounds, playable, score_data

@@ -22,9 +22,9 @@ from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.datasets.motion.kinematics import forward_kinematics
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.contract.generation import Prompt
+from motionloom.pipeline.inference.files.outputs import write_motions
+from motionloom.pipeline.inference.files.writers import figure_options
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.outputs import write_motions
-from motionloom.pipeline.inference.writers import figure_options
 from motionloom.pipeline.rigs.animations import SUFFIX, read_animation
 from motionloom.pipeline.rigs.gltf import Gltf
 from motionloom.pipeline.rigs.names import HUMANOID

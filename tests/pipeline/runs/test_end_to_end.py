@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save_file
 
 from motionloom.datasets.motion.bvh.motion import read_bvh
 from motionloom.pipeline.evaluation.figures import MODEL, RECORDED, FigureFile
-from motionloom.pipeline.inference.display_figure import shown
+from motionloom.pipeline.inference.files.display_figure import shown
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.store.artifact import Artifact
 

@@ -108,7 +108,9 @@ def test_saving_asks_for_the_same_motion(visit: Any, until: Any, quick: Any) -> 
 
 
 def test_music_is_chosen_and_heard(visit: Any, until: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("motionloom.pipeline.inference.outputs.beats", lambda samples, rate: np.array([0.5]))
+    monkeypatch.setattr(
+        "motionloom.pipeline.inference.files.outputs.beats", lambda samples, rate: np.array([0.5])
+    )
     page, music = visit(), {"name": "tone.wav", "mimeType": "audio/wav", "buffer": tone(2.5)}
     page.locator("#sound").set_input_files(music)
     until(page, "document.getElementById('status').textContent === 'tone.wav: 2.5 s of music'")

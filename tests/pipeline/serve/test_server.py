@@ -226,7 +226,9 @@ def test_names_that_are_allowed(run_server: Callable[..., Any], quick: Any) -> N
 
 
 def test_music_is_sent_and_driven_by(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("motionloom.pipeline.inference.outputs.beats", lambda samples, rate: np.array([0.5]))
+    monkeypatch.setattr(
+        "motionloom.pipeline.inference.files.outputs.beats", lambda samples, rate: np.array([0.5])
+    )
     name = served.ask("POST", "/api/sounds", tone(3.0)).json
     assert name["seconds"] == 3.0
     assert served.ask("POST", "/api/sounds", tone(3.0)).json == name

@@ -11,9 +11,9 @@ from motionloom.datasets.audio.features import beats
 from motionloom.datasets.base.errors import UserError, nearest
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.register import discover
-from motionloom.pipeline.inference.display_figure import FigureOptions, shown
-from motionloom.pipeline.inference.motion_data import MotionData
-from motionloom.pipeline.inference.writers import WRITERS, OutputClip, Outputs, cell_of, writer_for
+from motionloom.pipeline.inference.files.display_figure import FigureOptions, shown
+from motionloom.pipeline.inference.files.motion_data import MotionData
+from motionloom.pipeline.inference.files.writers import WRITERS, OutputClip, Outputs, cell_of, writer_for
 from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.render.viewer import viewer_page
 from motionloom.pipeline.store.artifact import Terms

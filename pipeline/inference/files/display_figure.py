@@ -18,7 +18,7 @@ from motionloom.datasets.base.config import Config
 from motionloom.datasets.motion.body.feet import FeetReport, foot_contacts, plant_feet
 from motionloom.datasets.motion.body.rigid import RigidMotion, fit_rigid
 from motionloom.datasets.motion.features.joints import rotations_of
-from motionloom.pipeline.inference.motion_data import MotionData
+from motionloom.pipeline.inference.files.motion_data import MotionData
 
 FAR_MM = 20.0
 """A figure that is further from the generated joints, on average, is worth a word."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from motionloom.pipeline.inference.display_figure import FigureOptions, ShownMotion
+    from motionloom.pipeline.inference.files.display_figure import FigureOptions, ShownMotion
     from motionloom.pipeline.render.body.glb import GlbClip
     from motionloom.pipeline.render.sound import Score
     from motionloom.pipeline.render.viewer import ViewerMotion
@@ -255,7 +255,7 @@ _MADE_BY = {"body_model": "smplx", "arkit_bases": "arkit"}
 
 def figure_keys() -> list[str]:
     """Keys of `FigureOptions`, and options of formats."""
-    from motionloom.pipeline.inference.display_figure import FigureOptions
+    from motionloom.pipeline.inference.files.display_figure import FigureOptions
 
     own = [key for key in FigureOptions.model_fields if key != "more"]
     return [*own, *(option for writer in WRITERS.values() for option in writer.options)]
@@ -263,7 +263,7 @@ def figure_keys() -> list[str]:
 
 def figure_options(values: Mapping[str, object], formats: Sequence[str]) -> FigureOptions:
     """The options of `figure_keys`; `UserError` where one is of a format that is not among `formats`."""
-    from motionloom.pipeline.inference.display_figure import FigureOptions
+    from motionloom.pipeline.inference.files.display_figure import FigureOptions
 
     discover()
     by_option = {option: name for name, writer in WRITERS.items() for option in writer.options}
