@@ -6,8 +6,10 @@ Two processes run them in turn, from the lightest on, and say after each which l
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -75,6 +77,23 @@ def test_a_check_looks_for_repeated_recordings_with_scipy_alone(imported: dict[s
 @pytest.mark.parametrize("command", ["info", "nothing to do", "dry run"])
 def test_with_torch_alone(command: str, imported: dict[str, set[str]]) -> None:
     assert imported[command] == {"torch"}
+
+
+def test_a_model_opens_with_few_modules_of_ours() -> None:
+    path = Path(__file__).resolve().parents[3] / "benchmarks" / "first_steps.py"
+    assert int(runpy.run_path(str(path))["modules_to_open"]()) <= 120
+
+
+@pytest.mark.parametrize("words", [["run", "nosuch"], ["run", "humantomato-tiny", "--set", "nosuch.x=1"]])
+def test_a_mistake_in_the_call_is_found_without_torch(words: list[str]) -> None:
+    program = PROGRAM.replace("code == 0", "code == 2")
+    said = subprocess.run(
+        [sys.executable, "-P", "-c", program, json.dumps([HEAVY, [words]])],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    assert json.loads(said.stdout) == []
 
 
 def test_a_motion_needs_none_of_what_trains_or_loads_other_encoders(imported: dict[str, set[str]]) -> None:
