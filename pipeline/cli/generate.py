@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
-from rich.console import Console
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.pipeline.cli.motions import formats_of, print_note, write_files
 from motionloom.pipeline.cli.options import At, Device, ModelFolder, Settings, settings_of
-from motionloom.pipeline.inference.files.writers import default_formats, figure_keys, figure_options, formats_help
+from motionloom.pipeline.inference.files.writers import figure_keys, figure_options, formats_help
 from motionloom.pipeline.launch.console import make_console, say
 from motionloom.pipeline.store.files import require_folder
-
-if TYPE_CHECKING:
-    from motionloom.pipeline.inference.motion import GeneratedMotion
 
 _SCRIPTS = (".yaml", ".yml")
 
@@ -68,8 +65,8 @@ def generate(
     from motionloom.datasets.audio.given_beats import in_words
     from motionloom.datasets.audio.sound import Excerpt
     from motionloom.pipeline.contract.sampling import SamplingConfig
-    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.files.outputs import page_note, page_title
+    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.request import Request, require_words
     from motionloom.pipeline.inference.script import read_music
     from motionloom.pipeline.runs.snapshot import run_at
@@ -137,33 +134,3 @@ def generate(
 def _each(values: Sequence[Any], samples: int) -> list[Any] | None:
     """Every value so many times; None without any."""
     return [value for value in values for _ in range(samples)] or None
-
-
-def formats_of(formats: str | None) -> list[str]:
-    """The formats of `--format`, in its words; the default ones without."""
-    from motionloom.pipeline.inference.files.outputs import require_formats
-
-    if formats is None:
-        return default_formats()
-    wanted = [name.strip() for name in formats.split(",") if name.strip()]
-    require_formats(wanted)
-    return wanted
-
-
-def print_note(console: Console, note: object) -> None:
-    """Print what a person should know of a motion, in yellow."""
-    say(console, f"note: {note}", "yellow")
-
-
-def write_files(
-    out: Path, motions: Sequence[GeneratedMotion], formats: Sequence[str], **options: Any
-) -> None:
-    """Write motions as `write_motions` does and list the files."""
-    from motionloom.pipeline.inference.files.outputs import write_motions
-
-    console, aside = make_console(), make_console(aside=True)
-    paths = write_motions(out, motions, formats, **options)
-    for path in paths:
-        say(console, str(path))
-    if "html" in formats:
-        say(aside, f"watch it in a browser: {(out / 'index.html').resolve()}")

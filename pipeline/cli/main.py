@@ -27,6 +27,7 @@ from motionloom.pipeline.cli.data import data_app
 from motionloom.pipeline.cli.evaluate import evaluate
 from motionloom.pipeline.cli.generate import generate
 from motionloom.pipeline.cli.options import (
+    PROGRAM,
     AsJson,
     At,
     Commands,
@@ -43,7 +44,7 @@ from motionloom.pipeline.launch.console import SafeConsole, make_console, quiet_
 from motionloom.pipeline.launch.process import Interrupted, JointError, TeamError, leave, process_rank
 
 app = Commands(
-    name="motionloom",
+    name=PROGRAM,
     help="Text or music to whole-body motion: data, training and generation (HumanTOMATO, UDE).",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -333,7 +334,7 @@ def _exit_code() -> int:
     errors = SafeConsole(stderr=True, highlight=False, soft_wrap=True)
     try:
         discover()  # formats, sources and metrics of other packages are in the help, too
-        code = app(prog_name="motionloom", standalone_mode=False) or 0
+        code = app(prog_name=PROGRAM, standalone_mode=False) or 0
         sys.stdout.flush()  # here a full disk can still be answered
     except JointError as error:
         if process_rank() == 0:

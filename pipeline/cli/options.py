@@ -15,6 +15,7 @@ from typer.main import get_command
 
 from motionloom.datasets.base.config import require_local
 from motionloom.datasets.base.errors import UserError, nearest
+from motionloom.datasets.base.register import discover
 from motionloom.pipeline.contract.command import COMMANDS
 
 ModelFolder = Annotated[
@@ -46,24 +47,28 @@ Workers = Annotated[int, typer.Option(help="Processes; the shards are the same b
 F = TypeVar("F", bound=Callable[..., object])
 
 
+PROGRAM = "motionloom"
+
+
 class Group(TyperGroup):
     """The commands of a `Commands`, and those of `COMMANDS` that belong to its group, each built when it is
     asked for."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*self.commands, *self._added(ctx)]
+        return [*self.commands, *self._added()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        added = self._added(ctx)
+        added = self._added()
         if cmd_name not in added:
             return super().get_command(ctx, cmd_name)
         app = Commands(add_completion=False, rich_markup_mode="markdown")
         app.command(cmd_name)(COMMANDS[added[cmd_name]].function)
         return get_command(app)
 
-    def _added(self, ctx: Any) -> dict[str, str]:
-        """Names in `COMMANDS` by the word that is typed in this group; nothing is imported for it."""
-        group = ctx.command_path.split()[1:]
+    def _added(self) -> dict[str, str]:
+        """Names in `COMMANDS` by the word that is typed in this group; none of them is imported for it."""
+        discover()
+        group = [] if self.name == PROGRAM else [self.name]
         words = {name: name.split() for name in COMMANDS}
         added = {word: name for name, (*before, word) in words.items() if before == group}
         for word in added.keys() & self.commands.keys():

@@ -9,7 +9,7 @@ import typer
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.register import register
-from motionloom.pipeline.cli.generate import formats_of, print_note, write_files
+from motionloom.pipeline.cli.motions import formats_of, print_note, write_files
 from motionloom.pipeline.cli.options import Device, ModelFolder, Settings, settings_of
 from motionloom.pipeline.contract.command import Command
 from motionloom.pipeline.inference.files.writers import figure_keys, figure_options, formats_help
