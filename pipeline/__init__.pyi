@@ -3,10 +3,10 @@ from .contract.sampling import SamplingConfig as SamplingConfig
 from .contract.stage import StageKind as StageKind
 from .evaluation.clip_metrics import ClipMetric as ClipMetric
 from .inference.captioning import captions as captions
-from .inference.model import MotionModel as MotionModel
-from .inference.motion import GeneratedMotion as GeneratedMotion
 from .inference.files.outputs import write_motions as write_motions
 from .inference.files.writers import Writer as Writer
+from .inference.model import MotionModel as MotionModel
+from .inference.motion import GeneratedMotion as GeneratedMotion
 from .results.paper.compare import compare_with_paper as compare_with_paper
 from .runs.api import evaluate_run as evaluate_run
 from .runs.api import export_run as export_run

@@ -255,7 +255,7 @@ def configs(base: type[Config]) -> Iterator[type[Config]]:
         yield from (kind, *configs(kind))
 
 
-assert converters() and stage_kinds()
+assert converters() and list(stage_kinds().values())
 for module in (
     "serve.requests",
     "editing.task",

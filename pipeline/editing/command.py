@@ -47,8 +47,8 @@ def edit(
     """
     from motionloom.pipeline.contract.sampling import SamplingConfig
     from motionloom.pipeline.editing.task import EditTask
-    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.inference.files.outputs import page_note
+    from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.store.yaml import read_yaml
 
     sampling, figure, fields = settings_of(

@@ -18,9 +18,9 @@ from motionloom.pipeline.editing.edit import ABILITY, EditedMotion, original_of
 from motionloom.pipeline.editing.frames import edit_frames
 from motionloom.pipeline.editing.task import MAX_SPEED, EditTask
 from motionloom.pipeline.inference.clip_file import read_clip
-from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.files.outputs import clip_of
 from motionloom.pipeline.inference.files.writers import cell_of
+from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.render.viewer import viewer_data
 from motionloom.pipeline.serve.part import Host, OpenPart, ServedPart
 from motionloom.pipeline.serve.requests import (

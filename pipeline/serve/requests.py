@@ -19,11 +19,11 @@ from motionloom.datasets.audio.sound import Sound, read_sound, sound_seconds
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import temporary_folder
+from motionloom.pipeline.inference.files.outputs import clip_of, file_stem, save
+from motionloom.pipeline.inference.files.writers import WRITERS, cell_of
 from motionloom.pipeline.inference.model import MotionModel
 from motionloom.pipeline.inference.motion import GeneratedMotion
-from motionloom.pipeline.inference.files.outputs import clip_of, file_stem, save
 from motionloom.pipeline.inference.request import Request
-from motionloom.pipeline.inference.files.writers import WRITERS, cell_of
 from motionloom.pipeline.render.viewer import viewer_data
 from motionloom.pipeline.store.known_captions import Unknown
 

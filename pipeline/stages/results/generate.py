@@ -20,10 +20,10 @@ from motionloom.pipeline.contract.stage import (
 from motionloom.pipeline.evaluation.dances import DanceClip, dance_to, dances_for, with_music
 from motionloom.pipeline.evaluation.truth import perform, spread_truths
 from motionloom.pipeline.inference.files.display_figure import FigureOptions
+from motionloom.pipeline.inference.files.writers import WRITERS, Format, default_formats
 from motionloom.pipeline.inference.generation import generate
 from motionloom.pipeline.inference.motion import GeneratedMotion
 from motionloom.pipeline.inference.request import Request
-from motionloom.pipeline.inference.files.writers import WRITERS, Format, default_formats
 from motionloom.pipeline.render.sound import Score
 from motionloom.pipeline.stages.results.evaluation import bundle_driven_by
 from motionloom.pipeline.store.artifact import Terms

@@ -10,8 +10,9 @@ import torch
 from second_device import second_device
 
 from motionloom.datasets.base.errors import UserError
-from motionloom.pipeline.contract.sampling import SamplingConfig
-from motionloom.pipeline.inference.model import MotionModel
+from motionloom.pipeline.inference.bundle import Bundle
+from motionloom.pipeline.inference.generation import generate
+from motionloom.pipeline.inference.request import Request
 from motionloom.pipeline.launch.hardware import Hardware, choose_device
 
 CAPTIONS = ["a person waves with the left hand", "a person walks"]
@@ -33,18 +34,16 @@ def test_the_second_device_is_strict() -> None:
 @pytest.mark.parametrize("face", ["gpt", "vae", "diffusion ddpm", "diffusion ddim", "diffusion dpm++"])
 def test_motions_are_made_where_the_networks_lie(face: str, small_run: Any) -> None:
     kind, _, sampler = face.partition(" ")
-    asked = {"face_model": kind, "cfg_scale": 1.5, "denoising_steps": 3, "sampler": sampler or "ddpm"}
-    sampling = SamplingConfig.parse(asked, "sampling")
-    near = MotionModel(small_run.folder)
+    fields = {"face_model": kind, "cfg_scale": 1.5, "denoising_steps": 3, "sampler": sampler or "ddpm"}
+    asked = Request.of(CAPTIONS, seconds=2.0, seed=3, sampling=fields)
+    near = Bundle.open(small_run.folder)
     with second_device() as device:
-        far = MotionModel(small_run.folder, device)
-        given = far.bundle.stage_cache.given(far.bundle.main.inputs)
-        assert far.bundle.device == given["tma"].device == device
-        made = far.generate(CAPTIONS, seconds=2.0, seed=3, sampling=sampling)
+        far = Bundle.open(small_run.folder, device)
+        given = far.stage_cache.given(far.main.inputs)
+        assert far.device == given["tma"].device == device
+        made = generate(far, asked)
     assert {str(weight.device) for weight in given["text"].encoder._weights.values()} == {str(device)}
-    for ours, theirs in zip(
-        made, near.generate(CAPTIONS, seconds=2.0, seed=3, sampling=sampling), strict=True
-    ):
+    for ours, theirs in zip(made, generate(near, asked), strict=True):
         np.testing.assert_allclose(ours.features, theirs.features, atol=1e-4)
         np.testing.assert_allclose(ours.face, theirs.face, atol=1e-4)
 

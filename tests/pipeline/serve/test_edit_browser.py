@@ -124,6 +124,7 @@ def test_a_file_is_chosen(visit: Any, until: Any, walk: Callable[..., Any]) -> N
     from tests.pipeline.serve.test_editing import npz
 
     page = visit()
+    until(page, "!document.getElementById('start-file').hidden")
     page.locator("#clip").set_input_files(
         {"name": "mine.npz", "mimeType": "application/zip", "buffer": npz(walk(40))}
     )
