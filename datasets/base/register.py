@@ -53,7 +53,7 @@ class Table(Mapping[str, T]):
         return name in self._things or name in self._places
 
     def __iter__(self) -> Iterator[str]:
-        """What was registered without being declared first, a stranger's or the core's; then what is declared."""
+        """What was registered without being declared first, then what is declared."""
         self._import_others()
         return iter({**{name: 0 for name in self._things if name not in self._places}, **self._places})
 
