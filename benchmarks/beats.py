@@ -77,8 +77,8 @@ def main() -> None:
     args = arguments(parser)
     sets: dict[str, list[Song]] = {"charted": [], "rendered": []}
     for place in args.places:
-        found = list(charted(place))
-        sets["rendered" if any(place.glob("*.mid")) else "charted"] += found
+        scored = any(file.name != "notes.mid" for file in place.glob("*.mid"))
+        sets["rendered" if scored else "charted"] += charted(place)
     finders: Mapping[str, Callable[[Sound], Times]] = {
         **{one.partition("=")[0]: tracked(Path(one.partition("=")[2])) for one in args.weights},
         "ours": tracked(WEIGHTS),

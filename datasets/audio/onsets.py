@@ -51,8 +51,9 @@ def track_beats(onsets: NDArray[np.float32], rate: int) -> NDArray[np.int64]:
     score = np.convolve(scaled, window)[step : step + len(onsets)].astype(np.float32)
     before, total = _best_before(score, step)
     peaks = local_maxima(total)
-    enough = np.flatnonzero(peaks & (total >= 0.5 * np.median(total[peaks]))) if peaks.any() else []
-    frames, at = [], int(enough[-1]) if len(enough) else len(onsets) - 1
+    enough = peaks & (total >= 0.5 * np.median(total[peaks])) if peaks.any() else peaks
+    at = int(np.flatnonzero(enough)[-1]) if enough.any() else len(onsets) - 1
+    frames = []
     while at >= 0:
         frames.append(at)
         at = int(before[at])
@@ -60,7 +61,7 @@ def track_beats(onsets: NDArray[np.float32], rate: int) -> NDArray[np.int64]:
     # Beats before the first and after the last frame that is loud enough are taken off.
     smooth = np.convolve(score[beats], np.hanning(5))[2 : len(score) + 2]
     loud = np.flatnonzero(score > 0.5 * np.sqrt(np.mean(np.square(smooth))))
-    return beats[(beats >= loud[0]) & (beats <= loud[-1])]
+    return np.asarray(beats[(beats >= loud[0]) & (beats <= loud[-1])])
 
 
 def _best_before(score: NDArray[np.float32], step: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

@@ -78,7 +78,7 @@ def hidden(piece: Arrangement, rng: np.random.Generator) -> Arrangement:
         ended = min(len(bars) - 1, begun + int(rng.choice([4, 4, 8, 16]))) if begun >= 0 else 0
         first, last = (bars[begun] if begun >= 0 else 0), bars[ended]
         inside = (numbers >= first - 0.05) & (numbers < last - 0.05)
-        section = [piece.notes[k] for k in np.flatnonzero(inside)]
+        section = [piece.notes[k] for k in np.flatnonzero(inside).tolist()]
         if begun >= 0 and rng.random() < 0.7:
             section = _section(piece, section, bars[begun : ended + 1], late, rng)
         notes += section

@@ -86,7 +86,7 @@ class SongBatches(Dataset[dict[str, Tensor]]):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return a stretch's levels [rows, 64] and targets [rows, 2], played faster or slower."""
         mixed = levels(_mixed(song, rng if self.augment else None))
-        speed = min(np.exp(rng.uniform(-0.16, 0.16)), len(mixed) / self.rows) if self.augment else 1.0
+        speed = min(np.exp(rng.uniform(-0.16, 0.25)), len(mixed) / self.rows) if self.augment else 1.0
         places = rng.uniform(0, len(mixed) - speed * (self.rows - 1) - 1) + speed * np.arange(self.rows)
         # Levels between two rows are interpolated: playing faster is reading at other places.
         before = places.astype(np.int64)
