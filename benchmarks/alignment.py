@@ -85,7 +85,9 @@ def figures(counts: Counts) -> NDArray[np.float64]:
 
 def gains(arm: Counts, tokens: Counts) -> list[str]:
     """Differences of both figures with their intervals; counts have seeds first."""
-    rng, (seeds, clips), drawn = np.random.default_rng(0), arm.shape[:2], []
+    rng = np.random.default_rng(0)
+    (seeds, clips) = arm.shape[:2]
+    drawn = []
     for _ in range(DRAWS):
         some = np.ix_(rng.integers(seeds, size=seeds), rng.integers(clips, size=clips))
         drawn.append(figures(arm[some]) - figures(tokens[some]))
@@ -103,8 +105,10 @@ def main() -> None:
     args = arguments(parser)
     stages = stages_of(str(args.data.resolve()), args.base, args.more)
     finished = finished_stages(train(args.work / "run", stages, seed=7, start="synthetic"))
-    cache, inputs = StageCache(), finished["base"].inputs
-    data, judge = cache.get(inputs["data"]), Judge(cache.get(inputs["tma"]))
+    cache = StageCache()
+    inputs = finished["base"].inputs
+    data = cache.get(inputs["data"])
+    judge = Judge(cache.get(inputs["tma"]))
     dataset = data.split("val")
     chosen = np.random.default_rng(0).permutation(len(dataset))[:CLIPS]
     truths = [truth_of(dataset, index) for index in chosen.tolist()]
@@ -133,7 +137,8 @@ def main() -> None:
 
     steps = f"{args.base:,} and {args.more:,} more"
     facts = {"split": "val", "clips": len(truths), "batch": BATCH, "steps": steps}
-    rows, counts = [], {}
+    rows = []
+    counts = {}
     for arm in ARMS:
         names = [f"{arm}_{seed}" for seed in SEEDS]
         found = [kept(args.work / f"{name}.json", partial(made, name)) for name in names]

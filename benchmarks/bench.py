@@ -224,7 +224,8 @@ def shown(values: Any, column: Mapping[str, Any]) -> str:
     """A cell: text as it is, a value, both of two seeds, or the mean over seeds with its 95 % interval."""
     if not isinstance(values, list):
         return str(values)
-    digits, found = column["digits"], estimate([column["scale"] * value for value in values])
+    digits = column["digits"]
+    found = estimate([column["scale"] * value for value in values])
     if found.pair:
         return " / ".join(f"{value:.{digits}f}" for value in found.pair)
     half = "" if found.interval is None else f" ± {found.interval:.{digits}f}"

@@ -34,7 +34,8 @@ def turned(joints: Joints, fps: float) -> float:
 
 def raised(joints: Joints, side: str) -> float:
     """Highest the wrist gets above its shoulder, metres."""
-    wrist, shoulder = SKELETON.index(f"{side}_wrist"), SKELETON.index(f"{side}_shoulder")
+    wrist = SKELETON.index(f"{side}_wrist")
+    shoulder = SKELETON.index(f"{side}_shoulder")
     return float((joints[:, wrist, 1] - joints[:, shoulder, 1]).max())
 
 
@@ -50,7 +51,8 @@ def only(joints: Joints, side: str) -> bool:
     return raised(joints, side) > UP and raised(joints, other) < DOWN
 
 
-UP, DOWN = -0.1, -0.2
+UP = -0.1
+DOWN = -0.2
 Check = Callable[[Joints, float], bool]
 BY_CONTENT: dict[str, Check] = {  # by the label of a clip's content
     "walk-turn-left": lambda j, f: turned(j, f) > 45,

@@ -57,7 +57,8 @@ GAP = (0.3, 0.7)
 DRAWS = 3
 SECONDS = 5.0
 """As long as training clips can be."""
-MODEL, LINES = "**the model**", "straight lines"
+MODEL = "**the model**"
+LINES = "straight lines"
 NEAREST = f"nearest of {TRAINING} training clips"
 OTHER_WORDS = "other words from the gap on"
 CARD = model_folder(Path("inbetween")) / "README.md"
@@ -75,7 +76,8 @@ Joints = NDArray[np.float64]
 
 def measured(joints: Joints, clip: Joints, fps: float, gap: slice) -> dict[str, float]:
     """Figures of a filled gap, beside the clip as it was."""
-    size, steps = accelerations(joints, fps), np.arange(len(joints) - 1)
+    size = accelerations(joints, fps)
+    steps = np.arange(len(joints) - 1)
     around = [edge + k for edge in (gap.start, gap.stop) for k in range(-3, 1)]
     return {
         "away": 100 * float(np.linalg.norm(joints[gap] - clip[gap], axis=-1).mean()),
@@ -117,9 +119,12 @@ def nearest(clip: Joints, gap: slice, fps: float, training: Sequence[Joints]) ->
     found = best[1]
     known = np.zeros(size + 1, dtype=bool)
     known[[0, -1]] = True
-    angle, place = heading(found, fps), ground(found[:, 0])
-    wanted, there = heading(clip, fps), ground(clip[:, 0])
-    turn, move = np.zeros(size + 1), np.zeros(size + 1, dtype=np.complex128)
+    angle = heading(found, fps)
+    place = ground(found[:, 0])
+    wanted = heading(clip, fps)
+    there = ground(clip[:, 0])
+    turn = np.zeros(size + 1)
+    move = np.zeros(size + 1, dtype=np.complex128)
     turn[[0, -1]] = wanted[[gap.start - 1, gap.stop]] - angle[[0, -1]]
     move[[0, -1]] = there[[gap.start - 1, gap.stop]] - place[[0, -1]]
     out = clip.copy()
@@ -136,7 +141,8 @@ def obeyed(joints: Joints, words: Truth, fps: float, start: int) -> dict[str, fl
 
 def asked_of(clip: Joints, fps: float, gap: slice, words: Truth) -> dict[str, dict[str, object]]:
     """The requests to the model, by the row's title."""
-    keep, middle = [{"end": gap.start / fps}, {"start": gap.stop / fps}], (gap.start + gap.stop) // 2
+    keep = [{"end": gap.start / fps}, {"start": gap.stop / fps}]
+    middle = (gap.start + gap.stop) // 2
     aim = clip[middle, 20] + [0.05, 0.1, 0.1]  # a hand's breadth from where the wrist was
     pin = {"at": middle / fps, "joint": "left_wrist", "position": [float(value) for value in aim]}
     out: dict[str, dict[str, object]] = {MODEL: {"keep": keep}}
@@ -152,7 +158,10 @@ def figures_of(
     models: Sequence[MotionModel], clip: RecordedClip, task: dict[str, object], gap: slice, words: Truth
 ) -> list[dict[str, float]]:
     """Figures of each draw of a task; none where the clip does not allow it, such as a pin out of reach."""
-    fps, out, drawing, asked = models[0].fps, [], SamplingConfig(), EditTask.parse(task, "task")
+    fps = models[0].fps
+    out = []
+    drawing = SamplingConfig()
+    asked = EditTask.parse(task, "task")
     try:
         draws = [
             edit_clip(models[draw % len(models)].bundle, clip, asked, 1, draw, drawing)
@@ -161,7 +170,8 @@ def figures_of(
     except UserError:
         return []
     for (made,) in draws:
-        near, figures = made.report, measured(made.joints, clip.joints, fps, gap)
+        near = made.report
+        figures = measured(made.joints, clip.joints, fps, gap)
         if "seconds" in task:
             figures = {"sliding": near.sliding, **obeyed(made.joints, words, fps, gap.start)}
         elif "pins" in task:
@@ -257,11 +267,13 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=60, help="synthetic test clips")
     parser.add_argument("--card", action="store_true", help="write the model's card from its records")
     args = arguments(parser)
-    models, recipe = [MotionModel(path, "cpu") for path in args.models], load_recipe(RECIPE)
+    models = [MotionModel(path, "cpu") for path in args.models]
+    recipe = load_recipe(RECIPE)
     files = sorted(args.real.glob("*.bvh")) if args.real else []
     wanted = len(files) if args.real else args.clips
     truths, config = test_clips(recipe, TRIED + 2 * wanted)
-    words, truths = truths[TRIED : TRIED + wanted], truths[TRIED + wanted :]
+    words = truths[TRIED : TRIED + wanted]
+    truths = truths[TRIED + wanted :]
     fps = models[0].fps
     clips = [RecordedClip(truth.id, truth.joints, fps, truth.face) for truth in truths]
     if args.real:

@@ -58,7 +58,8 @@ def main() -> None:
                 continue
             began = time.monotonic()
             result = inject(fault, place)
-            found, missed = found + (result == "found"), missed + (result != "found")
+            found = found + (result == "found")
+            missed = missed + (result != "found")
             print(f"{result:9} {time.monotonic() - began:5.0f} s  {fault.name}", flush=True)
     print(f"{found} found, {missed} not")
     sys.exit(missed > 0)

@@ -261,7 +261,8 @@ def main() -> None:
         return clips.figures([recorded[i] for i in order])
 
     def arm_figures(arm: str, seed: int) -> dict[str, float]:
-        recipe, folder = arm_recipe(args, arm, seed, steps[arm], rates[arm]), args.work / f"{arm}-{seed}"
+        recipe = arm_recipe(args, arm, seed, steps[arm], rates[arm])
+        folder = args.work / f"{arm}-{seed}"
         seconds = sum(train_arm(recipe, folder).values())
         return figures_of(Bundle.open(folder), clips, seed, args) | {"seconds": seconds}
 

@@ -69,7 +69,8 @@ def run(
     work: Path, names: list[str], counts: dict[str, Count], seed: int, inputs: int, seconds: float
 ) -> None:
     """Read inputs of each reader: so many each, or in turn until the CPU seconds are over."""
-    todo, spent = list(names), 0.0
+    todo = list(names)
+    spent = 0.0
     while todo:
         name = todo.pop(0)
         count = counts.setdefault(name, Count())
@@ -113,7 +114,8 @@ def record(counts: dict[str, Count]) -> None:
     commit = subprocess.run(
         ["git", "rev-parse", "--short=8", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.strip()
-    whole, today = total(counts), date.today()
+    whole = total(counts)
+    today = date.today()
     facts = {
         "date": today.isoformat(),
         "commit": commit,

@@ -72,7 +72,9 @@ class Rows:
     """Rows in a file, each written as it is measured, while there is time."""
 
     def __init__(self, path: Path, minutes: float, only: list[str]) -> None:
-        self.path, self.end, self.only = path, time.monotonic() + 60 * minutes, tuple(only)
+        self.path = path
+        self.end = time.monotonic() + 60 * minutes
+        self.only = tuple(only)
         lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
         self.rows: list[dict[str, Any]] = [json.loads(line) for line in lines]
         self.left_out: list[str] = []
@@ -118,7 +120,9 @@ class Clock(L.Callback):
     """Seconds of the first step, and of one of those that count."""
 
     def __init__(self, synchronize: Callable[[], object]) -> None:
-        self.synchronize, self.begin, self.last = synchronize, 0.0, 0
+        self.synchronize = synchronize
+        self.begin = 0.0
+        self.last = 0
 
     def on_train_start(self, *_: Any) -> None:
         self.begin = self.now()
@@ -127,7 +131,8 @@ class Clock(L.Callback):
         step = trainer.global_step
         if step not in (1, 4, self.last):
             return
-        seconds, self.begin = self.now() - self.begin, self.now()
+        seconds = self.now() - self.begin
+        self.begin = self.now()
         if step == 1:
             self.first = seconds
         elif step == 4:
@@ -146,7 +151,8 @@ class Benchmark:
 
     def __init__(self, args: Namespace) -> None:
         accelerator: Any = "cpu" if args.device == "cpu" else "gpu"
-        self.args, self.device = args, Hardware(accelerator=accelerator).device()
+        self.args = args
+        self.device = Hardware(accelerator=accelerator).device()
         self.console = Console(file=(args.work / "log.txt").open("a", encoding="utf-8"), width=120)
         self.run = args.work / "run"
         self.hardware = [f"hardware.accelerator={accelerator}", "hardware.devices=1"]
@@ -183,7 +189,8 @@ class Benchmark:
         """A stage's network before training, on inputs that are not trained either."""
         recipe = self.recipes[family]
         stage = recipe.stage(name)
-        kind, config = stage.kind, stage.config
+        kind = stage.kind
+        config = stage.config
         given = previews(stage, {one.name: one for one in recipe.stages})
         inputs = kind.inputs.of(given)
         torch.manual_seed(0)
@@ -208,7 +215,8 @@ class Benchmark:
             torch.cuda.reset_peak_memory_stats()
         hardware = self.recipes["humantomato"].hardware.model_copy(update={"deterministic": how != "free"})
         module.logs_rows = True
-        clock, folder = Clock(self.synchronize), Path(tempfile.mkdtemp())
+        clock = Clock(self.synchronize)
+        folder = Path(tempfile.mkdtemp())
         trainer = make_trainer(
             hardware,
             train.model_copy(update={"steps": 104}),
@@ -319,7 +327,8 @@ def with_values(batch: Batch, net: Any) -> Batch:
 
     batch = tree_map(drawn, batch)
     if "tokens" in batch:
-        shape, last = batch["tokens"].shape, len(net.ends)
+        shape = batch["tokens"].shape
+        last = len(net.ends)
         batch["tokens"] = torch.randint(int(net.ends.min()), shape)
         batch["tokens"][:, -last:] = net.ends
     return batch
@@ -367,7 +376,8 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[], metavar="ROWS")
     args = arguments(parser)
     args.work.mkdir(parents=True, exist_ok=True)
-    rows, bench = Rows(args.work / "rows.jsonl", args.minutes, args.only), Benchmark(args)
+    rows = Rows(args.work / "rows.jsonl", args.minutes, args.only)
+    bench = Benchmark(args)
     for table, title, cells in measurements(bench):
         rows.measure(table, title, cells)
     named = torch.cuda.get_device_name(bench.device) if bench.device.type == "cuda" else "CPU"

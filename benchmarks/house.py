@@ -99,7 +99,8 @@ def docstring_lines(path: Path) -> set[int]:
 
 def tokens(path: Path) -> int:
     """Tokens of a file, without comments, docstrings and line ends."""
-    text, described = path.read_text(encoding="utf-8"), docstring_lines(path)
+    text = path.read_text(encoding="utf-8")
+    described = docstring_lines(path)
     return sum(
         token.type not in _NO_TOKENS and not (token.type == tokenize.STRING and token.start[0] in described)
         for token in tokenize.generate_tokens(io.StringIO(text).readline)
@@ -194,7 +195,9 @@ def cli_parameters() -> dict[str, int]:
 def figures() -> dict[str, float]:
     """Every figure by its name in the table of limits."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    code, parameters, arrows = files(*SOURCE), cli_parameters(), imports()
+    code = files(*SOURCE)
+    parameters = cli_parameters()
+    arrows = imports()
     tuples = sum(1 for path in code for _ in tuple_assignments(path))
     return {
         "tokens of the core": sum(map(tokens, source(fence=False))),

@@ -57,7 +57,8 @@ def empty(steps: int) -> Empty:
 
 def by_hand(steps: int) -> None:
     """The same calls as a loop of a dozen lines."""
-    module, batches = empty(steps), Ones()
+    module = empty(steps)
+    batches = Ones()
     optimizer: Any = module.configure_optimizers()[0]["optimizer"]
     for step in range(steps):
         module.schedule.set_step(step)

@@ -54,7 +54,9 @@ RECIPE = "humantomato-synthetic"
 KINDS = ("held out", "other")
 
 WORDS = Path(__file__).with_name("synthetic_wordings.json")
-FAMILIAR, OTHER, GUESS = "as in training", "other words", "another clip's motion"
+FAMILIAR = "as in training"
+OTHER = "other words"
+GUESS = "another clip's motion"
 
 ASKED = 60
 """Clips whose captions are asked about."""
@@ -86,7 +88,9 @@ def _said(truth: Mapping[str, Any], words: Mapping[str, Any], pick: Callable[[Se
     said = pick(
         words["actions"][" ".join(part for part in (truth["action"], truth.get("direction"), style) if part)]
     )
-    count, speed, side = truth.get("count"), truth.get("speed"), truth.get("side")
+    count = truth.get("count")
+    speed = truth.get("speed")
+    side = truth.get("side")
     limb = {"wave": "hand", "raise": "arm"}.get(truth["action"])
     named = f"both {limb}s" if side == "both" else f"the {side} {limb}" if limb else side
     return said.format(
@@ -138,7 +142,8 @@ def truth_from(sample: Sample, config: SynthConfig) -> Truth:
     layout = config.motion_layout
     motion = np.asarray(sample.motion, dtype=np.float32)
     motion = motion[: len(motion) // 4 * 4]
-    body, caption = motion[:, layout.part("bodyhand")], sample.texts[0].text if sample.texts else ""
+    body = motion[:, layout.part("bodyhand")]
+    caption = sample.texts[0].text if sample.texts else ""
     return Truth(
         id=sample.meta.id,
         features=body,
@@ -185,7 +190,8 @@ def main() -> None:
     parser.add_argument("--clips", type=int, help="test clips, at most; default: as the card says, or all")
     parser.add_argument("--seed", type=int, help="default: as the card says, or 0")
     args = parser.parse_args()
-    model, console = model_folder(args.model), Console()
+    model = model_folder(args.model)
+    console = Console()
     before = noted(model)
     settings = before.get("settings", []) if args.set is None else args.set
     recipe = load_recipe(args.recipe or before.get("recipe", RECIPE), settings, strict=False)
@@ -205,7 +211,8 @@ def main() -> None:
         OTHER: ([body for body, _ in other], [face or body for body, face in other]),
     }
     order = np.random.default_rng(0).permutation(len(truths))
-    fps, hold_out = bundle.layout.fps, data.hold_out
+    fps = bundle.layout.fps
+    hold_out = data.hold_out
 
     def measured(how: SamplingConfig) -> dict[str, Shares]:
         out = {}
@@ -317,7 +324,9 @@ def card_of(
     figures: Mapping[str, Any], recipe: Recipe, data: SynthConfig, bundle: Bundle, model: Path
 ) -> str:
     """The card as Markdown."""
-    shares, strange, sampling = figures["right"], figures["unknown"], figures["sampling"]
+    shares = figures["right"]
+    strange = figures["unknown"]
+    sampling = figures["sampling"]
     head = ["right, %", *(f"{title}: {kind}" for title, kind in columns_of(shares))]
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
     options = "".join(

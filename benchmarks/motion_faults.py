@@ -68,7 +68,8 @@ def with_values(motion: BvhMotion, values: NDArray[Any]) -> BvhMotion:
 
 def stuck(*names: str) -> Planted:
     def go(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
-        values, columns = motion.values.copy(), columns_of(motion, joint_map, names)
+        values = motion.values.copy()
+        columns = columns_of(motion, joint_map, names)
         values[:, columns] = values[len(values) // 2, columns]
         return with_values(motion, values)
 
@@ -76,7 +77,8 @@ def stuck(*names: str) -> Planted:
 
 
 def rooted(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
-    values, columns = motion.values.copy(), root_columns(motion)
+    values = motion.values.copy()
+    columns = root_columns(motion)
     values[:, columns] = values[0, columns]
     return with_values(motion, values)
 
@@ -85,7 +87,9 @@ def longer(factor: float) -> Planted:
     def go(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
         limb = ("left_knee", "left_ankle", "right_elbow", "right_wrist")[rng.integers(4)]
         (name, *_) = joint_map.sources[joint_map.target.joints.index(limb)]
-        offsets, values, joint = motion.offsets.copy(), motion.values.copy(), motion.joints.index(name)
+        offsets = motion.offsets.copy()
+        values = motion.values.copy()
+        joint = motion.joints.index(name)
         offsets[joint] *= factor
         values[:, [column for one, _, column in channel_columns(motion.channels)[0] if one == joint]] *= (
             factor
@@ -97,7 +101,8 @@ def longer(factor: float) -> Planted:
 
 def shifted(frames: int | None, metres: float) -> Planted:
     def go(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
-        values, at = motion.values.copy(), int(rng.integers(len(motion.values) // 4, len(motion.values) // 2))
+        values = motion.values.copy()
+        at = int(rng.integers(len(motion.values) // 4, len(motion.values) // 2))
         end = len(values) if frames is None else at + frames
         values[at:end, root_columns(motion)[0]] += metres * metre(motion, joint_map)
         return with_values(motion, values)
@@ -107,13 +112,15 @@ def shifted(frames: int | None, metres: float) -> Planted:
 
 def spike(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
     names = ("left_hip", "right_knee", "left_shoulder", "right_elbow")
-    values, columns = motion.values.copy(), columns_of(motion, joint_map, (names[rng.integers(4)],))
+    values = motion.values.copy()
+    columns = columns_of(motion, joint_map, (names[rng.integers(4)],))
     values[int(rng.integers(len(values) // 4, len(values) // 2)), columns[:2]] += 60
     return with_values(motion, values)
 
 
 def drift(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
-    values, columns = motion.values.copy(), root_columns(motion)
+    values = motion.values.copy()
+    columns = root_columns(motion)
     values[:, columns[0]] += 0.7 * metre(motion, joint_map) * np.arange(len(values)) / motion.fps
     return with_values(motion, values)
 
@@ -125,7 +132,8 @@ def repeated(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -
 
 
 def frozen(motion: BvhMotion, joint_map: JointMap, rng: np.random.Generator) -> BvhMotion:
-    values, at = motion.values.copy(), motion.frames // 4
+    values = motion.values.copy()
+    at = motion.frames // 4
     count = int(0.7 * motion.fps) + 1
     values[at : at + count] = values[at]
     return with_values(motion, values)

@@ -65,8 +65,10 @@ class Counted(TorchDispatchMode):
 def counted(recipe: str, name: str) -> tuple[Counted, int]:
     """The counts of a stage's second step, and its batch."""
     loaded = load_recipe(recipe)
-    stage, stages = loaded.stage(name), {one.name: one for one in loaded.stages}
-    config, dry = stage.config, cast(Any, stage.kind)
+    stage = loaded.stage(name)
+    stages = {one.name: one for one in loaded.stages}
+    config = stage.config
+    dry = cast(Any, stage.kind)
     if name == "gpt":
         config = config.model_copy(update={"loss": config.loss.model_copy(update={"align_from": 0})})
     fabric = Fabric(accelerator="cpu", precision=config.train.precision)
@@ -74,7 +76,8 @@ def counted(recipe: str, name: str) -> tuple[Counted, int]:
     with FakeTensorMode(allow_non_fake_inputs=True):
         inputs = dry.inputs.of(previews(stage, stages))
         net = dry.network(dry.facts(config, inputs), inputs)
-        module, batch = dry.dry_module(config, net, inputs), dry.example(config, net, inputs, size).batch
+        module = dry.dry_module(config, net, inputs)
+        batch = dry.example(config, net, inputs, size).batch
         for layer in module.modules():  # a CPU has no fused kernel with dropout
             if isinstance(layer, SelfAttention):
                 layer.attention_dropout = 0.0

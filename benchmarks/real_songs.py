@@ -142,7 +142,8 @@ class Training:
 
     def random(self, stretch: Stretch, rng: np.random.Generator) -> Array:
         """A training dance, and another behind it, until the stretch is full."""
-        frames, out = round(stretch.sound.seconds * self.fps), []
+        frames = round(stretch.sound.seconds * self.fps)
+        out = []
         while sum(map(len, out)) < frames:
             out.append(self.clips[int(rng.integers(len(self.clips)))].joints[:, :BODY_JOINTS])
         return np.concatenate(out)[:frames]

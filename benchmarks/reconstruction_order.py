@@ -63,7 +63,8 @@ FIGURES = ("mpjpe", "body", "hands", "world")
 
 def whole_bodies(shards: Path, split: str) -> Iterator[NDArray[np.int16]]:
     """Joints [T, 52, 3] in `UNIT`s of the clips that hold a window, with synthetic hands."""
-    clips, rng = ShardDataset.open(shards, split), np.random.default_rng(7)
+    clips = ShardDataset.open(shards, split)
+    rng = np.random.default_rng(7)
     for number in range(min(CLIPS, len(clips))):
         motion = clips.motion(number)
         if len(motion) < WINDOW:
@@ -88,7 +89,8 @@ def make(shards: Path, file: Path) -> None:
 def read(file: Path, split: str) -> list[NDArray[np.float32]]:
     """Features [T, 313] of each clip."""
     with np.load(file, allow_pickle=False) as arrays:
-        frames, planes = arrays[f"{split}_frames"], arrays[f"{split}_bytes"]
+        frames = arrays[f"{split}_frames"]
+        planes = arrays[f"{split}_bytes"]
     steps = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(np.int16)[..., 0]
     joints = np.cumsum(steps, axis=0, dtype=np.int16) * UNIT
     return [encode(clip, LAYOUT) for clip in np.split(joints, np.cumsum(frames)[:-1])]
@@ -126,7 +128,8 @@ class Data:
     def errors(self, motion: Tensor) -> dict[str, float]:
         """Errors in mm: of all joints and of the body from the root, of fingers from their wrists, with the
         path."""
-        made, true = self.joints(motion), self.truth
+        made = self.joints(motion)
+        true = self.truth
         hands = [
             mpjpe(*(x[:, :, [wrist, *joints]] for x in (made, true))).mean().item() * 16 / 15
             for wrist, joints in FINGERS.values()
@@ -160,7 +163,10 @@ class Training:
     """One tokenizer of one seed, whose step is a CUDA graph on a GPU."""
 
     def __init__(self, arm: str, seed: int, data: Data, args: argparse.Namespace) -> None:
-        self.arm, self.seed, self.data, self.args = arm, seed, data, args
+        self.arm = arm
+        self.seed = seed
+        self.data = data
+        self.args = args
         sizes = {"width": args.width, "depth": args.depth, "code_dim": args.width, "reset_below": 0.05}
         torch.manual_seed(seed)
         net = (H2VQConfig(**sizes) if arm == "H2VQ" else rvq(arm, sizes)).build(LAYOUT)

@@ -159,7 +159,11 @@ def row_of(run: Path, table: Table, title: str) -> Record:
     """The cells of a row, one value for each seed that has finished, and how it was measured."""
     stage, row = table.rows[title]
     cells: dict[str, list[float]] = {}
-    seeds, protocol, candidates, variant, code = [], {}, {}, list[str](), dict[str, int]()
+    seeds = []
+    protocol = {}
+    candidates = {}
+    variant = list[str]()
+    code = dict[str, int]()
     for seed in SEEDS if row == MODEL else SEEDS[:1]:
         folder = run / "stages" / f"{stage}_{seed}"
         if seed == SEEDS[0] and (run / "stages" / stage).is_dir():  # of a recipe that has one
@@ -172,7 +176,8 @@ def row_of(run: Path, table: Table, title: str) -> Record:
             value = logged(run, stage, seed, column) if row == MODEL else None
             figure = found.of(column.figure, row) if found else None
             if figure is not None:
-                value, protocol = figure.value, {**protocol, **figure.protocol}
+                value = figure.value
+                protocol = {**protocol, **figure.protocol}
                 if "candidates" in figure.protocol:
                     candidates[column.figure] = figure.protocol["candidates"]
             if value is not None:
@@ -198,7 +203,8 @@ def steps_of(model: StageRecord | None) -> str | int:
 
 def unlike_published(kind: str, config: Mapping[str, object]) -> list[str]:
     """Choices of a network, sizes aside, other than its kind's and the published norm behind the sums."""
-    usual, own = flatten(stage_kinds()[kind].config().dump()) | {"net.norm": "post"}, flatten(config)
+    usual = flatten(stage_kinds()[kind].config().dump()) | {"net.norm": "post"}
+    own = flatten(config)
     chosen = [key for key in own if key.startswith("net.") and usual.get(key) != own[key]]
     return [f"{key.split('.')[-1]} {own[key]}".lower() for key in chosen if isinstance(own[key], str | bool)]
 

@@ -43,7 +43,8 @@ from motionloom.pipeline.training.loaders import ROOMS, Loader
 
 COLUMNS = (Column("ours", "ours"), Column("the usual way", "usual"), Column("times faster", "ratio", 1))
 CAPTIONS = ("a person walks forward", "a person waves with the left hand", "a person squats")
-WINDOW, BATCH = 64, 256
+WINDOW = 64
+BATCH = 256
 
 
 def row(title: str, ours: str, usual: str = "", ratio: float | None = None) -> Record:
@@ -55,8 +56,10 @@ def audio(args: Namespace) -> Record:
     """438 features of one minute: drum noise and decaying notes at 112 beats a minute."""
     import librosa
 
-    settings, rng = AudioSettings(fps=60.0), np.random.default_rng(0)
-    rate, octaves = settings.rate, fitting_octaves(settings.rate)
+    settings = AudioSettings(fps=60.0)
+    rng = np.random.default_rng(0)
+    rate = settings.rate
+    octaves = fitting_octaves(settings.rate)
     sound = 0.01 * rng.standard_normal(60 * rate)
     for beat in range(112):
         start = int(beat * 60 / 112 * rate)
@@ -109,7 +112,8 @@ class NoiseClips:
 class NoiseText:
     """Captions as twelve words of noise, as wide as the sentence encoder of the recipes."""
 
-    name, dim = "noise", 384
+    name = "noise"
+    dim = 384
 
     def encode(self, captions: Sequence[str]) -> EncodedText:
         tokens = np.random.default_rng(0).standard_normal((len(captions), 12, self.dim), dtype=np.float32)
@@ -127,8 +131,11 @@ def noise(folder: str, layout: MotionLayout, clips: int, least: int) -> tuple[Sh
 
 def paper_batches(folder: str) -> dict[str, Numbered[Batch]]:
     """Batches of 256 as the paper trains on them, of 512 whole-body clips of 196 frames in `folder`."""
-    layout, count, groups = MotionLayout.named("wholebody363"), 512, 49
-    columns, draw = layout.part("bodyhand"), torch.Generator().manual_seed(0)
+    layout = MotionLayout.named("wholebody363")
+    count = 512
+    groups = 49
+    columns = layout.part("bodyhand")
+    draw = torch.Generator().manual_seed(0)
     dataset, stats = noise(folder, layout, count, 196)
     texts = [caption.text for i in range(count) for caption in dataset.texts(i)]
     cache = build_with_encoder(Path(folder, "text"), texts, NoiseText(), progress=False)
@@ -136,8 +143,10 @@ def paper_batches(folder: str) -> dict[str, Numbered[Batch]]:
     codes = {k: torch.randint(512, (count * groups * n,), generator=draw) for k, n in per_group.items()}
     store = TokenStore(codes, np.arange(count + 1) * groups, per_group, np.ones(count, bool))
     captions = TokenCaptions.of([[(3 * i + k, 0, groups) for k in range(3)] for i in range(count)])
-    latents, alike = torch.zeros(3 * count, 256), torch.zeros(3 * count, NoiseText.dim)
-    pattern, ends = ("body", "body", "hand"), dict.fromkeys(per_group, 512)
+    latents = torch.zeros(3 * count, 256)
+    alike = torch.zeros(3 * count, NoiseText.dim)
+    pattern = ("body", "body", "hand")
+    ends = dict.fromkeys(per_group, 512)
     clips = {"max_frames": 196, "captioned": "body", "columns": columns, "batch_size": BATCH}
     return {
         "tokenizer": WindowBatches(dataset, stats, window=WINDOW, batch_size=BATCH, columns=columns),
@@ -149,7 +158,8 @@ def paper_batches(folder: str) -> dict[str, Numbered[Batch]]:
 def batches(args: Namespace) -> Record:
     """CPU time of one batch."""
     with tempfile.TemporaryDirectory() as folder:
-        step, made = itertools.count(), paper_batches(folder)
+        step = itertools.count()
+        made = paper_batches(folder)
         motion = np.zeros((2, *made["TMA"][0]["motion"].shape), dtype=np.float32)
         calls: dict[str, Callable[[], object]] = {
             name: lambda own=own: own[next(step)] for name, own in made.items()
@@ -162,7 +172,10 @@ def batches(args: Namespace) -> Record:
 
 def workers(args: Namespace) -> Record:
     """Wall time from batch to batch of one loader process, as for a GPU, and as torch alone sends them."""
-    begins, count, ours, usual = 10, 60, [], []
+    begins = 10
+    count = 60
+    ours = []
+    usual = []
     with tempfile.TemporaryDirectory() as folder:
         for own in paper_batches(folder).values():
             steps = Steps(lambda rank, world, own=own: own, begins + count)

@@ -89,7 +89,8 @@ def adversarial(args: argparse.Namespace) -> None:
             values = {"ARM": arm, "WEIGHT": weight, "STEPS": args.steps}
             stages |= stages_of("adversarial", args.clips, seed, **values)
     run = train(args.work / "adversarial", stages, until=args.until, seed=7)
-    finished, rows = finished_stages(run), []
+    finished = finished_stages(run)
+    rows = []
     for title, (way, sampling) in WAYS.items():
         for arm, weight in ADVERSARIAL.items():
             names = {seed: f"{way}_{arm}_{seed}" for seed in args.seeds}
@@ -112,14 +113,17 @@ def decoders(args: argparse.Namespace) -> None:
         stages |= stages_of("paper_decoders", args.clips, seed, STEPS=args.steps)
     finished = finished_stages(train(args.work / "decoders", stages, until=args.until, seed=7))
     cache = StageCache()
-    tokenizer, data = cache.get(finished["ema_7"]), cache.get(finished["data"])
-    dataset, nearest = data.split("test"), NearestClip(data.split("train"))
+    tokenizer = cache.get(finished["ema_7"])
+    data = cache.get(finished["data"])
+    dataset = data.split("test")
+    nearest = NearestClip(data.split("train"))
     chosen = np.random.default_rng(0).permutation(len(dataset))[:DECODED]
     truths = [truth_at(dataset, k, min(int(dataset.frames[k]), 160) // 4 * 4) for k in chosen.tolist()]
     codes = tokenizer.encode([truth.features for truth in truths])
 
     def measured(stage: str, sampler: Sampler, steps: int) -> dict[str, float]:
-        net, seeds = cache.get(finished[stage]).net, sample_seeds(0, DECODED)
+        net = cache.get(finished[stage]).net
+        seeds = sample_seeds(0, DECODED)
         made = decode_motions(net, codes, seeds=seeds, sampler=sampler, steps=steps)
         return decoder_figures(
             [joints_of(tokenizer.of_coordinates(x), tokenizer.layout) for x in made], truths

@@ -61,9 +61,13 @@ CONTROLS: dict[str, Look] = {
 }
 """One look for each end of the drawn face's controls: what the page moves the face by."""
 
-_EYE_WIDTH, _EYE_HEIGHT, _EYE_X, _EYE_Y = 0.0165, 0.0108, 0.0325, 0.006
+_EYE_WIDTH = 0.0165
+_EYE_HEIGHT = 0.0108
+_EYE_X = 0.0325
+_EYE_Y = 0.006
 _RING = 24
-_MOUTH_Y, _MOUTH_WIDTH = -0.055, 0.025
+_MOUTH_Y = -0.055
+_MOUTH_WIDTH = 0.025
 _JAW_DROP = 0.022
 PATCH = (0.044, 0.03)
 """Half width and half height of the skin around the mouth."""
@@ -106,12 +110,14 @@ def behind_mouth(local: Floats, triangles: Triangles) -> NDArray[np.bool_]:
 def on_skin(skin: Field, centre: Floats, places: Floats) -> Floats:
     """World points [V, 3] of face coordinates [V, 3]: straight back onto the skin, then lifted off it."""
     point = centre + np.column_stack([places[:, :2], np.full(len(places), 0.16)])
-    front, back = point[:, 2].copy(), np.full(len(places), centre[2] - 0.02)
+    front = point[:, 2].copy()
+    back = np.full(len(places), centre[2] - 0.02)
     # From in front the first crossing: the face has no overhang within the features' area.
     for _ in range(28):
         point[:, 2] = (front + back) / 2
         outside = skin.value(point) > 0
-        front, back = np.where(outside, point[:, 2], front), np.where(outside, back, point[:, 2])
+        front = np.where(outside, point[:, 2], front)
+        back = np.where(outside, back, point[:, 2])
     return np.asarray(point + places[:, 2:] * skin.normals(point), dtype=np.float64)
 
 
@@ -127,7 +133,8 @@ def skin_shift(local: Floats, look: Look, jaw: Floats | None = None) -> Floats:
     out[:, 1] -= _JAW_DROP * drop
     out[:, 2] -= 0.005 * drop
     # The lips, and less and less the skin around them.
-    u, v = x / _MOUTH_WIDTH, (y - _MOUTH_Y) / 0.011
+    u = x / _MOUTH_WIDTH
+    v = (y - _MOUTH_Y) / 0.011
     near = np.exp(-np.square(np.maximum(np.hypot(u, v) - 1, 0) / 0.7)) * ahead
     curve = look.smile - look.frown
     out[:, 0] += x * near * (0.24 * max(look.smile, 0.0) - 0.14 * look.mouth_open - 0.34 * look.purse)

@@ -198,7 +198,8 @@ def surface_nets(values: Floats) -> tuple[Floats, Triangles]:
     number = np.full(mixed.shape, -1, dtype=np.int64)
     number[mixed] = np.arange(mixed.sum())
     cells = np.argwhere(mixed)
-    total, crossings = np.zeros((len(cells), 3)), np.zeros(len(cells))
+    total = np.zeros((len(cells), 3))
+    crossings = np.zeros(len(cells))
     quads = []
     for axis in range(3):
         near = np.take(values, range(values.shape[axis] - 1), axis)
@@ -208,7 +209,8 @@ def surface_nets(values: Floats) -> tuple[Floats, Triangles]:
         share = near[crossed] / (near[crossed] - far[crossed])
         place = at.astype(np.float64)
         place[:, axis] += share
-        one, two = (axis + 1) % 3, (axis + 2) % 3
+        one = (axis + 1) % 3
+        two = (axis + 2) % 3
         around = []
         for step_one, step_two in ((0, 0), (1, 0), (1, 1), (0, 1)):
             cell = at.copy()

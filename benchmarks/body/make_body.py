@@ -100,8 +100,11 @@ def make_detail(detail: str) -> Piece:
     skeleton = Skeleton.named("smplx52")
     limbs, fingers, skull, fine = SPACING[detail]
     shapes = list(SHAPES[detail].values())
-    centre, turn = head_centre(skeleton), skeleton.index("head")
-    trunk, skin, hairs = trunk_and_limbs(skeleton), head(skeleton), hair(skeleton)
+    centre = head_centre(skeleton)
+    turn = skeleton.index("head")
+    trunk = trunk_and_limbs(skeleton)
+    skin = head(skeleton)
+    hairs = hair(skeleton)
 
     def piece(field: Field, spacing: float, softness: float, swatch: str, *over: Field) -> Piece:
         vertices, triangles = mesh_of(field, spacing)
@@ -160,10 +163,13 @@ def painted(piece: Piece, borders: Paint) -> Piece:
 
 def _cut(piece: Piece, value: Floats) -> tuple[Piece, NDArray[np.bool_]]:
     """Triangles that `value` [V] changes its sign in are split there; also which are above 0 now [F]."""
-    triangles, paint = piece.triangles, piece.paint
+    triangles = piece.triangles
+    paint = piece.paint
     above = value[triangles] >= 0
     whole = above.all(axis=1) | ~above.any(axis=1)
-    out, sides, colours = [triangles[whole]], [above[whole, 0]], [paint[whole]]
+    out = [triangles[whole]]
+    sides = [above[whole, 0]]
+    colours = [paint[whole]]
     edges: dict[tuple[int, int], int] = {}
     ends: list[tuple[int, int]] = []
 
@@ -177,7 +183,8 @@ def _cut(piece: Piece, value: Floats) -> tuple[Piece, NDArray[np.bool_]]:
     for corners, signs, colour in zip(triangles[~whole], above[~whole], paint[~whole], strict=True):
         alone = int(np.flatnonzero(signs == (signs.sum() == 1))[0])
         a, b, c = (int(corners[(alone + k) % 3]) for k in range(3))
-        ab, ac = middle(a, b), middle(a, c)
+        ab = middle(a, b)
+        ac = middle(a, c)
         out.append(np.array([[a, ab, ac], [ab, b, c], [ab, c, ac]]))
         sides.append(np.array([signs[alone], ~signs[alone], ~signs[alone]]))
         colours.append(np.full(3, colour))
@@ -223,7 +230,8 @@ def _hand(skeleton: Skeleton, side: str, spacing: float, shapes: int, sleeve: Fi
 
 def _band(rows: Floats, joint: str, swatch: str, shapes: int) -> Piece:
     """A band of rows [R, around, 3], left to right as seen from outside, that moves with one joint."""
-    skeleton, (count, around) = Skeleton.named("smplx52"), rows.shape[:2]
+    skeleton = Skeleton.named("smplx52")
+    (count, around) = rows.shape[:2]
     one = np.arange((count - 1) * around)
     two = one - one % around + (one + 1) % around
     triangles = np.concatenate(
@@ -260,10 +268,12 @@ def _stacked(moves: list[Floats], count: int) -> Floats:
 
 def _limb_borders(points: Floats, skeleton: Skeleton) -> list[tuple[Floats, str, str]]:
     """Trunk up to the shoulders and to a line from the crotch to the hips' outside; limbs beyond."""
-    pelvis, shoulder = skeleton.rest_joints[0], skeleton.rest_joints[skeleton.index("left_shoulder")]
+    pelvis = skeleton.rest_joints[0]
+    shoulder = skeleton.rest_joints[skeleton.index("left_shoulder")]
     out = []
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        x, y = sign * (points[:, 0] - pelvis[0]), points[:, 1] - pelvis[1]
+        x = sign * (points[:, 0] - pelvis[0])
+        y = points[:, 1] - pelvis[1]
         arm = np.where(points[:, 1] > shoulder[1] - 0.15, x - (shoulder[0] + 0.01), -1.0)
         leg = np.where(x > -0.02, 0.8 * (-0.155 + 0.75 * np.maximum(x, 0) - y), -1.0)
         beyond = np.maximum(arm, np.minimum(leg, x + 1e-4))
@@ -281,9 +291,11 @@ def flattened(piece: Piece) -> tuple[Piece, NDArray[np.int64]]:
     size = np.linalg.norm(
         np.cross(*(piece.vertices[triangles[:, k]] - piece.vertices[triangles[:, 0]] for k in (1, 2))), axis=1
     )
-    triangles, paint = triangles[size > 1e-12], piece.paint[size > 1e-12]
+    triangles = triangles[size > 1e-12]
+    paint = piece.paint[size > 1e-12]
     middle = piece.vertices[triangles].mean(axis=1)
-    low, high = middle.min(axis=0), middle.max(axis=0)
+    low = middle.min(axis=0)
+    high = middle.max(axis=0)
     cells = ((middle - low) / (high - low).max() * 1023).astype(np.int64)
     curve = np.zeros(len(cells), dtype=np.int64)
     for bit in range(10):
@@ -312,7 +324,8 @@ def flattened(piece: Piece) -> tuple[Piece, NDArray[np.int64]]:
 def packed(detail: str) -> dict[str, NDArray[np.generic]]:
     """The arrays of one detail."""
     piece, swatch = flattened(make_detail(detail))
-    low, high = piece.vertices.min(axis=0), piece.vertices.max(axis=0)
+    low = piece.vertices.min(axis=0)
+    high = piece.vertices.max(axis=0)
     step = (high - low) / 65535
     order = np.argsort(-piece.weights, axis=1, kind="stable")[:, :4]
     shares = np.take_along_axis(piece.weights, order, axis=1)

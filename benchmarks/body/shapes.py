@@ -28,7 +28,8 @@ _KNUCKLE = {"index": 0.0108, "middle": 0.0112, "ring": 0.0104, "pinky": 0.0092, 
 
 def trunk_and_limbs(skeleton: Skeleton) -> Field:
     """Everything but hands and head."""
-    rest, at = skeleton.rest_joints, skeleton.index
+    rest = skeleton.rest_joints
+    at = skeleton.index
     out: list[Capsule] = []
 
     def place(joint: str, *move: float) -> Floats:
@@ -81,10 +82,12 @@ def trunk_and_limbs(skeleton: Skeleton) -> Field:
 
 def hand(skeleton: Skeleton, side: str) -> Field:
     """Palm, fingers and thumb, and the forearm as far as it is inside its sleeve."""
-    rest, at = skeleton.rest_joints, skeleton.index
+    rest = skeleton.rest_joints
+    at = skeleton.index
     wrist = rest[at(f"{side}_wrist")]
     out: list[Capsule] = []
-    palm, bone = at(f"{side}_wrist"), skeleton.offsets[at(f"{side}_wrist")]
+    palm = at(f"{side}_wrist")
+    bone = skeleton.offsets[at(f"{side}_wrist")]
     out.append(Capsule(at(f"{side}_elbow"), wrist - 0.26 * bone, wrist - 0.02 * bone, 0.0275, 0.0235, 0.92))
     out.append(Capsule(palm, wrist, wrist + 0.06 * bone, 0.023, 0.021, 0.95))
     for finger in SPREAD:
@@ -144,9 +147,13 @@ def cuff(skeleton: Skeleton, side: str) -> Floats:
 
 def head(skeleton: Skeleton) -> Field:
     """Neck, skull and jaw. Only the skull turns with the head joint."""
-    rest, at = skeleton.rest_joints, skeleton.index
-    centre, neck, top = head_centre(skeleton), rest[at("neck")], rest[at("head")]
-    turn, bend = at("head"), at("neck")
+    rest = skeleton.rest_joints
+    at = skeleton.index
+    centre = head_centre(skeleton)
+    neck = rest[at("neck")]
+    top = rest[at("head")]
+    turn = at("head")
+    bend = at("neck")
     wide = HEAD_SIZE[0]
 
     def place(x: float, y: float, z: float) -> Floats:
@@ -171,18 +178,22 @@ def head(skeleton: Skeleton) -> Field:
 
 def nose(skeleton: Skeleton) -> Field:
     """The nose, a shape of its own: it would melt away at the head's softness."""
-    centre, turn = head_centre(skeleton), skeleton.index("head")
-    bridge, tip = centre + _move(0, 0.012, 0.082), centre + _move(0, -0.026, 0.1)
+    centre = head_centre(skeleton)
+    turn = skeleton.index("head")
+    bridge = centre + _move(0, 0.012, 0.082)
+    tip = centre + _move(0, -0.026, 0.1)
     wings = []
     for sign in (-1.0, 1.0):
-        inner, outer = centre + _move(0.004 * sign, -0.03, 0.09), centre + _move(0.0095 * sign, -0.032, 0.088)
+        inner = centre + _move(0.004 * sign, -0.03, 0.09)
+        outer = centre + _move(0.0095 * sign, -0.032, 0.088)
         wings.append(Capsule(turn, inner, outer, 0.008, 0.0075))
     return Field([Capsule(turn, bridge, tip, 0.0075, 0.0105), *wings], 0.003)
 
 
 def hair(skeleton: Skeleton) -> Field:
     """Short hair, parted at the side: what of it is outside the skull shows."""
-    centre, turn = head_centre(skeleton), skeleton.index("head")
+    centre = head_centre(skeleton)
+    turn = skeleton.index("head")
     strands = [
         ((0, 0.042, -0.022), (0, 0.042, -0.004), 0.083, 0.079),
         ((0, 0.01, -0.04), (0, -0.048, -0.05), 0.074, 0.048),
@@ -198,7 +209,8 @@ def hair(skeleton: Skeleton) -> Field:
 
 def ears(skeleton: Skeleton) -> Field:
     """Two ears, each a rim around a hollow."""
-    centre, turn = head_centre(skeleton), skeleton.index("head")
+    centre = head_centre(skeleton)
+    turn = skeleton.index("head")
     rim = np.array(
         [[77, 10, 8], [83, 24, 3], [89, 29, -10], [92, 20, -22], [91, 2, -23], [85, -17, -12], [80, -29, 0]]
     )  # fmt: skip
@@ -207,7 +219,8 @@ def ears(skeleton: Skeleton) -> Field:
         move = np.array([sign, 1.0, 1.0]) / 1000
         for a, b in pairwise(rim):
             out.append(Capsule(turn, centre + a * move, centre + b * move, 0.0055, 0.0055))
-        inner, lobe = np.array([80, 15, -9]) * move, np.array([78, -18, -3]) * move
+        inner = np.array([80, 15, -9]) * move
+        lobe = np.array([78, -18, -3]) * move
         out.append(Capsule(turn, centre + inner, centre + lobe, 0.0105, 0.0075))
     return Field(out, 0.0025)
 

@@ -83,7 +83,9 @@ def glb_clip(folder: Path) -> bytes:
     save(folder / "made.glb", GeneratedMotion(Prompt("walks"), features, joints, None, layout, seed=1))
     raw = (folder / "made.glb").read_bytes()
     end = 20 + int.from_bytes(raw[12:16], "little")
-    scene, blob, kept = json.loads(raw[20:end]), raw[end + 8 :], b""
+    scene = json.loads(raw[20:end])
+    blob = raw[end + 8 :]
+    kept = b""
     scene["meshes"] = scene["materials"] = []
     used = {
         place
@@ -363,8 +365,8 @@ def _splits(folder: Path) -> Made:
         (tree / f"{name}.txt").write_bytes(ids.encode())
 
     def read(_: str) -> object:
-        splits, _notes = read_split_files(tree)
-        keep_mirrors_together(splits, tree)
-        return splits
+        lists = read_split_files(tree)
+        keep_mirrors_together(lists.splits, tree)
+        return lists
 
     return of_tree(tree, {".txt": damaged_text}, read)

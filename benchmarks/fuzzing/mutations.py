@@ -232,7 +232,8 @@ def damaged_value(random: Random, value: Any, depth: int = 0) -> Any:
     """A value with one place in it changed: another value or kind, a key more or less, a list longer."""
     if isinstance(value, dict | list) and value and (random.random() < 0.85 or depth == 0) and depth < 40:
         keys = list(value) if isinstance(value, dict) else list(range(len(value)))
-        key, inner = random.choice(keys), random.random()
+        key = random.choice(keys)
+        inner = random.random()
         out = dict(value) if isinstance(value, dict) else list(value)
         if inner < 0.7:
             out[key] = damaged_value(random, value[key], depth + 1)

@@ -48,7 +48,8 @@ def damaged_npy(random: Random, data: bytes, other: bytes) -> bytes:
     wide = data[6] > 1
     length = int.from_bytes(data[8 : 12 if wide else 10], "little")
     begin = 12 if wide else 10
-    header, body = data[begin : begin + length].decode("latin1"), bytearray(data[begin + length :])
+    header = data[begin : begin + length].decode("latin1")
+    body = bytearray(data[begin + length :])
     match random.randrange(6):
         case 0:
             shape = re.search(r"'shape': \(([^)]*)\)", header)
@@ -154,7 +155,8 @@ def damaged_pickle(random: Random, data: bytes, other: bytes) -> bytes:
     starts = [place or 0 for _, _, place in codes] + [len(data)]
     pieces = [data[a:b] for a, b in pairwise(starts)]
     for _ in range(random.choice((1, 1, 2, 4))):
-        at, to = random.randrange(len(pieces)), random.randrange(len(pieces))
+        at = random.randrange(len(pieces))
+        to = random.randrange(len(pieces))
         match random.randrange(6):
             case 0 if len(pieces) > 2:
                 del pieces[at]
@@ -206,7 +208,8 @@ def damaged_safetensors(random: Random, data: bytes, other: bytes) -> bytes:
     if random.random() < 0.12:
         return damaged_bytes(random, data, other)
     end = 8 + int.from_bytes(data[:8], "little")
-    header, body = data[8:end], data[end:]
+    header = data[8:end]
+    body = data[end:]
     if random.random() < 0.7:
         header = _damaged_header(random, header)
     else:
@@ -299,7 +302,8 @@ def damaged_glb(random: Random, data: bytes, other: bytes) -> bytes:
     if random.random() < 0.12:
         return damaged_bytes(random, data, other)
     length = int.from_bytes(data[12:16], "little")
-    text, rest = data[20 : 20 + length], data[20 + length + 8 :]
+    text = data[20 : 20 + length]
+    rest = data[20 + length + 8 :]
     if random.random() < 0.7:
         text = damaged_json(random, text, text)
     else:

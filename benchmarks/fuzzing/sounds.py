@@ -25,7 +25,9 @@ def _table(polynomial: int, bits: int) -> tuple[int, ...]:
 
 def _crc(data: bytes, polynomial: int, bits: int) -> int:
     """The checksum of FLAC (8 and 16 bits) and of OGG (32): high bit first, from 0."""
-    table, value, mask = _table(polynomial, bits), 0, (1 << bits) - 1
+    table = _table(polynomial, bits)
+    value = 0
+    mask = (1 << bits) - 1
     for byte in data:
         value = ((value << 8) & mask) ^ table[(value >> (bits - 8)) ^ byte]
     return value
@@ -34,9 +36,11 @@ def _crc(data: bytes, polynomial: int, bits: int) -> int:
 @lru_cache(maxsize=32)
 def _flac_frames(data: bytes) -> tuple[int, tuple[tuple[int, int, int], ...]]:
     """End of the metadata; and start, end of the header and end of each frame."""
-    at, last = 4, False
+    at = 4
+    last = False
     while not last:
-        last, at = bool(data[at] & 128), at + 4 + int.from_bytes(data[at + 1 : at + 4], "big")
+        last = bool(data[at] & 128)
+        at = at + 4 + int.from_bytes(data[at + 1 : at + 4], "big")
     starts = []
     place = data.find(b"\xff", at)
     while 0 <= place < len(data) - 16:
@@ -48,7 +52,8 @@ def _flac_frames(data: bytes) -> tuple[int, tuple[tuple[int, int, int], ...]]:
                     break
         place = data.find(b"\xff", place + 1)
     # A sync within a frame's numbers is none: a frame ends in the sum of all of it.
-    frames, ends = [], [start for start, _ in starts] + [len(data)]
+    frames = []
+    ends = [start for start, _ in starts] + [len(data)]
     begin = 0
     while begin < len(starts):
         for stop in range(begin + 1, len(ends)):
@@ -108,7 +113,8 @@ def damaged_ogg(random: Random, data: bytes, other: bytes) -> bytes:
     """An OGG with pages damaged, left out, repeated or exchanged, whose sums are right."""
     if random.random() < 0.12:
         return damaged_bytes(random, data, other)
-    pages, at = [], 0
+    pages = []
+    at = 0
     while data[at : at + 4] == b"OggS":
         count = data[at + 26]
         size = 27 + count + sum(data[at + 27 : at + 27 + count])
@@ -126,7 +132,8 @@ def damaged_ogg(random: Random, data: bytes, other: bytes) -> bytes:
                 pages.insert(random.randrange(len(pages)), bytearray(page))
             case 2:
                 to = random.randrange(len(pages))
-                pages[number], pages[to] = pages[to], page
+                pages[number] = pages[to]
+                pages[to] = page
             case 3:
                 place = random.choice((4, 5, *range(6, 22), 26))
                 page[place] = random.choice((0, 1, 2, 4, 255, page[place] ^ (1 << random.randrange(8))))
@@ -149,7 +156,8 @@ _RATES_2 = (0, 8, 16, 24, 32, 40, 48, 56, 64, 80, 96, 112, 128, 144, 160)
 @lru_cache(maxsize=32)
 def _mp3_frames(data: bytes) -> tuple[tuple[int, int], ...]:
     """Start and end of each frame of layer III."""
-    frames, at = [], max(0, data.find(b"\xff"))
+    frames = []
+    at = max(0, data.find(b"\xff"))
     while at + 4 <= len(data) and data[at] == 0xFF and data[at + 1] & 0xE6 == 0xE2:
         first = data[at + 1] & 0x18 == 0x18
         half = {0x18: 0, 0x10: 1, 0x00: 2}.get(data[at + 1] & 0x18, 0)
@@ -168,7 +176,8 @@ def damaged_mp3(random: Random, data: bytes, other: bytes) -> bytes:
     found = _mp3_frames(data)
     if random.random() < 0.12 or len(found) < 3:
         return damaged_bytes(random, data, other)
-    head, frames = data[: found[0][0]], [bytearray(data[a:b]) for a, b in found]
+    head = data[: found[0][0]]
+    frames = [bytearray(data[a:b]) for a, b in found]
     for _ in range(random.choice((1, 1, 2, 3))):
         at = random.randrange(len(frames))
         frame = frames[at]
@@ -208,7 +217,8 @@ def damaged_wav(random: Random, data: bytes, other: bytes) -> bytes:
     """A WAV with its chunks changed, exchanged or repeated; lengths are right or are the damage."""
     if random.random() < 0.2:
         return damaged_bytes(random, data, other)
-    chunks, at = [], 12
+    chunks = []
+    at = 12
     while at + 8 <= len(data):
         size = int.from_bytes(data[at + 4 : at + 8], "little")
         chunks.append((data[at : at + 4], bytearray(data[at + 8 : at + 8 + size])))

@@ -67,7 +67,8 @@ def _shard(folder: Path) -> Made:
 
     def read(file: str) -> object:
         clips = scan_tar(root / file)
-        manifest, content = json.loads(before), (root / file).read_bytes()
+        manifest = json.loads(before)
+        content = (root / file).read_bytes()
         stated = next(shard for shard in manifest["shards"] if shard["name"] == file)
         stated |= {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
         (root / "manifest.json").write_bytes(_json(manifest))  # as whoever changes a file would do it

@@ -205,7 +205,8 @@ def glb(root: Path) -> Path:
     """A character of which one animation turns the hips, and moves them."""
     root.mkdir()
     nodes = character(root / "turn.glb", "unreal")
-    rig, angles = Gltf.read(root / "turn.glb"), np.linspace(0, 1, 31)
+    rig = Gltf.read(root / "turn.glb")
+    angles = np.linspace(0, 1, 31)
     turns = np.stack([0 * angles, np.sin(angles), 0 * angles, np.cos(angles)], axis=1)
     moved = np.stack([angles, 1 + 0 * angles, 0 * angles], axis=1)
     rig.animate(
@@ -242,7 +243,8 @@ _RAISED = re.compile(r"[A-Za-z_.]*(Error|Exception|Warning|Interrupt|Exit): ")
 def source_of(name: str, folder: Path) -> tuple[list[Seed], Read]:
     """Seeds of a converter: each file of its source; read by the plan, and by converting its clip."""
     make, options = TREES[name]
-    tree, kind = make(folder / name), converter_named(name)
+    tree = make(folder / name)
+    kind = converter_named(name)
     placed = {
         key: tuple(tree / one for one in value)
         if isinstance(value, tuple)

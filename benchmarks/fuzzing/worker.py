@@ -89,7 +89,9 @@ class Worker:
     """Reads inputs of one reader in children, one after the other."""
 
     def __init__(self, reader: Reader, seed: int, failing: Path) -> None:
-        self.reader, self.seed, self.failing = reader, seed, failing
+        self.reader = reader
+        self.seed = seed
+        self.failing = failing
         self._shared = mmap.mmap(-1, mmap.PAGESIZE)
 
     def run(self, first: int, count: int, seconds: float = float("inf")) -> Count:
@@ -103,7 +105,8 @@ class Worker:
                     _genuine(self.reader.name, seed, read)
                 died = False
                 while total.inputs < count and total.cpu_seconds < seconds and not died:
-                    at, left = first + total.inputs, (count - total.inputs, seconds - total.cpu_seconds)
+                    at = first + total.inputs
+                    left = (count - total.inputs, seconds - total.cpu_seconds)
                     part, died = self._child(seeds, read, at, *left)
                     total.add(part)
         return total
@@ -136,7 +139,8 @@ class Worker:
             setattr(found, kind, getattr(found, kind) + 1)
             found.places[place] = found.places.get(place, 0) + 1
         if ended:
-            found.inputs, found.unexpected = found.inputs + 1, found.unexpected + 1
+            found.inputs = found.inputs + 1
+            found.unexpected = found.unexpected + 1
             place = f"process ended by {ended}"
             found.places[place] = found.places.get(place, 0) + 1
             number = first + found.inputs - 1
@@ -145,7 +149,9 @@ class Worker:
 
     def _watch(self, child: int) -> str | int:
         """Wait for a child; the signal by which it ended, or its code, or `hang`."""
-        seen, since, used = -1, time.monotonic(), 0.0
+        seen = -1
+        since = time.monotonic()
+        used = 0.0
         while True:
             done, status = os.waitpid(child, os.WNOHANG)
             if done:
@@ -159,7 +165,9 @@ class Worker:
                 fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
                 now = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
                 if number != seen:
-                    seen, since, used = number, time.monotonic(), now
+                    seen = number
+                    since = time.monotonic()
+                    used = now
                 elif now - used > _HANGS or (time.monotonic() - since > 3 * _HANGS and now - used < 0.2):
                     os.kill(child, signal.SIGKILL)
                     os.waitpid(child, 0)
@@ -194,7 +202,8 @@ class Worker:
                 os.write(notes, f"{kind} {place}\n".encode("utf-8", "replace"))
                 self._keep(place, seed, content, number)
             counts[0] += 1
-            slowest, largest = max(slowest, used), max(largest, grown / 2**20)
+            slowest = max(slowest, used)
+            largest = max(largest, grown / 2**20)
             spent = time.process_time() - began
             self._shared[: _ROW.size] = _ROW.pack(*counts, slowest, largest, spent)
             # The most memory is known for a whole process alone: who follows starts anew.
@@ -217,7 +226,9 @@ def _genuine(name: str, seed: Seed, read: Read) -> None:
 
 def _tried(read: Read, seed: Seed, content: bytes) -> tuple[str, float, int]:
     """`refused`, `taken` or what was wrong and where; CPU seconds; bytes that the process has grown by."""
-    most, here, began = _peak(), _size(), time.process_time()
+    most = _peak()
+    here = _size()
+    began = time.process_time()
     try:
         read(seed, content)
         fault = "taken"
@@ -229,7 +240,8 @@ def _tried(read: Read, seed: Seed, content: bytes) -> tuple[str, float, int]:
         )
     except BaseException as error:
         fault = _place(error)
-    used, peak = time.process_time() - began, _peak()
+    used = time.process_time() - began
+    peak = _peak()
     return fault, used, max(0, peak - here) if peak > most else 0
 
 

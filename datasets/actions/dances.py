@@ -41,7 +41,8 @@ class MeasuredDance(NamedTuple):
 def measure_dance(joints: NDArray[np.floating], fps: float) -> MeasuredDance:
     """The dance of joints [T, N >= 22, 3] (metres, Y up)."""
     signals = signals_of(joints, fps)
-    root, heading = signals.joints[:, 0], signals.heading
+    root = signals.joints[:, 0]
+    heading = signals.heading
     aside = (root[:, 0] - root[:, 0].mean()) * np.cos(heading)
     aside -= (root[:, 2] - root[:, 2].mean()) * np.sin(heading)
     style: Style = "bounce" if float(np.std(root[:, 1])) > float(np.std(aside)) else "sway"

@@ -133,7 +133,8 @@ def _cuts(frames: int, fps: float) -> range:
 
 
 def _action(s: Signals) -> str:
-    moved, turned = abs(float(s.travel[-1])), abs(_turned(s))
+    moved = abs(float(s.travel[-1]))
+    turned = abs(_turned(s))
     # From signs that no other action shows to those that several share, so that each test may assume that
     # the ones before it failed. First who is on the floor.
     if np.percentile(s.drop, 10) > 0.3 and np.median(s.trunk) > 0.9:
@@ -172,7 +173,8 @@ def _action(s: Signals) -> str:
 
 
 def _arm_action(s: Signals) -> str:
-    waves, tops = [_waves(s, side) for side in (0, 1)], s.wrists[:, :, 1].max(1)
+    waves = [_waves(s, side) for side in (0, 1)]
+    tops = s.wrists[:, :, 1].max(1)
     if max(waves) >= 3:
         return "wave"
     if tops.min() > 0.35 and (np.abs(s.aside).max() > ASIDE or s.drop.min() < -0.02):
@@ -198,7 +200,8 @@ def _reach_or_point(s: Signals) -> str:
 def _attributes(s: Signals, action: str) -> Record:
     """Return direction, side, count, speed or tempo as `action` defines them."""
     if action in ("walk", "run"):
-        backward, turned = s.travel[-1] < 0, _turned(s)
+        backward = s.travel[-1] < 0
+        turned = _turned(s)
         way = "backward" if backward else "forward"
         if abs(turned) > CIRCLE:
             way = "counterclockwise" if turned > 0 else "clockwise"

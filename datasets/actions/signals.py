@@ -25,7 +25,10 @@ THIGH, SHIN = (float(np.linalg.norm(_REST.offsets[joint])) for joint in (4, 7))
 """Metres from hip to knee and from knee to ankle."""
 _STANDING = 25
 """Percent of the frames, at least, in which runners and jumpers have a foot on the floor."""
-BALLS, _ANKLES, _SHOULDERS, _WRISTS = (10, 11), (7, 8), (16, 17), (20, 21)
+BALLS = (10, 11)
+_ANKLES = (7, 8)
+_SHOULDERS = (16, 17)
+_WRISTS = (20, 21)
 
 
 @dataclass(frozen=True)
@@ -88,7 +91,8 @@ def signals_of(joints: NDArray[np.floating], fps: float) -> Signals:
     heading = smooth(np.unwrap(np.arctan2(-hips[:, 2], hips[:, 0])), 0.08, fps)
     forward = np.stack([np.sin(heading), np.cos(heading)], axis=-1)
     left = np.stack([np.cos(heading), -np.sin(heading)], axis=-1)
-    root, feet = x[:, 0], x[:, BALLS].mean(1)
+    root = x[:, 0]
+    feet = x[:, BALLS].mean(1)
     # Steps are projected on the heading before they are summed: a circle goes forward all the way.
     step = np.diff(feet[:, [0, 2]], axis=0)
     travel = np.concatenate([[0.0], np.cumsum((step * 0.5 * (forward[1:] + forward[:-1])).sum(-1))])
@@ -134,7 +138,8 @@ def rise_time(signal: Array, fps: float) -> float:
 
     Infinite for a signal that never rises (a generated motion may do nothing); never less than a frame.
     """
-    low, high = float(signal[0]), float(signal.max())
+    low = float(signal[0])
+    high = float(signal.max())
     if high - low < 1e-6:
         return math.inf
     share = (signal - low) / (high - low)

@@ -77,7 +77,9 @@ def _filters() -> NDArray[np.float32]:
     """[1025, 64]: each band rises from the centre of the one below to its own and falls to the next."""
     hertz = np.fft.rfftfreq(_FFT, 1 / RATE)[:, None]
     points = _centres()
-    below, centre, above = points[:-2], points[1:-1], points[2:]
+    below = points[:-2]
+    centre = points[1:-1]
+    above = points[2:]
     shape = np.minimum((hertz - below) / (centre - below), (above - hertz) / (above - centre))
     return np.maximum(shape, 0).astype(np.float32)
 
@@ -98,7 +100,8 @@ class BeatNet(nn.Module):
     def __init__(self, config: BeatNetConfig) -> None:
         super().__init__()
         self.config = config
-        width, kernel = config.width, config.kernel
+        width = config.width
+        kernel = config.kernel
         self.first = nn.Conv1d(BANDS, width, kernel, padding="same")
         dilations = [2**layer for layer in range(config.layers)]
         self.heard = nn.ModuleList(

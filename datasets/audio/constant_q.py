@@ -36,15 +36,20 @@ def constant_q(samples: NDArray[np.float32], rate: int, octaves: int) -> NDArray
     # A sound with room above the highest filter is first brought down; frames must begin at whole samples.
     room = int(np.ceil(np.log2(rate / 2 / _lengths(frequencies, rate)[1]))) - 2
     down = 2 ** max(0, min(room, 10 - octaves))
-    samples, hop, top = _slower(samples, down), HOP // down, rate / down
+    samples = _slower(samples, down)
+    hop = HOP // down
+    top = rate / down
     lengths = _lengths(frequencies, top)[0]
-    own, parts = top, []
+    own = top
+    parts = []
     for octave in range(octaves - 1, -1, -1):
         part = slice(octave * BINS, (octave + 1) * BINS)
         basis = _basis(frequencies[part], lengths[part] * own / top, own) * np.float32(np.sqrt(top / own))
         parts.append(basis @ stft(samples, np.ones(2 * basis.shape[1] - 2, dtype=np.float32), hop))
         if hop % 2 == 0:
-            samples, hop, own = _slower(samples, 2), hop // 2, own / 2
+            samples = _slower(samples, 2)
+            hop = hop // 2
+            own = own / 2
     frames = min(part.shape[1] for part in parts)
     spectrum = np.concatenate([part[:, :frames] for part in reversed(parts)])
     return np.asarray(np.abs(spectrum) / np.sqrt(lengths)[:, None], dtype=np.float32)

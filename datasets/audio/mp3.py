@@ -51,7 +51,8 @@ def unheard() -> Iterator[None]:
 
 def _turn_aside() -> tuple[int, threading.Thread]:
     """A copy of standard error, which is a pipe from now on, and the thread that empties that."""
-    own, onward = os.dup(_STDERR), os.dup(_STDERR)
+    own = os.dup(_STDERR)
+    onward = os.dup(_STDERR)
     out, into = os.pipe()
     os.dup2(into, _STDERR)
     os.close(into)

@@ -160,7 +160,8 @@ def _moving_mean(values: NDArray[np.floating], width: int) -> NDArray[np.float64
     # Differences of running sums: the cost does not depend on the width.
     sums = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
     rows = np.arange(len(values))
-    first, last = np.maximum(rows - width // 2, 0), np.minimum(rows + width // 2 + 1, len(values))
+    first = np.maximum(rows - width // 2, 0)
+    last = np.minimum(rows + width // 2 + 1, len(values))
     return np.asarray((sums[last] - sums[first]) / (last - first))
 
 

@@ -71,13 +71,15 @@ class Excerpt:
     @classmethod
     def named(cls, name: Path | str) -> Excerpt:
         """Parse a name; `UserError`, naming it, for times that are none."""
-        whole, match = Path(name), _PART.fullmatch(str(name))
+        whole = Path(name)
+        match = _PART.fullmatch(str(name))
         if match is None or is_file(whole):
             return cls(whole)
         file, start, dash, end = match.group("file", "start", "dash", "end")
         if not dash or not (start or end):
             raise UserError(f"{name}: no such file; a part of {file} is written {Path(file).name}@0:30-1:00")
-        first, last = _seconds(start or "0", name), None if not end else _seconds(end, name)
+        first = _seconds(start or "0", name)
+        last = None if not end else _seconds(end, name)
         if last is not None and last <= first:
             raise UserError(f"{name}: its end, {end}, is not after its start, {start}; swap them")
         if last is not None and last - first < _LEAST and "." in f"{start}{end}":
@@ -230,7 +232,8 @@ def resampled_length(samples: int, rate_in: int, rate_out: int) -> int:
 
 def _mono(file: Any, name: str, count: int) -> Iterator[NDArray[np.float32]]:
     """The first `count` samples as mono blocks [n], checked and clipped; tags after them are not decoded."""
-    at, most = 0, max(1, _BLOCK // file.channels)
+    at = 0
+    most = max(1, _BLOCK // file.channels)
     while len(block := file.read(min(most, count - at), dtype="float32", always_2d=True)):
         if (
             at % most
@@ -265,7 +268,8 @@ def _length(path: Path, name: str) -> tuple[int, int]:
     """(samples, rate) of a sound file; `UserError` for those that cannot be."""
     _check_header(path, name)
     with _opened(path, name) as file:
-        samples, rate = int(file.frames), int(file.samplerate)
+        samples = int(file.frames)
+        rate = int(file.samplerate)
         if samples == _UNKNOWN:
             samples = sum(len(block) for block in _mono(file, name, MAX_SECONDS * rate + 1))
     if samples <= 0:

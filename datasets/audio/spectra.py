@@ -84,7 +84,8 @@ def separate(samples: Array, rate: int) -> Spectra:
         magnitude = np.abs(spectrum)
         mel[:, piece.frames] = _mel(magnitude, rate)[:, piece.inside]
         # Notes are steady along time and percussion along frequency: medians each way tell them apart.
-        steady, sudden = _row_medians(magnitude), _row_medians(magnitude.T).T
+        steady = _row_medians(magnitude)
+        sudden = _row_medians(magnitude.T).T
         soft = _softmask(steady, sudden)
         shares = [_istft(spectrum * mask, len(piece.samples)) for mask in (soft, 1 - soft)]
         own = shares[0][piece.inside.start * HOP : piece.inside.stop * HOP]
@@ -163,7 +164,8 @@ def _pieces(samples: Array) -> Iterator[_Piece]:
     for start in range(0, count, _PIECE):
         stop = min(start + _PIECE, count)
         # The last piece takes the rest as it is.
-        first, last = max(0, start - _MARGIN), stop + _MARGIN
+        first = max(0, start - _MARGIN)
+        last = stop + _MARGIN
         around = samples[first * HOP :] if last >= count else samples[first * HOP : (last - 1) * HOP]
         yield _Piece(around, slice(start, stop), slice(start - first, stop - first))
 

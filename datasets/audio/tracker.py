@@ -87,7 +87,8 @@ def _given(times: NDArray[np.float64], heard: NDArray[np.float32]) -> Beats:
 
 def decode(probabilities: NDArray[np.float32]) -> Beats:
     """Return the beats of probabilities [T, 2] of beats and downbeats."""
-    beat, downbeat = probabilities[:, 0], probabilities[:, 1]
+    beat = probabilities[:, 0]
+    downbeat = probabilities[:, 1]
     rows = beat_rows(beat)
     places, meter = bar_places(_peak(downbeat, rows))
     confidence = 0.0
@@ -118,7 +119,8 @@ def beat_rows(activation: NDArray[np.float32]) -> NDArray[np.int64]:
     # The best end is a beat in the padding behind the piece; from there the path is followed back.
     after = len(gain) - int(periods[-1])
     back, now = divmod(int(score[after:].argmax()), len(periods))
-    rows, row = [], after + back
+    rows = []
+    row = after + back
     while row >= periods[-1]:
         rows.append(row - periods[-1])
         now = came[row, now]
@@ -133,7 +135,8 @@ def bar_places(downbeats: NDArray[np.float32]) -> tuple[NDArray[np.int64], int]:
     Bars go on through the piece; where music was cut, one may begin out of turn.
     """
     kept = np.clip(downbeats, *_OFTEN).astype(np.float64)
-    on, off = np.log(kept), np.log1p(-kept)
+    on = np.log(kept)
+    off = np.log1p(-kept)
     counts = {meter: _count_bars(on, off, meter) for meter in METERS}
     meter = max(METERS, key=lambda one: counts[one][1])
     return counts[meter][0], meter

@@ -18,7 +18,9 @@ class UserError(Exception):
     """
 
     def __init__(self, words: str = "") -> None:
-        lines, half, said = list[str](), _LONGEST // 2, words.split("\n")
+        lines = list[str]()
+        half = _LONGEST // 2
+        said = words.split("\n")
         if len(said) > _MOST_LINES:  # names of strangers may hold line breaks
             said[_MOST_LINES - 2 : -1] = ["…"]
         for line in said:

@@ -21,7 +21,8 @@ _SHOWN = 5
 def no_such_folder(folder: Path) -> str:
     """One sentence about a folder that is not there, with the nearest names that are. Raises for a URL."""
     require_local(folder)
-    place, name = folder, folder.name
+    place = folder
+    name = folder.name
     while not place.is_dir() and place != place.parent:
         place, name = place.parent, place.name
     try:

@@ -30,7 +30,9 @@ class Pace:
     """Decides when a line is due, and estimates the time that the rest takes at the speed so far."""
 
     def __init__(self, total: int, first: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
-        self.total, self.first, self._clock = total, first, clock
+        self.total = total
+        self.first = first
+        self._clock = clock
         self._began = self._said = clock()
 
     def due(self, done: int) -> bool:
@@ -47,7 +49,8 @@ class Pace:
 
     def left(self, done: int) -> str:
         """The time that the rest takes, in words; nothing where that cannot be said."""
-        rest, speed = self.total - done, self.speed(done)
+        rest = self.total - done
+        speed = self.speed(done)
         return f"{duration(rest / speed)} left" if rest > 0 and speed > 0 else ""
 
 
@@ -64,7 +67,8 @@ class Meter:
         shown: bool = True,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._name, self._done = name, done
+        self._name = name
+        self._done = done
         self._console = console or Console(highlight=False)
         self._shown = shown and not self._console.quiet
         self._pace = Pace(total, done, clock)

@@ -24,7 +24,8 @@ from typing import Any, TypeVar
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of, sha256_of_json
 
-GROUP, VARIABLE = "motionloom.stages", "MOTIONLOOM_STAGES"
+GROUP = "motionloom.stages"
+VARIABLE = "MOTIONLOOM_STAGES"
 
 T = TypeVar("T")
 
@@ -35,7 +36,8 @@ class Table(Mapping[str, T]):
     """
 
     def __init__(self, of: type, called: str, *, classes: bool = False) -> None:
-        self.called, self.classes = called, classes
+        self.called = called
+        self.classes = classes
         self.followers: list[Callable[[T], object]] = []
         self._things: dict[str, T] = {}
         _TABLES[of] = self

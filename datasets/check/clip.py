@@ -75,10 +75,13 @@ def beyond(
     frame = int(np.abs(motion[:, column]).argmax())
     part = next(name for name, _ in layout.fields if column < layout.slice(name).stop)
     at = column - layout.slice(part).start
-    value, most, unit = float(motion[frame, column]), float(limits[column]), ""
+    value = float(motion[frame, column])
+    most = float(limits[column])
+    unit = ""
     if part in _PER_SECOND:
         unit = " rad/s" if part == "root_yaw_velocity" else " m/s"
-        value, most = value * layout.fps, most * layout.fps
+        value = value * layout.fps
+        most = most * layout.fps
     return f"{part}[{at}] is {value:.4g}{unit} at frame {frame}; at most {most:.4g} is sensible"
 
 

@@ -65,7 +65,8 @@ class Figures:
 
     def __init__(self, layout: MotionLayout) -> None:
         self._layout = layout
-        self._all, self._folders = PlausibilityStats(), dict[str, PlausibilityStats]()
+        self._all = PlausibilityStats()
+        self._folders = dict[str, PlausibilityStats]()
         # Parameters may stay on the floor of their source.
         self._on_zero = layout.family != "raw"
 
@@ -118,7 +119,8 @@ def examine(root: Path, *, progress: bool = False) -> CheckReport:
     except UserError as error:
         problem = Problem(str(root), str(error).removeprefix(f"{root}: "))
         return CheckReport([problem], [], {"manifest": 1}, {}, 0, 0)
-    findings, frames = Findings(), 0
+    findings = Findings()
+    frames = 0
     _stray_files(root, manifest, findings)
     table = ClipTable(root, manifest.shards, layout)
     figures = Figures(layout)

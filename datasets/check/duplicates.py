@@ -68,7 +68,9 @@ class ClipTable:
     """Every clip seen, in reading order."""
 
     def __init__(self, root: Path, shards: list[ShardInfo], layout: MotionLayout) -> None:
-        self.root, self.shards, self.layout = root, shards, layout
+        self.root = root
+        self.shards = shards
+        self.layout = layout
         self._clips: list[_Seen] = []
         self._signatures: list[NDArray[np.float32]] = []
 
@@ -101,7 +103,8 @@ class ClipTable:
         first = next((clip for clip in clips if clip.id == original), clips[0])
         of = "which is" if first.id == original else f"as '{first.id}' does"
         for clip in clips:
-            split, there = self._split(clip), self._split(first)
+            split = self._split(clip)
+            there = self._split(first)
             if clip.id != original and split != there:
                 message = f"mirrors '{original}', {of} in split '{there}', not '{split}'"
                 findings.error("mirror image in another split", self._where(clip), message)
@@ -109,8 +112,10 @@ class ClipTable:
     def _same_motions(self, findings: Findings) -> None:
         told: set[tuple[int, bool]] = set()
         for earlier, later, shift in near(self._signatures):
-            one, two = self._clips[earlier], self._clips[later]
-            split, other = self._split(two), self._split(one)
+            one = self._clips[earlier]
+            two = self._clips[later]
+            split = self._split(two)
+            other = self._split(one)
             apart = split != other
             # A family in two splits has been reported already.
             if one.id == two.id or (later, apart) in told or (apart and one.family == two.family):
@@ -193,9 +198,11 @@ def near(signatures: list[NDArray[np.float32]]) -> Iterator[tuple[int, int, int]
     reach = REACH_METRES * np.sqrt(points.shape[1])
     _, found = KDTree(few).query(few[asked], k=most, distance_upper_bound=reach)
     rows, columns = np.nonzero(found.reshape(len(asked), -1) < len(few))
-    one, other = moving[asked[rows]], moving[found.reshape(len(asked), -1)[rows, columns]]
+    one = moving[asked[rows]]
+    other = moving[found.reshape(len(asked), -1)[rows, columns]]
     apart = owner[one] != owner[other]
-    first, second = np.minimum(one, other)[apart], np.maximum(one, other)[apart]
+    first = np.minimum(one, other)[apart]
+    second = np.maximum(one, other)[apart]
     pairs, votes = np.unique(
         np.stack([owner[first], owner[second], (place[second] - place[first]) // 4], axis=1),
         axis=0,
@@ -223,7 +230,8 @@ def likeness(first: NDArray[np.float64], second: NDArray[np.float64], fps: float
     """Return how joints `second` [T, N, 3], whose seconds begin `shift` tenths of one later, repeat those
     `first`, each second seen from itself.
     """
-    one, other = _sampled(first, fps), _sampled(second, fps)
+    one = _sampled(first, fps)
+    other = _sampled(second, fps)
     best = Likeness("")
     for how, figure in (("the same recording as", one), ("the mirror image of", mirror(one, _NAMED))):
         seconds = _repeated(figure, other, shift)
@@ -236,7 +244,8 @@ def likeness(first: NDArray[np.float64], second: NDArray[np.float64], fps: float
 def _repeated(first: NDArray[np.float64], second: NDArray[np.float64], shift: int) -> float:
     """Seconds of the second joints that are in the first, `shift` tenths of a second before or nearly so."""
     window = min(_WINDOW, len(first), len(second))
-    here, there = _windows(first, window, 1), _windows(second, window, _HOP)
+    here = _windows(first, window, 1)
+    there = _windows(second, window, _HOP)
     apart = np.full(len(there), np.inf)
     for near_by in range(-_AROUND, _AROUND + 1):
         at = _HOP * (np.arange(len(there)) - shift) + near_by

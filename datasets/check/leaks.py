@@ -37,7 +37,8 @@ def find_leaks(sets: Mapping[str, Splits]) -> list[str]:
 def _compare(
     name: str, clips: ClipDataset, other: str, others: ClipDataset, found: dict[tuple[str, Split, int], str]
 ) -> None:
-    ids, other_ids = clips.ids, others.ids
+    ids = clips.ids
+    other_ids = others.ids
     lengths = np.intersect1d(clips.frames, others.frames)
     here: defaultdict[tuple[int, bytes], list[int]] = defaultdict(list)
     by_id: dict[tuple[int, str], int] = {}
@@ -46,7 +47,8 @@ def _compare(
         here[frames, clips.motion(i)[0].tobytes()].append(i)
         by_id[frames, ids[i]] = i
     for j in np.flatnonzero(np.isin(others.frames, lengths)).tolist():
-        frames, motion = int(others.frames[j]), others.motion(j)
+        frames = int(others.frames[j])
+        motion = others.motion(j)
         again = by_id.get((frames, other_ids[j]))
         near = [again] if again is not None else []
         for i in [*here.get((frames, motion[0].tobytes()), ()), *near]:

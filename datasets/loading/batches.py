@@ -60,7 +60,8 @@ class WindowBatches(Dataset[MotionBatch]):
         self.crops = Crops(dataset, stats, columns)
         self.dataset = dataset
         self.window = window
-        self.seed, self.share = seed, share
+        self.seed = seed
+        self.share = share
         self.clips = self.crops.clips
         if len(self.clips) == 0 or not self.crops.present[np.unique(dataset.present)].any(axis=0).all():
             raise UserError(

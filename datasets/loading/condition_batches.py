@@ -32,7 +32,9 @@ from motionloom.datasets.shards.clips import ClipDataset
 from motionloom.datasets.text.cache import TextCache
 
 # Counters that keep the draws for different purposes apart (arguments of `uniform`).
-_CAPTION, _CROP, _DROP = 2, 3, 4
+_CAPTION = 2
+_CROP = 3
+_DROP = 4
 
 Captioned = Literal["body", "face"]
 """Subject of the captions that every clip must have."""
@@ -85,7 +87,9 @@ class ConditionedClips:
         self.members = {name: modality(name).members[0] for name in self.readers}
         if self.face:
             self.members["text"] = "face_texts.json"
-        self.min_frames, self.max_frames, self.captioned = min_frames, max_frames, captioned
+        self.min_frames = min_frames
+        self.max_frames = max_frames
+        self.captioned = captioned
         # What a clip holds is known from the index: no shard is opened to say which clips qualify.
         usable = dataset.frames >= min_frames
         if captioned:
@@ -193,10 +197,12 @@ class ConditionBatches(Dataset[ConditionBatch]):
             dataset, stats, readers, max_frames=max_frames, min_frames=min_frames, columns=columns,
             captioned=captioned,
         )  # fmt: skip
-        self.seed, self.share = seed, share
+        self.seed = seed
+        self.share = share
         self.drop = drop or {}
         clips = self.source.clips
-        present, names = self.source.present[clips], self.source.names
+        present = self.source.present[clips]
+        names = self.source.names
         self.plan = KindPlan(dataset, clips, present, names, batch_size, seed, balance, homogeneous)
         self.plan.local(0, self.share)  # an indivisible batch is refused now, not in a loader worker
 
@@ -229,7 +235,8 @@ class EvalBatches(Dataset[ConditionBatch]):
             dataset, stats, readers or {}, max_frames=max_frames, min_frames=min_frames, columns=columns,
             captioned=captioned,
         )  # fmt: skip
-        self.clips, self.batch_size = self.source.clips, batch_size
+        self.clips = self.source.clips
+        self.batch_size = batch_size
 
     def __len__(self) -> int:
         return -(-len(self.clips) // self.batch_size)
@@ -237,6 +244,8 @@ class EvalBatches(Dataset[ConditionBatch]):
     def __getitem__(self, k: int) -> ConditionBatch:
         if not 0 <= k < len(self):
             raise IndexError(f"evaluation batch {k} of {len(self)}")
-        clips, source = self.clips[k * self.batch_size : (k + 1) * self.batch_size], self.source
-        present, first = source.present[clips], np.zeros(len(clips))
+        clips = self.clips[k * self.batch_size : (k + 1) * self.batch_size]
+        source = self.source
+        present = source.present[clips]
+        first = np.zeros(len(clips))
         return source.make(clips, present, source.spans(clips, present, first), first)

@@ -108,7 +108,8 @@ class Crops:
         self._missing = [[place for place, _ in _runs(np.flatnonzero(~row))] for row in self.present]
         self._mean = stats.mean[chosen]
         self._scale = 1.0 / stats.std[chosen]
-        self._mean_row, self._scale_row = self._mean, self._scale
+        self._mean_row = self._mean
+        self._scale_row = self._scale
         self._runs = _runs(chosen)
         self._keep()
 

@@ -59,7 +59,9 @@ class BeatBatches(Dataset[BeatBatch]):
     """
 
     def __init__(self, batches: Dataset[ConditionBatch], stats: FrameStats, fps: float) -> None:
-        self.batches, self.stats, self.fps = batches, stats, fps
+        self.batches = batches
+        self.stats = stats
+        self.fps = fps
 
     def __len__(self) -> int:
         return len(self.batches)  # type: ignore[arg-type]

@@ -85,7 +85,8 @@ def drop_some(
         names: The M modalities.
         draws: In [0, 1), [B].
     """
-    out, low = present.copy(), 0.0
+    out = present.copy()
+    low = 0.0
     for key, rate in drop.items():
         kind = kind_of(key)
         left_out = np.array([name in kind for name in names])

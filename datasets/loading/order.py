@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 # Last elements of keys. `BatchPlan` draws its pools by (seed, epoch, n >= 1), so a zero in the third place
 # keeps these apart from them; no key may end in zero (numpy pads keys with zeros).
-_SHARDS, _WITHIN, _MIX = 1, 2, 3
+_SHARDS = 1
+_WITHIN = 2
+_MIX = 3
 
 
 def source_order(source: Source, *key: int) -> NDArray[np.int64]:
@@ -43,7 +45,9 @@ def mixed_order(
     holds its share to within a clip or two. A source goes on where it stopped in the epoch before: all its
     items come once, in an order of their own each time, before any comes again. `turns` counts these rounds.
     """
-    places, items, turns = [], [], []
+    places = []
+    items = []
+    turns = []
     for number, (source, share) in enumerate(zip(sources, shares(sources, size), strict=True)):
         # A source goes on where the epoch before left it: turn and place are of its own count of draws.
         drawn = np.arange(epoch * share, (epoch + 1) * share)

@@ -124,13 +124,15 @@ class BatchPlan:
             order, turns = mixed_order(self.sources, self._used, self.seed, epoch)
         if self.lengths is None or len(order) < self.batch_items:
             return order, turns
-        size, used = self.batch_items, self._used
+        size = self.batch_items
+        used = self._used
         for start in range(0, used, POOL * size):
             end = min(start + POOL * size, used)
             by_length = np.argsort(self.lengths[order[start:end]], kind="stable").reshape(-1, size)
             # The epoch's own number keeps this draw apart from that of the permutation itself.
             dealt = start + by_length[permutation(len(by_length), self.seed, epoch, start + 1)].ravel()
-            order[start:end], turns[start:end] = order[dealt], turns[dealt]
+            order[start:end] = order[dealt]
+            turns[start:end] = turns[dealt]
         return order, turns
 
     def __getstate__(self) -> dict[str, object]:

@@ -193,7 +193,8 @@ def from_moments(moments: Moments, layout: MotionLayout, *, group: bool = False)
     frames = round(moments.count.max())
     if frames == 0:
         raise UserError("no frames to compute feature statistics from: the training split is empty")
-    std, counted = moments.std, moments.count > 0
+    std = moments.std
+    counted = moments.count > 0
     if group:
         for name, _ in layout.fields:
             field = np.arange(layout.dim)[layout.slice(name)]

@@ -35,7 +35,9 @@ class Steps(IterableDataset[T_co]):
     def __init__(
         self, make: Callable[[int, int], Numbered[T_co]], last: int, first: int | Callable[[], int] = 0
     ) -> None:
-        self.make, self.first, self.last = make, first, last
+        self.make = make
+        self.first = first
+        self.last = last
 
     @cached_property
     def batches(self) -> Numbered[T_co]:
@@ -63,5 +65,6 @@ class Steps(IterableDataset[T_co]):
 
     def __getstate__(self) -> dict[str, object]:
         """Workers get the rank's batches; they know nothing of the process group."""
-        batches, (first, last) = self.batches, self.span()
+        batches = self.batches
+        (first, last) = self.span()
         return {"make": None, "first": first, "last": last, "batches": batches}

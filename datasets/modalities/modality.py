@@ -44,7 +44,9 @@ def load_columns(path: Path, stage: str) -> tuple[Columns, Columns, int, dict[st
     try:
         require_plain(path)
         with safe_open(path, framework="numpy") as stored:
-            mean, std, about = stored.get_tensor("mean"), stored.get_tensor("std"), stored.metadata() or {}
+            mean = stored.get_tensor("mean")
+            std = stored.get_tensor("std")
+            about = stored.metadata() or {}
         frames = whole(about["frames"], f"{path}: frames")
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; run {stage}") from None
@@ -199,13 +201,15 @@ class FrameModality(Modality):
         mask = (np.arange(rows.frames)[None] < rows.length[:, None]) & rows.present[:, None]
         for row in np.flatnonzero(rows.present).tolist():
             stored = self._stored(dataset, int(rows.clips[row]), reader.dim)
-            first, count = int(rows.begin[row]), int(rows.length[row])
+            first = int(rows.begin[row])
+            count = int(rows.length[row])
             features[row, :count] = reader.normalize(stored[first : first + count])
         return condition_of(features, mask)
 
     def _stored(self, dataset: Clips, clip: int, width: int) -> NDArray[np.float32]:
         """Return a clip's features [T, E]; `UserError` unless they are one row a frame."""
-        features, frames = dataset.array(clip, self.members[0]), int(dataset.frames[clip])
+        features = dataset.array(clip, self.members[0])
+        frames = int(dataset.frames[clip])
         if features is None or features.shape != (frames, width):
             shape = "none" if features is None else str(list(features.shape))
             raise UserError(

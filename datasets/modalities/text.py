@@ -39,7 +39,8 @@ class TextModality(Modality):
 
     def batch(self, reader: object, dataset: Clips, rows: Rows) -> Condition:
         """Word features [B, L, E] and unit sentence embeddings [B, E] of the rows' captions."""
-        cache, count = cast("TextCache", reader), len(rows.captions)
+        cache = cast("TextCache", reader)
+        count = len(rows.captions)
         with_text = np.flatnonzero(rows.present)
         chosen = [rows.captions[row] for row in with_text.tolist()]
         tokens, known = cache.tokens(chosen)
@@ -51,7 +52,9 @@ class TextModality(Modality):
         mask = np.zeros((count, places), dtype=np.bool_)
         pooled = np.zeros((count, cache.dim), dtype=np.float32)
         if len(with_text):
-            features[with_text], mask[with_text], pooled[with_text] = tokens, known, cache.sentence(chosen)
+            features[with_text] = tokens
+            mask[with_text] = known
+            pooled[with_text] = cache.sentence(chosen)
         return condition_of(features, mask, pooled)
 
     def encode(self, prepared: object, values: Sequence[object | None], fps: float) -> Condition:
@@ -59,15 +62,19 @@ class TextModality(Modality):
             raise UserError("this model has no text encoder; leave the text out")
         words = ["" if text is None else str(text) for text in values]
         encoded = cast(_Prepared, prepared).encoder.encode(words)
-        features, mask, pooled = encoded.tokens, encoded.mask, encoded.sentence
+        features = encoded.tokens
+        mask = encoded.mask
+        pooled = encoded.sentence
         has_text = np.array([bool(text.strip()) for text in words])
         if not has_text.all():
             mask = mask & has_text[:, None]
-            features, pooled = features * mask[..., None], pooled * has_text[:, None]
+            features = features * mask[..., None]
+            pooled = pooled * has_text[:, None]
         return condition_of(features, mask, pooled)
 
     def example(self, batch: int, frames: int, width: int) -> Condition:
-        features, pooled = np.empty((batch, _WORDS, width), np.float32), np.empty((batch, width), np.float32)
+        features = np.empty((batch, _WORDS, width), np.float32)
+        pooled = np.empty((batch, width), np.float32)
         return condition_of(features, np.ones((batch, _WORDS), np.bool_), pooled)
 
 

@@ -96,7 +96,8 @@ def canonicalize(joints: NDArray[Float]) -> NDArray[Float]:
     out[..., 1] -= out[..., 1].min(axis=(-2, -1), keepdims=True)
     plane = ground(out)
     plane = (plane - plane[..., :1, :1]) * np.exp(-1j * facing(out[..., :1, :, :]))[..., None]
-    out[..., 2], out[..., 0] = plane.real, plane.imag
+    out[..., 2] = plane.real
+    out[..., 0] = plane.imag
     return out.astype(kind, copy=False)
 
 
@@ -151,8 +152,10 @@ def resample_quaternions(
     left, weight = _source_frames(len(quaternions), fps_in, fps_out)
     right = np.minimum(left + 1, len(quaternions) - 1)
     unit = roma.quat_normalize(torch.from_numpy(np.asarray(quaternions, dtype=np.float64)))
-    start, end = unit[torch.from_numpy(left)], unit[torch.from_numpy(right)]
-    start, end = start.reshape(-1, 4), end.reshape(-1, 4)
+    start = unit[torch.from_numpy(left)]
+    end = unit[torch.from_numpy(right)]
+    start = start.reshape(-1, 4)
+    end = end.reshape(-1, 4)
     # roma's slerp takes one list of steps for all pairs; here each frame has its own, so the arc is scaled.
     arc = roma.unitquat_to_rotvec(roma.quat_product(roma.quat_conjugation(start), end), shortest_arc=True)
     step = torch.from_numpy(weight).repeat_interleave(len(start) // len(left))

@@ -22,7 +22,8 @@ def between_known(
     """The rows [R, J] of known [T, J] before, or at, and after, or at, some rows, and how far these are on
     the `smooth` way between them. Where there is none on one side, both are that of the other.
     """
-    number, count = np.arange(len(known))[:, None], len(known)
+    number = np.arange(len(known))[:, None]
+    count = len(known)
     first = np.maximum.accumulate(np.where(known, number, -1), axis=0)[rows]
     last = np.minimum.accumulate(np.where(known, number, count)[::-1], axis=0)[::-1][rows]
     first, last = np.where(first < 0, last, first), np.where(last == count, first, last)

@@ -92,7 +92,8 @@ STRETCH = 0.3
 def judge(joints: NDArray[np.floating], fps: float, *, small: float = PERSON_METRES[0]) -> Iterator[Fault]:
     """The faults of joints [T, N >= 22, 3]: metres, Y up, the floor at 0; figures may be `small` metres."""
     body = np.asarray(joints[:, :BODY_JOINTS], dtype=np.float64)
-    figure, tall = measure(joints, fps), PERSON_METRES[1]
+    figure = measure(joints, fps)
+    tall = PERSON_METRES[1]
     if not small <= figure.height <= tall:
         ratio = max(small / max(figure.height, 1e-3), figure.height / tall)
         text = f"{figure.height:.2f} m tall, not {small:g} to {tall:g} m"
@@ -147,7 +148,8 @@ def _axis(body: NDArray[np.float64]) -> Iterator[Fault]:
     trunk /= np.maximum(np.linalg.norm(trunk, axis=-1, keepdims=True), 1e-9)
     legs = body[:, _HIPS].mean(axis=1) - body[:, _ANKLES].mean(axis=1)
     legs /= np.maximum(np.linalg.norm(legs, axis=-1, keepdims=True), 1e-9)
-    way, straight = np.median(trunk, axis=0), float(np.median((trunk * legs).sum(axis=-1)))
+    way = np.median(trunk, axis=0)
+    straight = float(np.median((trunk * legs).sum(axis=-1)))
     level = float(np.percentile(np.abs(trunk[:, 1]), 90))
     if level < UPRIGHT and np.linalg.norm(way) > STRAIGHT and straight > STRAIGHT:
         axis = "xyz"[int(np.abs(way).argmax())]
@@ -157,7 +159,8 @@ def _axis(body: NDArray[np.float64]) -> Iterator[Fault]:
 
 
 def _feet(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
-    trunk, balls = body[:, _HEAD] - body[:, _PELVIS], body[:, _BALLS]
+    trunk = body[:, _HEAD] - body[:, _PELVIS]
+    balls = body[:, _BALLS]
     upright = trunk[:, 1] > UPRIGHT * np.linalg.norm(trunk, axis=-1)
     speed = np.linalg.norm(np.gradient(balls, axis=0), axis=-1) * fps
     lower = balls[..., 1] <= balls[..., 1].min(axis=-1, keepdims=True)  # the other may be held in the air
@@ -221,7 +224,8 @@ def _smoothness(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
         yield _fault("jumps", text, float(leaps.max()) / most, int(leaps.argmax()))
     # Fourth differences leave nothing of a cubic; of white noise √70 times its deviation.
     rough = np.abs(np.diff(body - body[:, :1], 4, axis=0))[:, 1:]
-    noise, most = float(np.median(rough)) / (0.6745 * np.sqrt(70)), TREMOR + TREMOR_SPEED / fps**4
+    noise = float(np.median(rough)) / (0.6745 * np.sqrt(70))
+    most = TREMOR + TREMOR_SPEED / fps**4
     if noise > most:
         text = f"trembles by {1000 * noise:.1f} mm, not at most {1000 * most:.1f} mm"
         yield _fault("jitters", text, noise / most, int(rough.mean(axis=(1, 2)).argmax()))
@@ -234,7 +238,8 @@ def _limbs(body: NDArray[np.float64]) -> Iterator[Fault]:
     ways = np.diff(bones / np.maximum(np.linalg.norm(bones, axis=-1, keepdims=True), 1e-6), axis=0)
     turns = np.linalg.norm(ways, axis=-1)
     around = np.pad(turns, ((1, 1), (0, 0)), mode="edge")
-    before, after = turns - around[:-2], turns - around[2:]
+    before = turns - around[:-2]
+    after = turns - around[2:]
     alone = np.minimum(before, after)
     leaps = [alone * (LIMB_FLIP / LIMB_SNAP)]
     for frames in range(1, min(LONGEST_FLIP, len(turns) - 1) + 1):
@@ -260,7 +265,8 @@ def _still(body: NDArray[np.float64], fps: float) -> Iterator[Fault]:
         yield _fault("frozen", text, seconds / FROZEN + 1e-3, start)
 
 
-_GRAVITY, _USUAL = 9.81, 0.54
+_GRAVITY = 9.81
+_USUAL = 0.54
 _LEAST_FPS = 24
 """Steps of fewer frames a second are counted too coarsely."""
 
@@ -295,7 +301,8 @@ def _falls(body: NDArray[np.float64], fps: float) -> Iterator[tuple[int, int, fl
 def _stuck(body: NDArray[np.float64]) -> Iterator[Fault]:
     """Joints that never move although what they hang on does: channels that were not written."""
     for name, (first, joint, last) in _HINGES.items():
-        above, below = body[:, joint] - body[:, first], body[:, last] - body[:, joint]
+        above = body[:, joint] - body[:, first]
+        below = body[:, last] - body[:, joint]
         sizes = np.linalg.norm(above, axis=-1) * np.linalg.norm(below, axis=-1)
         bend = float(
             np.ptp(np.arccos(np.clip((above * below).sum(axis=-1) / np.maximum(sizes, 1e-9), -1, 1)))

@@ -212,7 +212,8 @@ face; arms are without fingers; hands are the fingers."""
 PIECES = ("lower", "trunk", "left_arm", "right_arm", "left_hand", "right_hand", "face")
 LOWER = PIECES.index("lower")
 
-_ARM, _LEG = ("shoulder", "elbow", "wrist"), ("pelvis", "hip", "knee", "ankle", "foot")
+_ARM = ("shoulder", "elbow", "wrist")
+_LEG = ("pelvis", "hip", "knee", "ankle", "foot")
 _UPPER = PIECES[1:6]
 _OF: dict[FigurePart, tuple[str, ...]] = {"all": PIECES, "upper": _UPPER, "hands": PIECES[4:6]}
 

@@ -79,7 +79,8 @@ def read_npy_header(stream: IO[bytes], where: str, size: int) -> ArrayHeader:
     header = ArrayHeader(shape, dtype, stream.tell() - begin, fortran)
     if header.end != size:
         what = "truncated array" if size < header.end else "more data than the header states"
-        expected, actual = header.end - header.start, size - header.start
+        expected = header.end - header.start
+        actual = size - header.start
         raise UserError(f"{where}: {what}: {expected} bytes expected for {list(shape)}, {actual} found")
     return header
 

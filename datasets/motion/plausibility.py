@@ -199,7 +199,8 @@ class PlausibilityStats:
         out: list[Oddity] = []
 
         def count(kind: Kind, odd: NDArray[np.bool_], text: str, of: int | None = None) -> None:
-            number, total = int(odd.sum()), of or len(self)
+            number = int(odd.sum())
+            total = of or len(self)
             if number > ODD * total:
                 share = f"{number} of {total} clips ({number / total:.0%})"
                 out.append(Oddity(kind, number, total, f"{share} {text}"))

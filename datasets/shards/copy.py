@@ -30,7 +30,8 @@ class Copied(NamedTuple):
 
 def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
     """Copy the data set at `source` to `target`, folders or URLs; `UserError` if a byte is damaged."""
-    here, there = open_store(source), open_store(target)
+    here = open_store(source)
+    there = open_store(target)
     if there.place.startswith("http"):
         raise UserError(f"{target}: a web server is only read; name a folder, s3://… or hf://datasets/…")
     manifest, digest = read_manifest(here)
@@ -50,7 +51,8 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
                 if name in needed:
                     raise
             else:
-                sent, kept = sent + new, kept + (not new)
+                sent = sent + new
+                kept = kept + (not new)
             meter.advance()
     return Copied(sent, kept)
 
@@ -72,7 +74,8 @@ def _send_file(here: Store, there: Store, name: str, wanted: str | None, folder:
     """Send a file unless the target has it, compare it there, and return whether it was sent."""
     if wanted is not None and there.digest(name) == wanted:
         return False
-    source, path = here.where(name), folder / name
+    source = here.where(name)
+    path = folder / name
     if isinstance(here, LocalStore):
         path = here.root / name
         if not path.is_file():

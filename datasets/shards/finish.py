@@ -165,7 +165,8 @@ def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
     for folder in (OLD_FOLDER, PARTS_FOLDER):
         shutil.rmtree(out / folder, ignore_errors=True)
     # A wrong map or unit rather than bad clips.
-    lost, clips = [*planned.lost, *failed], planned.items + len(planned.lost)
+    lost = [*planned.lost, *failed]
+    clips = planned.items + len(planned.lost)
     if len(lost) > planned.most_lost * clips:
         raise UserError(
             f"{out}: {len(lost)} of {clips} clips cannot be used ({grouped(lost)[0]}); the rest is "

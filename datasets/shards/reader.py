@@ -97,7 +97,9 @@ class MappedShards:
     def __init__(self, store: Store, shards: list[ShardInfo], index: SplitIndex, room: int = 0) -> None:
         self.maps: OrderedDict[int, mmap.mmap] = OrderedDict()
         self._self = ref(self)
-        self._store, self._shards, self._offsets = store, shards, index.offsets
+        self._store = store
+        self._shards = shards
+        self._offsets = index.offsets
         self._most = OPEN_SHARDS
         if room:  # a deleted file takes disk space while it is mapped: at most an eighth of the cache may
             self._most = max(1, min(OPEN_SHARDS, room // (8 * max(shard.bytes for shard in shards))))
@@ -107,7 +109,8 @@ class MappedShards:
         mapped = self.maps.pop(shard, None) or self._map(shard)
         self._recent.pop((self._self, shard), None)
         # Back as the one used last.
-        self.maps[shard], self._recent[self._self, shard] = mapped, None
+        self.maps[shard] = mapped
+        self._recent[self._self, shard] = None
         while len(self.maps) > self._most:
             self._recent.pop((self._self, self.maps.popitem(last=False)[0]), None)
         while len(self._recent) > OPEN_SHARDS:
@@ -217,7 +220,8 @@ class ShardDataset:
 
     def motion(self, i: int) -> NDArray[np.float32]:
         """Features of clip `i`, [T, D]: a read-only view of the stored bytes (a copy if float16)."""
-        index, row = self._index, self._row(i)
+        index = self._index
+        row = self._row(i)
         buffer, start = self._access.member(self._shard_of(row), row, _MOTION)
         start += int(index.data[row]) - int(index.offsets[row, _MOTION])
         shape = (int(index.frames[row]), self.layout.dim)
@@ -273,7 +277,8 @@ class ShardDataset:
         return [(self, 1.0)]
 
     def _member(self, i: int, member: str) -> bytes:
-        column, row = MEMBERS.index(member), self._row(i)
+        column = MEMBERS.index(member)
+        row = self._row(i)
         size = int(self._index.sizes[row, column])
         if size == 0:
             return b""
@@ -298,7 +303,8 @@ class ShardDataset:
 
     def _check_motion_sizes(self) -> None:
         """Every motion fills its member exactly, so no later read can leave the file or mix two clips."""
-        index, column = self._index, MEMBERS.index("motion.npy")
+        index = self._index
+        column = MEMBERS.index("motion.npy")
         end = index.offsets[:, column] + index.sizes[:, column]
         size = index.frames.astype(np.int64) * self.layout.dim * index.itemsize
         bad = np.flatnonzero((index.data + size != end) | (index.data < index.offsets[:, column]))

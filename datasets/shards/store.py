@@ -29,7 +29,8 @@ from motionloom.datasets.shards.checksums import LocalShard, fault_of
 
 SCHEMES = ("file", "http", "https", "s3", "hf")
 
-_CONNECT_SECONDS, _READ_SECONDS = 15, 60
+_CONNECT_SECONDS = 15
+_READ_SECONDS = 60
 
 
 def is_url(place: Path | str) -> bool:

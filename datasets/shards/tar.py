@@ -39,7 +39,8 @@ def scan_tar(path: Path, *, most: int = MOST_CLIPS) -> list[TarClip]:
     """Return the clips of a shard in order, at most `most`; a `UserError` names the fault."""
     clips: list[TarClip] = []
     seen: set[str] = set()
-    size, end = require_plain(path), 0
+    size = require_plain(path)
+    end = 0
     if size == 0:
         raise UserError(f"{path}: empty file, 0 bytes: an interrupted download or write")
     with open_plain(path) as file:

@@ -198,7 +198,8 @@ def _index_of(tar: Path) -> tuple[set[str], dict[str, list[ClipEntry]]]:
 @lru_cache(maxsize=8)
 def _read_index(tar: Path, changed: int) -> tuple[set[str], dict[str, list[ClipEntry]]]:
     """Read an index, cached by path and time of change."""
-    index, clips_by_origin = ShardIndex.load_json(index_path(tar)), dict[str, list[ClipEntry]]()
+    index = ShardIndex.load_json(index_path(tar))
+    clips_by_origin = dict[str, list[ClipEntry]]()
     for clip in index.clips:
         clips_by_origin.setdefault(clip.made_from, []).append(clip)
     return index.kinds, clips_by_origin

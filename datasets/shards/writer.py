@@ -107,8 +107,10 @@ class DatasetWriter(Generic[T]):
     def __init__(
         self, out: Path, tasks: list[ShardTask[T]], facts: DatasetFacts, how: WriteOptions, pool: Workers
     ) -> None:
-        self.out, self._pool = out, pool
-        self._how, self._name = how, facts.name
+        self.out = out
+        self._pool = pool
+        self._how = how
+        self._name = facts.name
         self._planned = _planned(tasks, facts)
         _require_same(out, self._planned.manifest)
         part = how.part

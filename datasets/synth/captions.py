@@ -146,7 +146,8 @@ def _varied(truth: Truth, rng: np.random.Generator, hands: bool, bare: bool = Fa
         return link.join(verb(phrase) for phrase in phrases)
 
     # Statements are likelier than headings, orders and "we see": people write them most.
-    form, who = int(rng.integers(8)), _pick(rng, table.who)
+    form = int(rng.integers(8))
+    who = _pick(rng, table.who)
     if form < 3:
         text = f"{who} {inflected(lambda phrase: _third_person(phrase, who))}"
     elif form < 5:
@@ -169,10 +170,13 @@ def _varied(truth: Truth, rng: np.random.Generator, hands: bool, bare: bool = Fa
 
 
 def _dance(truth: DanceTruth, rng: np.random.Generator) -> str:
-    genre, table = GENRES[truth.genre], words().dances
+    genre = GENRES[truth.genre]
+    table = words().dances
     pace = _pick(rng, table.tempo[_tempo(truth)])
-    who, music = _pick(rng, table.who), _pick(rng, genre.words)
-    style, arms = _pick(rng, table.styles[genre.style]), _pick(rng, genre.moves)
+    who = _pick(rng, table.who)
+    music = _pick(rng, genre.words)
+    style = _pick(rng, table.styles[genre.style])
+    arms = _pick(rng, genre.moves)
     return _pick(
         rng,
         (

@@ -191,7 +191,9 @@ def _phrases(song: Song, numbers: list[int], rng: np.random.Generator) -> list[_
 def _draw_phrase(song: Song, number: int, energy: float, rng: np.random.Generator) -> _Phrase:
     genre = song.style
     if energy == 0:
-        legs, arms, way = "stand", _one_of(FREEZES[song.genre], rng), "freeze"
+        legs = "stand"
+        arms = _one_of(FREEZES[song.genre], rng)
+        way = "freeze"
     else:
         weights = dict(QUIET_LEGS[genre.style] if energy < _QUIET else LEGS_OF[genre.style])
         if energy > _LOUD:
@@ -217,17 +219,20 @@ def _move_feet(track: Track, plan: _Plan) -> Array:
     A foot is on its place at each beat. On the way it goes up before it goes anywhere, and down after it.
     """
     places, lifts = _places(plan)
-    t, beats = track.t, plan.seconds
+    t = track.t
+    beats = plan.seconds
     index = np.clip(np.searchsorted(beats, t, side="right") - 1, 0, len(beats) - 2)
     phase = (t - beats[index]) / (beats[index + 1] - beats[index])
     away = ease((phase - _SWING) / (1 - 2 * _SWING))
     up = ease(phase / 0.4) * ease((1 - phase) / 0.4)
     body = keys(t, beats, places[:, :, [0, 1, 3]].mean(0))
     for foot in (0, 1):
-        from_, to = places[foot][index], places[foot][index + 1]
+        from_ = places[foot][index]
+        to = places[foot][index + 1]
         aside, forward, _, turn = (from_ + away[:, None] * (to - from_)).T
         lift = lifts[foot][index + 1] * up
-        out, ahead = track.ball[foot, :, 0].copy(), track.ball[foot, :, 2].copy()
+        out = track.ball[foot, :, 0].copy()
+        ahead = track.ball[foot, :, 2].copy()
         track.ball[foot, :, 0] = aside + out * np.cos(turn) + ahead * np.sin(turn)
         track.ball[foot, :, 2] = forward - out * np.sin(turn) + ahead * np.cos(turn)
         raised = keys(t, beats, places[foot, :, 2])
@@ -241,8 +246,10 @@ def _places(plan: _Plan) -> tuple[Array, Array]:
     """Return the place of each foot on each beat, off its first: x, z, height, heading [2, N, 4], and its
     lift on the way there [2, N]."""
     style = plan.song.style.style
-    places, lifts = np.zeros((2, len(plan.numbers), 4)), np.zeros((2, len(plan.numbers)))
-    base, first = 0.0, 0
+    places = np.zeros((2, len(plan.numbers), 4))
+    lifts = np.zeros((2, len(plan.numbers)))
+    base = 0.0
+    first = 0
     for k, phrase in enumerate(plan.phrases):
         before = places[:, k - 1] if k else places[:, 0]
         if k and phrase is not plan.phrases[k - 1]:
@@ -256,7 +263,8 @@ def _places(plan: _Plan) -> tuple[Array, Array]:
             # One foot goes, the one that is in the air or has the longer way; the other waits for its turn.
             ways = np.abs(places[:, k] - before).sum(-1) + 9.0 * (before[:, 2] > 0)
             other = int(np.argmin(ways))
-            places[other, k], moved[other] = before[other], False
+            places[other, k] = before[other]
+            moved[other] = False
         away = np.linalg.norm((places[:, k] - before) * [1, 1, 0, 0.12], axis=-1)
         # Quick feet are lifted high, or they would slide; slow ones may shuffle.
         far = away > _SLOW * (plan.seconds[k] - plan.seconds[k - 1])
@@ -268,7 +276,8 @@ def _places(plan: _Plan) -> tuple[Array, Array]:
 
 def _targets(plan: _Plan, k: int, beat: int, base: float) -> Array:
     """Places [2, 4] of both feet on beat `k`, which is `beat` of its phrase, for a dancer headed `base`."""
-    phrase, size = plan.phrases[k], plan.size[k]
+    phrase = plan.phrases[k]
+    size = plan.size[k]
     step = size * _BODY[plan.song.style.style][0]
     if plan.song.style.style != "step":
         step = min(step, 0.9 * _SLOW * plan.song.beat)
@@ -295,7 +304,8 @@ def _rounds(plan: _Plan, beat: int, lead: int) -> tuple[float, float]:
     """Headings of the left and the right foot on a beat of a phrase that turns round."""
     sign = -1.0 if plan.lead else 1.0
     turn = sign * 2 * np.pi / plan.song.meter
-    first, second = (beat + 1) // 2 * turn, beat // 2 * turn
+    first = (beat + 1) // 2 * turn
+    second = beat // 2 * turn
     return (second, first) if lead else (first, second)
 
 
@@ -305,7 +315,8 @@ def _rounds(plan: _Plan, beat: int, lead: int) -> tuple[float, float]:
 def _move_body(track: Track, plan: _Plan, body: Array, rng: np.random.Generator) -> None:
     """Move root, spine and head over the feet; `body` is what `_move_feet` returns."""
     _, aside, down, roll, twist = _BODY[plan.song.style.style]
-    size, even = plan.size, 1.0 - plan.odd
+    size = plan.size
+    even = 1.0 - plan.odd
     side = size * (2.0 * even - 1.0)
 
     def keyed(values: Array) -> Array:

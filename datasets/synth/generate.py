@@ -174,7 +174,8 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
     layout = config.motion_layout
     planned = dance_of(index, config)
     truth = planned.truth if planned else truth_of(index, config)
-    hands, has_face = layout.num_joints > BODY_JOINTS, layout.has("face")
+    hands = layout.num_joints > BODY_JOINTS
+    has_face = layout.has("face")
     motion, shape = (np.random.default_rng([config.seed, index, k]) for k in (1, 2))
     if planned:
         begin = planned.seconds(layout.fps)
@@ -191,15 +192,19 @@ def make_clip(index: int, config: SynthConfig) -> Clip:
     size = float(np.clip(1 + SIZE_SPREAD * shape.standard_normal(), 0.8, 1.2))
     smpl = None
     if layout.name == "smpl75":
-        size, smpl = 1.0, smpl75_of(track.rotations(), solved, _REST_ROOT)
+        size = 1.0
+        smpl = smpl75_of(track.rotations(), solved, _REST_ROOT)
     face = (
         dancing_face(planned.song, begin, track.t, shape) if planned else express(truth.face, track.t, shape)
     )
     audio = wav = None
     if planned and config.dances and planned.comes in ("audio", "both"):
-        song, rate, end = planned.song, SAMPLE_RATE, planned.start + planned.frames
+        song = planned.song
+        rate = SAMPLE_RATE
+        end = planned.start + planned.frames
         audio = song_features(song, rate, layout.fps, config.dances.width)[planned.start : end]
-        first, samples = round(begin * rate), round(planned.frames / layout.fps * rate)
+        first = round(begin * rate)
+        samples = round(planned.frames / layout.fps * rate)
         wav = render_song(song, rate)[first : first + samples], rate
     texts, face_texts = captions_of(index, config)
     return Clip(
@@ -220,7 +225,8 @@ def captions_of(index: int, config: SynthConfig) -> tuple[list[str], list[str]]:
     if planned is not None and planned.comes not in ("text", "both"):
         return [], []
     truth = planned.truth if planned else truth_of(index, config)
-    layout, words = config.motion_layout, np.random.default_rng([config.seed, index, 3])
+    layout = config.motion_layout
+    words = np.random.default_rng([config.seed, index, 3])
     texts = body_captions(truth, words, layout.num_joints > BODY_JOINTS, config.wordings)
     face_texts = face_captions(truth, words, body=texts, wordings=config.wordings)
     return texts, face_texts if layout.has("face") else []
@@ -274,13 +280,15 @@ def truth_of(index: int, config: SynthConfig) -> Truth:
 
 def _action_of(index: int, config: SynthConfig) -> tuple[str, int]:
     """Action of clip `index`, and which round of the actions (for a dance: which dance) it is."""
-    actions, rank = config.action_names, index
+    actions = config.action_names
+    rank = index
     share = config.dances.share if config.dances else None
     if share is not None:
         before = int(np.floor(index * share + 1e-9))
         if int(np.floor((index + 1) * share + 1e-9)) > before:
             return "dance", before
-        actions, rank = config.other_actions, index - before
+        actions = config.other_actions
+        rank = index - before
     block, place = divmod(rank, len(actions))
     order = np.random.default_rng([config.seed, block, 101]).permutation(len(actions))
     return actions[int(order[place])], block

@@ -104,7 +104,8 @@ def express(emotion: str, t: Array, rng: np.random.Generator) -> Array:
     seconds = float(t[-1]) if len(t) > 1 else 1.0
     weights = _idle(t, rng)
     if emotion != "neutral":
-        onset, begin = rng.uniform(0.15, 0.5), rng.uniform(-0.3, 0.15 * seconds)
+        onset = rng.uniform(0.15, 0.5)
+        begin = rng.uniform(-0.3, 0.15 * seconds)
         release = seconds - rng.uniform(-0.5, 0.12 * seconds)
         left = rng.uniform(0.2, 0.7)
         shape = ease((t - begin) / onset) * (1 - (1 - left) * ease((t - release) / 0.4))

@@ -56,7 +56,8 @@ def build_text_cache(
     `similarity` names the encoder whose sentence embeddings say which captions mean the same; None is
     `encoder_name`.
     """
-    folder, captions = Path(folder), set(captions)
+    folder = Path(folder)
+    captions = set(captions)
     workers = workers if device == "cpu" else 1
     encoder = load_text_encoder(encoder_name, device=device)
     build_with_encoder(folder, captions, encoder, progress, encoder_name, workers)
@@ -75,7 +76,8 @@ class SentencesOnly:
 
     def __init__(self, encoder: TextEncoder) -> None:
         self._encoder = encoder
-        self.name, self.dim = f"{encoder.name}:sentences", encoder.dim
+        self.name = f"{encoder.name}:sentences"
+        self.dim = encoder.dim
 
     def encode(self, captions: Sequence[str]) -> EncodedText:
         sentence = self._encoder.encode(captions).sentence

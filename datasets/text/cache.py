@@ -50,13 +50,16 @@ class TextCache:
         self.encoder = info.encoder
         self.dim = info.dim
         try:
-            self._keys, self._sentence = map_npy(folder / "keys.npy"), map_npy(folder / "sentence.npy")
-            self._tokens, offsets = map_npy(folder / "tokens.npy"), map_npy(folder / "offsets.npy")
+            self._keys = map_npy(folder / "keys.npy")
+            self._sentence = map_npy(folder / "sentence.npy")
+            self._tokens = map_npy(folder / "tokens.npy")
+            offsets = map_npy(folder / "offsets.npy")
         except UserError as error:
             raise UserError(
                 f"{folder}: the text cache is damaged ({error}); run the text stage again"
             ) from None
-        n, dim = info.count, info.dim
+        n = info.count
+        dim = info.dim
         self._offsets = np.array(offsets)
         rows = int(offsets[-1]) if offsets.shape == (n + 1,) and offsets.dtype == np.int64 else -1
         wanted = {"keys": (n, 32), "sentence": (n, dim), "offsets": (n + 1,), "tokens": (rows, dim)}
@@ -96,7 +99,8 @@ class TextCache:
         import torch  # only batches pay for the import
 
         rows = self._rows(captions)
-        begin, length = self._offsets[rows], self._offsets[rows + 1] - self._offsets[rows]
+        begin = self._offsets[rows]
+        length = self._offsets[rows + 1] - self._offsets[rows]
         position = np.arange(length.max(initial=0))[None]
         mask = position < length[:, None]
         # Padding repeats the last token, then becomes 0: one gather is cheaper than filling by the mask.

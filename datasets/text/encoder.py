@@ -73,8 +73,10 @@ class MiniLmEncoder:
     def __init__(self, folder: Path, device: str = "cpu") -> None:
         try:
             facts, longest = map(_plain_json, (folder / "config.json", folder / "sentence_bert_config.json"))
-            self._heads, self._layers = int(facts["num_attention_heads"]), int(facts["num_hidden_layers"])
-            self.dim, self._eps = int(facts["hidden_size"]), float(facts["layer_norm_eps"])
+            self._heads = int(facts["num_attention_heads"])
+            self._layers = int(facts["num_hidden_layers"])
+            self.dim = int(facts["hidden_size"])
+            self._eps = float(facts["layer_norm_eps"])
             for name in ("model.safetensors", "tokenizer.json"):
                 require_plain(folder / name)
             weights = load_file(folder / "model.safetensors")

@@ -73,7 +73,8 @@ class Mate(nn.Module):
         if not widths:
             raise UserError("MATE needs at least one modality to read")
         self.config = config
-        self.widths, self.timed = dict(widths), frozenset(timed)
+        self.widths = dict(widths)
+        self.timed = frozenset(timed)
         dim = config.dim
         self.project = nn.ModuleDict(
             {name: nn.Linear(width * self._stride(name), dim) for name, width in widths.items()}
@@ -98,7 +99,8 @@ class Mate(nn.Module):
         if size is None:
             raise ValueError("without any modality the size of the batch must be given")
         first = self.aggregate.expand(size, -1)
-        pieces, masks = [], []
+        pieces = []
+        masks = []
         for name, width in self.widths.items():
             features, mask = self._modality(conditions.get(name), name, width, size)
             x = self.project[name](features.to(self.aggregate.dtype)) + self.modality[name]
@@ -140,11 +142,13 @@ class Mate(nn.Module):
             raise UserError(
                 f"MATE was built for {width} {name} features, the data has {condition.features.shape[-1]}"
             )
-        features, mask = condition.features.masked_fill(~condition.mask[..., None], 0.0), condition.mask
+        features = condition.features.masked_fill(~condition.mask[..., None], 0.0)
+        mask = condition.mask
         stride = self._stride(name)
         if stride > 1:
             more = -mask.shape[1] % stride
-            features, mask = nn.functional.pad(features, (0, 0, 0, more)), nn.functional.pad(mask, (0, more))
+            features = nn.functional.pad(features, (0, 0, 0, more))
+            mask = nn.functional.pad(mask, (0, more))
             rows, frames = mask.shape
             features = features.reshape(rows, frames // stride, stride * width)
             mask = mask.view(rows, frames // stride, stride).any(2)

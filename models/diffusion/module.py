@@ -35,7 +35,8 @@ class DenoiserModule(StageModule):
         bool [B, D] (optional: all). Time steps and noise are drawn in each call.
         """
         batch = self.prepared(batch)
-        motion, schedule = batch["motion"], self.net.config.schedule
+        motion = batch["motion"]
+        schedule = self.net.config.schedule
         mask = length_mask(batch["length"], motion.shape[1])
         step = torch.randint(0, schedule.steps, (len(motion),), device=motion.device)
         noise = torch.randn_like(motion)
@@ -92,13 +93,16 @@ class DmdModule(DenoiserModule):
     @torch.no_grad()
     def prepared(self, batch: Batch) -> Batch:
         """Return the batch with its motion in the tokenizer's coordinates, and their tokens as "codes"."""
-        tokenizer, motion, present = self.tokenizer.module, batch["motion"], batch.get("present")
+        tokenizer = self.tokenizer.module
+        motion = batch["motion"]
+        present = batch.get("present")
         length = (batch["length"] // GROUP_FRAMES).clamp(min=1) * GROUP_FRAMES
         codes = tokenizer.encode(motion, length, present)
         return {**batch, "motion": tokenizer.coordinates(motion, present), "length": length, "codes": codes}
 
     def predict(self, noisy: Tensor, step: Tensor, batch: Batch, mask: Tensor) -> Tensor:
-        length, size = batch["length"], -(-noisy.shape[1] // GROUP_FRAMES)
+        length = batch["length"]
+        size = -(-noisy.shape[1] // GROUP_FRAMES)
         hidden = hidden_stretch(length // GROUP_FRAMES, size, self.net.config.hide)
         predicted: Tensor = self.net(noisy, step, batch["codes"], length, hidden)
         return predicted
@@ -107,7 +111,8 @@ class DmdModule(DenoiserModule):
         """Return the mean over the real frames of all ranks (equation 10), and by `velocity_weight` that of
         the error between frames.
         """
-        loss, weight = super().mean(error, mask, present), self.net.config.velocity_weight
+        loss = super().mean(error, mask, present)
+        weight = self.net.config.velocity_weight
         # A difference of frames counts where both of them are real.
         if weight:
             loss = loss + weight * masked_mean(error.diff(dim=1).square(), mask[:, 1:], present)

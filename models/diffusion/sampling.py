@@ -185,7 +185,8 @@ class _Windows:
         overlap: int,
     ) -> None:
         self.net = net
-        self.frames, self.size = frames, min(window, frames)
+        self.frames = frames
+        self.size = min(window, frames)
         self.starts = window_starts(frames, window, overlap)
         cut = {name: self._cut(values, net.pattern.count(name)) for name, values in codes.items()}
         rows = next(iter(cut.values()))
@@ -204,7 +205,8 @@ class _Windows:
 
     def denoise(self, x: Tensor, step: Tensor) -> Tensor:
         """The network's prediction for motions x [n, T, D] at one time step."""
-        count, number = len(x), len(self.starts)
+        count = len(x)
+        number = len(self.starts)
         cut = torch.stack([x[:, s : s + self.size] for s in self.starts], dim=1).flatten(0, 1)
         mask = length_mask(self.length, self.size)
         found = self.net.denoise(cut, step.to(x.device).expand(len(cut)), self.condition, mask)

@@ -42,7 +42,8 @@ class EvaluatorModule(AlternatingModule):
     ) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
         self.decoder = net.decoder()
-        self.movement_optim, self.movement_steps = movement_optim, movement_steps
+        self.movement_optim = movement_optim
+        self.movement_steps = movement_steps
         self.loss_config = loss or EvaluatorLossConfig()
 
     def optimizer_groups(self) -> Sequence[OptimizerGroup]:
@@ -65,7 +66,10 @@ class EvaluatorModule(AlternatingModule):
 
     def losses_of(self, group: str, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         """Losses of "motion" [B, T, D], "length" [B], "conditions" with "text", optional "present" [B, D]."""
-        net, motion, length, present = self.net, batch["motion"], batch["length"], batch.get("present")
+        net = self.net
+        motion = batch["motion"]
+        length = batch["length"]
+        present = batch.get("present")
         if group == MATCHING:
             text = batch["conditions"]["text"]
             latents = net.encode_text(text.features, text.mask), net.encode_motion(motion, length, present)

@@ -73,7 +73,8 @@ class MovementEncoder(nn.Module):
 
     def forward(self, x: Tensor, *, dropout: bool = False) -> Tensor:
         """[B, T, D] -> units [B, T // 4, C]; `dropout` in training mode alone, of the autoencoder."""
-        x, drop = x.mT, dropout and self.training
+        x = x.mT
+        drop = dropout and self.training
         for layer in (self.first, self.second):
             x = F.leaky_relu(F.dropout(layer(x), self.rate, drop), _SLOPE)
         out: Tensor = self.out(x.mT)
@@ -154,7 +155,10 @@ class Evaluator(nn.Module):
         super().__init__()
         if max_frames < UNIT or max_frames % UNIT:
             raise ValueError(f"max_frames {max_frames} is no multiple of {UNIT}")
-        self.config, self.text_dim, self.classes, self.max_frames = config, text_dim, classes, max_frames
+        self.config = config
+        self.text_dim = text_dim
+        self.classes = classes
+        self.max_frames = max_frames
         columns = layout.part(PART)
         self.motion_dim = len(columns)
         unread = np.arange(layout.dim)[layout.slice(_UNREAD)] if layout.has(_UNREAD) else columns[:0]

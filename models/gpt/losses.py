@@ -61,7 +61,8 @@ def cross_entropy(
 
     With `per_clip` it is the mean over the clips of each clip's own mean.
     """
-    errors, mask = token_errors(logits, tokens), predicted(tokens, logits, known)
+    errors = token_errors(logits, tokens)
+    mask = predicted(tokens, logits, known)
     return mean_of_rows(errors[..., None], mask) if per_clip else masked_mean(errors, mask)
 
 
@@ -105,7 +106,8 @@ def soft_codes(
     after `groups` hold arbitrary codes.
     """
     # As many groups as fit, not as many as there are: reading a maximum back would wait for the device.
-    batch, size = len(logits), len(gpt.pattern)
+    batch = len(logits)
+    size = len(gpt.pattern)
     count = logits.shape[1] // size
     steps = logits[:, : count * size].view(batch, count, size, -1)
     valid = torch.arange(count, device=logits.device)[None, :, None, None] < groups[:, None, None, None]

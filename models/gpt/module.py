@@ -46,7 +46,8 @@ class GptModule(StageModule):
                 "align_weight > 0 needs a trained tokenizer and a trained TMA; set align_weight: 0"
             )
         _check(net, tokenizer, tma)
-        self.tokenizer, self.tma = Frozen(tokenizer), Frozen(tma)
+        self.tokenizer = Frozen(tokenizer)
+        self.tma = Frozen(tma)
         self.compilable = self.loss_config.align_on != "samples"
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
@@ -58,10 +59,14 @@ class GptModule(StageModule):
         at that part's codes, which are neither read nor predicted, and "present" bool [B, C], the tokenizer's
         columns that they hold (both optional: all).
         """
-        net, config = self.net, self.net.config
-        tokens, kinds, text = batch["tokens"], batch["kinds"], batch["text"]
+        net = self.net
+        config = self.net.config
+        tokens = batch["tokens"]
+        kinds = batch["kinds"]
+        text = batch["text"]
         known = batch.get("known")
-        inputs, drop = None, None
+        inputs = None
+        drop = None
         if self.training:
             drop = torch.rand(len(text), device=text.device) < config.condition_dropout
             if config.pkeep < 1:
@@ -109,7 +114,8 @@ class GptModule(StageModule):
         )
 
     def _align_samples(self, batch: Batch, latent: Tensor, tokenizer: Tokenizer, tma: Tma) -> Tensor:
-        config, known = self.loss_config, batch.get("known")
+        config = self.loss_config
+        known = batch.get("known")
         count = config.samples if self.training else 1
         drawn = sample(self.net, batch["text"], count)
         reward = rewards(

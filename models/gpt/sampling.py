@@ -166,22 +166,28 @@ class Rows:
         how: Drawing,
         scale: Tensor | None,
     ) -> None:
-        self.how, self.size = how, len(network.pattern)
-        self.first, self.last = 0, 0
+        self.how = how
+        self.size = len(network.pattern)
+        self.first = 0
+        self.last = 0
         if len(limit):
             self.first, self.last = int(before.min()) * self.size, int((before + limit).max()) * self.size
         self.at = torch.full((1,), self.first, device=limit.device)
         """Number of the token to draw, int64 [1]."""
         self.tokens = functional.pad(start, (0, max(0, self.last - start.shape[1])))
         """int64 [B, N * P]; behind a row's End or limit they mean nothing."""
-        self.before, self.limit, self.scale = before, limit, scale
+        self.before = before
+        self.limit = limit
+        self.scale = scale
         number = torch.arange(self.tokens.shape[1], device=limit.device)
-        group, slot = number // self.size, number % self.size
+        group = number // self.size
+        slot = number % self.size
         self.new = group >= before[:, None]
         # Draws count from a row's first new token, whatever it starts from.
         index = (number - before[:, None] * self.size).clamp(0, max(0, uniform.shape[1] - 1))
         self.draws = uniform.gather(1, index)
-        self.kinds, self.end = network.slots[slot], network.ends[network.slots[0]]
+        self.kinds = network.slots[slot]
+        self.end = network.ends[network.slots[0]]
         # A motion is never empty, so its first group cannot be End.
         may_end = (slot == 0) & (group > before[:, None]) & free
         self.rules = self.kinds * 2 + may_end
@@ -199,7 +205,8 @@ class Rows:
 
         Nothing here waits for the device, and no shape depends on what lies there.
         """
-        at, kind = self.at, self.kinds.index_select(0, self.at)
+        at = self.at
+        kind = self.kinds.index_select(0, self.at)
         # One product for all streams' heads, of which one is taken.
         heads = functional.linear(hidden[:, 0].to(self.weight.dtype), self.weight, self.bias)
         logits = heads.view(len(heads), -1, self.illegal.shape[1]).index_select(1, kind)[:, 0].float()
@@ -266,7 +273,8 @@ class FixedSteps:
         for name, value in vars(rows).items():
             if isinstance(value, Tensor):
                 getattr(self.rows, name).copy_(value)
-        self.rows.first, self.rows.last = rows.first, rows.last
+        self.rows.first = rows.first
+        self.rows.last = rows.last
         self.cache.clear()
         tokens, counts = self.rows.run(lambda _: self.step())
         return tokens.clone(), counts
@@ -319,16 +327,19 @@ def generate(
         Codes per stream int64 [B, G * per_group], 0 after each sample's `groups`; G is the longest sample's
         length.
     """
-    batch, device = len(text), text.device
+    batch = len(text)
+    device = text.device
     limit = requested_groups(groups, batch, most=gpt.max_groups, limit=gpt.max_groups, device=device)
     gpt.require_guidance(cfg_scale)
-    size, most = len(gpt.pattern), int(limit.max()) if batch else 0
+    size = len(gpt.pattern)
+    most = int(limit.max()) if batch else 0
     fixed = device.type in _FIXED and batch > 0
     room = -(-most * size // _ROOM) * _ROOM if fixed else most * size
     # All numbers are drawn before the loop, so that a row does not depend on the others' lengths.
     uniform = uniform_numbers(seeds_of(seed, batch, "texts"), room, device)
     scale = torch.full((batch,), cfg_scale, device=device) if cfg_scale != 1 else None
-    start, before = torch.zeros(batch, room, dtype=torch.int64, device=device), torch.zeros_like(limit)
+    start = torch.zeros(batch, room, dtype=torch.int64, device=device)
+    before = torch.zeros_like(limit)
     with evaluating(gpt):
         first = gpt.embed_text(text)
         if scale is not None:

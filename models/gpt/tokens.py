@@ -107,15 +107,19 @@ def interleave(
         groups: Valid groups per clip, [B] (default: all G). Codes after them are ignored.
         closed: Bool [B], rows that get their End tokens (default: all); the others are clips that go on.
     """
-    names, slots = stream_names(pattern), slot_codes(codes, pattern)
-    (batch, count), device, body = slots.shape[:2], slots.device, slots.flatten(1)
+    names = stream_names(pattern)
+    slots = slot_codes(codes, pattern)
+    (batch, count) = slots.shape[:2]
+    device = slots.device
+    body = slots.flatten(1)
     if groups is None:
         groups = torch.full((batch,), count, dtype=torch.int64, device=device)
     kinds = _numbers(kind_of_slot(pattern), device).repeat(count).expand(batch, -1)
     length = groups * len(pattern)
     # Padding lies behind each row's own tokens, not at the end of each stream.
     valid = torch.arange(body.shape[1], device=device)[None] < length[:, None]
-    tokens, kinds = torch.where(valid, body, PAD), torch.where(valid, kinds, 0)
+    tokens = torch.where(valid, body, PAD)
+    kinds = torch.where(valid, kinds, 0)
     if ends is None:
         return TokenSequence(tokens, kinds, length)
     if closed is None:
@@ -144,7 +148,8 @@ def as_codes(tokens: Tensor, pattern: Sequence[str], groups: Tensor) -> Codes:
     """Tokens int64 [B, N, P] of `groups` [B] groups a row as streams; 0 after a shorter row."""
     longest = int(groups.max()) if len(groups) else 0
     inside = torch.arange(longest, device=tokens.device)[None, :, None] < groups[:, None, None]
-    rows, kinds = torch.where(inside, tokens[:, :longest], 0), kind_of_slot(pattern)
+    rows = torch.where(inside, tokens[:, :longest], 0)
+    kinds = kind_of_slot(pattern)
     names = stream_names(pattern)
     slots = {name: [slot for slot, kind in enumerate(kinds) if names[kind] == name] for name in names}
     return Codes({name: rows[:, :, here].flatten(1) for name, here in slots.items()}, groups)

@@ -65,7 +65,8 @@ def added_mask(mask: Tensor, x: Tensor) -> Tensor:
     in the type in which they are computed on x.
     """
     mask = mask[:, None, None, :] if mask.dim() == 2 else mask[:, None]
-    kind, size = product_type(x), mask.shape[-1]
+    kind = product_type(x)
+    size = mask.shape[-1]
     # Kernels of GPUs read rows that begin at multiples of 8, and copy others in every layer.
     hidden = F.pad(~mask, (0, -size % 8), value=True)
     return torch.zeros(hidden.shape, dtype=kind, device=x.device).masked_fill_(hidden, -torch.inf)[..., :size]
@@ -78,7 +79,8 @@ class LayerCache:
     """
 
     def __init__(self, size: int, at: Tensor | None = None) -> None:
-        self.size, self.at = size, at
+        self.size = size
+        self.at = at
         self.length = 0
         self.pairs: Tensor | None = None
 
@@ -108,7 +110,8 @@ class KVCache:
     """
 
     def __init__(self, layers: int, size: int, at: Tensor | None = None) -> None:
-        self.size, self.at = size, at
+        self.size = size
+        self.at = at
         self.layers = [LayerCache(size, at) for _ in range(layers)]
         self._masks: Tensor | None = None
 

@@ -29,7 +29,9 @@ from motionloom.datasets.motion.layout import BODY_JOINTS, WRISTS, MotionLayout
 
 FINGERS = (2, 5, 3)
 """Hands, fingers of a hand, joints of a finger from the wrist outwards: the order of `smplx52`."""
-INDEX, MIDDLE, PINKY = 0, 1, 2
+INDEX = 0
+MIDDLE = 1
+PINKY = 2
 
 
 class Basis(nn.Module):
@@ -54,7 +56,8 @@ class Basis(nn.Module):
         root = np.arange(layout.slice("positions").start) if layout.has("positions") else columns[:0]
         gain = np.where(np.isin(columns, root), root_gain, 1.0)
         self.register_buffer("gain", torch.as_tensor(gain, dtype=torch.float32), persistent=False)
-        self.louder, self.bends = root_gain != 1, finger_gain > 0
+        self.louder = root_gain != 1
+        self.bends = finger_gain > 0
         if not self.bends:
             return
         if not layout.has("positions"):

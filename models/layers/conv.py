@@ -37,7 +37,9 @@ class Conv(nn.Conv1d):
     def forward(self, x: Tensor) -> Tensor:
         if self.kernel_size == self.stride == (1,):
             return functional.linear(x, self.weight[..., 0], self.bias)
-        step, padding, dilation = (1, *self.stride), (0, int(self.padding[0])), (1, *self.dilation)
+        step = (1, *self.stride)
+        padding = (0, int(self.padding[0]))
+        dilation = (1, *self.dilation)
         weight = self.weight[:, :, None]
         out = functional.conv2d(x.mT[:, :, None], weight, self.bias, step, padding, dilation)
         return out[:, :, 0].mT
@@ -47,7 +49,9 @@ class ConvTranspose(nn.ConvTranspose1d):
     """`nn.ConvTranspose1d` of [B, T, C], for the same reason."""
 
     def forward(self, x: Tensor, output_size: list[int] | None = None) -> Tensor:
-        step, padding, weight = (1, *self.stride), (0, int(self.padding[0])), self.weight[:, :, None]
+        step = (1, *self.stride)
+        padding = (0, int(self.padding[0]))
+        weight = self.weight[:, :, None]
         return functional.conv_transpose2d(x.mT[:, :, None], weight, self.bias, step, padding)[:, :, 0].mT
 
 

@@ -27,7 +27,8 @@ def recorded(step: Callable[[], None], device: torch.device) -> Callable[[], Non
     if device.type != "cuda":
         step()
         return step
-    current, graph = torch.cuda.current_stream(device), torch.cuda.CUDAGraph()
+    current = torch.cuda.current_stream(device)
+    graph = torch.cuda.CUDAGraph()
     side = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
     side.wait_stream(current)
     # A place that is written once a step needs no sorting of indices, as places do in deterministic mode.

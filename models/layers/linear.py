@@ -28,7 +28,8 @@ class Linear(nn.Linear):
 
     def filled_up(self, x: Tensor) -> Tensor:
         """The same [..., out_features] of x [..., in_features], by a product of even sizes."""
-        columns, rows = -self.in_features % 8, -self.out_features % 8
+        columns = -self.in_features % 8
+        rows = -self.out_features % 8
         x = F.pad(x.to(product_type(x)), (0, columns))
         bias = None if self.bias is None else F.pad(self.bias, (0, rows))
         out = F.linear(x, F.pad(self.weight, (0, columns, 0, rows)), bias)

@@ -167,7 +167,8 @@ class Transformer(nn.Module):
     ) -> None:
         super().__init__()
         assert config.width is not None
-        dim, drop = config.width[1], config.dropout
+        dim = config.width[1]
+        drop = config.dropout
         inner = drop if attention_dropout is None else attention_dropout
         self.blocks = nn.ModuleList(
             Block(dim, config.heads, config.ff, drop, inner, norm, memory, qkv_bias) for _ in range(layers)
@@ -198,7 +199,8 @@ class Transformer(nn.Module):
         added, beside = (None if one is None else added_mask(one, x) for one in (mask, memory_mask))
         if mask is None and cache is not None:
             added = cache.mask(x)
-        given, seen = (added, causal), (memory, beside)
+        given = (added, causal)
+        seen = (memory, beside)
 
         def step(index: int, x: Tensor) -> Tensor:
             if cache is None:

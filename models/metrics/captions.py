@@ -39,7 +39,8 @@ def bleu(candidates: Sequence[Words], references: Sequence[Sequence[Words]]) -> 
     The brevity penalty compares with the reference nearest in length, of two the shorter one.
     """
     length = nearest = 0
-    hits, counts = [0] * ORDER, [0] * ORDER
+    hits = [0] * ORDER
+    counts = [0] * ORDER
     for words, known in zip(candidates, references, strict=True):
         length += len(words)
         nearest += min((abs(len(one) - len(words)), len(one)) for one in known)[1]
@@ -50,7 +51,8 @@ def bleu(candidates: Sequence[Words], references: Sequence[Sequence[Words]]) -> 
             hits[n - 1] += (_ngrams(words, n) & most).total()
             counts[n - 1] += max(len(words) - n + 1, 0)
     brevity = 1.0 if length >= nearest else math.exp(1 - nearest / length) if length else 0.0
-    out, product = [], 1.0
+    out = []
+    product = 1.0
     for n in range(1, ORDER + 1):
         product *= hits[n - 1] / counts[n - 1] if counts[n - 1] else 0.0
         out.append(brevity * product ** (1 / n))
@@ -88,7 +90,8 @@ def cider_d(candidates: Sequence[Words], references: Sequence[Sequence[Words]]) 
 
     out = []
     for words, known in zip(candidates, references, strict=True):
-        own, total = vectors(words), 0.0
+        own = vectors(words)
+        total = 0.0
         for one in known:
             # Lengths are counted in pairs of words, as COCO's code counts them.
             apart = max(len(words) - 1, 0) - max(len(one) - 1, 0)
@@ -114,7 +117,8 @@ def bert_score(candidate: Tensor, reference: Tensor) -> tuple[float, float, floa
     cosines = functional.normalize(candidate.double(), dim=-1) @ (
         functional.normalize(reference.double(), dim=-1).t()
     )
-    precision, recall = float(cosines[1:-1].amax(1).mean()), float(cosines[:, 1:-1].amax(0).mean())
+    precision = float(cosines[1:-1].amax(1).mean())
+    recall = float(cosines[:, 1:-1].amax(0).mean())
     total = precision + recall
     return precision, recall, 2 * precision * recall / total if total else 0.0
 

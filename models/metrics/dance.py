@@ -33,7 +33,8 @@ def normalized_by(true: NDArray[np.floating], features: NDArray[np.floating]) ->
     generated motions agree on them the figures are the published ones.
     """
     reference = np.asarray(true, dtype=np.float64)
-    mean, std = reference.mean(0), reference.std(0)
+    mean = reference.mean(0)
+    std = reference.std(0)
     constant = std <= 1e-9 * np.maximum(1.0, np.abs(mean))
     return np.asarray((np.asarray(features, dtype=np.float64) - mean) / np.where(constant, 1.0, std + 1e-10))
 

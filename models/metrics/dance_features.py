@@ -50,7 +50,8 @@ def kinetic_features(joints: NDArray[np.floating]) -> Array:
     velocity = _windowed(steps, 1, len(x)) / KINETIC_SECONDS
     horizontal = (velocity[..., [0, 2]] ** 2).sum(-1).mean(0)
     vertical = (velocity[..., 1] ** 2).mean(0)
-    after, before = steps[1:] / KINETIC_SECONDS, x[1:-1] - x[:-2] / KINETIC_SECONDS
+    after = steps[1:] / KINETIC_SECONDS
+    before = x[1:-1] - x[:-2] / KINETIC_SECONDS
     change = _windowed((after - before) / KINETIC_SECONDS, 1, len(x))
     spent = np.linalg.norm(change, axis=-1).mean(0)
     return np.stack([horizontal, vertical, spent], axis=-1).reshape(-1)

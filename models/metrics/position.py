@@ -50,7 +50,8 @@ def position_errors(
         real: The recorded one.
         sides: (left, right) joints that say where the body faces; `PUBLIC_SIDES` for public code's figures.
     """
-    ape, ave = [], []
+    ape = []
+    ave = []
     for one, other in zip(_views(made, sides), _views(real, sides), strict=True):
         ape.append(torch.linalg.vector_norm(one - other, dim=-1).mean().item())
         ave.append(torch.linalg.vector_norm(one.var(0) - other.var(0), dim=-1).mean().item())
@@ -61,7 +62,8 @@ def _views(joints: Tensor, sides: tuple[tuple[int, int], ...]) -> tuple[Tensor, 
     """Joints [T, N, 3], the pose without the root [T, N - 1, 3], the root [T, 3] and its path [T, 2]."""
     joints = joints.double()
     height = joints[:, _FEET, 1].amin(-1)
-    low, high = height.min(), height.max()
+    low = height.min()
+    high = height.max()
     # A soft minimum, so that one bad frame does not decide.
     floor = low - torch.log(_SOFTNESS + torch.exp(low - high))
     across = sum(joints[:, left] - joints[:, right] for left, right in sides)
@@ -78,6 +80,7 @@ def _views(joints: Tensor, sides: tuple[tuple[int, int], ...]) -> tuple[Tensor, 
 
 def _turned(joints: Tensor, forward: Tensor) -> Tensor:
     """Joints [T, N, 3] seen from one who faces `forward` [T or 1, 2], (x, z) of length 1."""
-    sin, cos = forward[:, None, 0], forward[:, None, 1]
+    sin = forward[:, None, 0]
+    cos = forward[:, None, 1]
     x, y, z = joints.unbind(-1)
     return torch.stack([cos * x - sin * z, y, sin * x + cos * z], dim=-1)

@@ -30,7 +30,8 @@ class JointErrors(NamedTuple):
 
     def means(self) -> dict[str, float]:
         """MPJPE and PA-MPJPE per frame (mm), ACCEL per inner frame (mm / frame^2)."""
-        frames, inner = self.frames.clamp(min=1), self.accel_frames.clamp(min=1)
+        frames = self.frames.clamp(min=1)
+        inner = self.accel_frames.clamp(min=1)
         return {
             "mpjpe": (self.mpjpe / frames).item(),
             "pa_mpjpe": (self.pa_mpjpe / frames).item(),
@@ -41,15 +42,18 @@ class JointErrors(NamedTuple):
 def mpjpe(pred: Tensor, target: Tensor, *, root: int | None = 0) -> Tensor:
     """Mean joint distance in mm, [..., T, N, 3] -> [..., T], with joint `root` of both at the origin."""
     if root is not None:
-        pred, target = pred - pred[..., root : root + 1, :], target - target[..., root : root + 1, :]
+        pred = pred - pred[..., root : root + 1, :]
+        target = target - target[..., root : root + 1, :]
     out: Tensor = 1000 * torch.linalg.vector_norm(pred - target, dim=-1).mean(-1)
     return out
 
 
 def procrustes(pred: Tensor, target: Tensor) -> Tensor:
     """`pred` [..., N, 3] under the similarity transform nearest to `target` (least squares)."""
-    pred_mean, target_mean = pred.mean(-2, keepdim=True), target.mean(-2, keepdim=True)
-    a, b = pred - pred_mean, target - target_mean
+    pred_mean = pred.mean(-2, keepdim=True)
+    target_mean = target.mean(-2, keepdim=True)
+    a = pred - pred_mean
+    b = target - target_mean
     u, s, vh = torch.linalg.svd(a.mT @ b)
     # A reflection is not a rigid motion: the direction of the smallest singular value is flipped back.
     sign = torch.ones_like(s)
@@ -81,7 +85,8 @@ def joint_errors(
     frame first (an index into the full skeleton); ACCEL does not, as in the public metrics. What lies behind
     `length` is never read.
     """
-    pred, target = pred.double(), target.double()
+    pred = pred.double()
+    target = target.double()
     keep = slice(None) if joints is None else joints
     real = length_mask(length, pred.shape[1])
     moved = (pred - pred[:, :, root : root + 1])[real][:, keep]

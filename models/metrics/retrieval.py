@@ -57,9 +57,11 @@ def recall(
     Returns:
         "t2m/R@1" ..., "t2m/MedR" (1 = first), the same for "m2t", and "size", the number of candidates.
     """
-    text, motion = text.double(), motion.double()
+    text = text.double()
+    motion = motion.double()
     if distance == "cosine":
-        text, motion = F.normalize(text, dim=-1), F.normalize(motion, dim=-1)
+        text = F.normalize(text, dim=-1)
+        motion = F.normalize(motion, dim=-1)
     found: dict[str, list[Tensor]] = {"t2m": [], "m2t": []}
     batches = _batches(text, motion, batch, None if batch is None else seed)
     # Each batch is a set of candidates of its own; ranks of all batches are averaged together.
@@ -150,8 +152,10 @@ def accuracy_among(
     # The largest draws choose without replacement; texts that mean the same are never chosen.
     draws = torch.rand(count, count, generator=generator, dtype=torch.float64).masked_fill(~allowed, -1.0)
     others = draws.topk(candidates - 1, dim=1).indices.to(motion.device)
-    motion, text = F.normalize(motion.double(), dim=-1), F.normalize(text.double(), dim=-1)
+    motion = F.normalize(motion.double(), dim=-1)
+    text = F.normalize(text.double(), dim=-1)
     near = (motion @ text.T).nan_to_num(nan=-1.0)
-    own, rest = near.diagonal()[:, None], near.gather(1, others)
+    own = near.diagonal()[:, None]
+    rest = near.gather(1, others)
     rank = (rest > own).sum(1) + 0.5 * (rest == own).sum(1)
     return {f"top-{k}": float((rank < k).double().mean()) for k in tops}

@@ -124,7 +124,8 @@ class LearntCodebook(nn.Module):
             counts = code_sums(real.float(), codes, self.config.num_codes)
             # Both sides are masked before they meet: a padded NaN would otherwise be in the gradient.
             outside = ~real.view(z.shape[:-1])[..., None]
-            latents, near = full.masked_fill(outside, 0.0), chosen.masked_fill(outside, 0.0)
+            latents = full.masked_fill(outside, 0.0)
+            near = chosen.masked_fill(outside, 0.0)
             resets = counts.new_zeros(())
             if update:
                 counts, resets = self._update(rows, real, codes, counts)

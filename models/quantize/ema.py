@@ -68,7 +68,9 @@ class EmaQuantizer(LearntCodebook):
         if is_distributed():
             packed = sum_over_ranks(torch.cat([sums, fresh, counts[:, None]], dim=1))
             dim = self.config.dim
-            sums, fresh, counts = packed[:, :dim], packed[:, dim:-1], packed[:, -1]
+            sums = packed[:, :dim]
+            fresh = packed[:, dim:-1]
+            counts = packed[:, -1]
         floor = self.config.reset_below
         # A batch without vectors (no clip of it has hands) teaches nothing: everything stays as it is.
         rate = torch.where(counts.sum() > 0, 1 - self.config.decay, 0.0)

@@ -31,16 +31,21 @@ class TmaModule(StageModule):
         Latents are sampled in training and are the means in evaluation. InfoNCE contrasts the means, as the
         published HumanTOMATO code does (TMR contrasts samples): retrieval uses the means too.
         """
-        net, config = self.net, self.loss_config
-        motion, length, present = batch["motion"], batch["length"], batch.get("present")
+        net = self.net
+        config = self.loss_config
+        motion = batch["motion"]
+        length = batch["length"]
+        present = batch.get("present")
         text_features = batch["conditions"]["text"]
         text = net.encode_text(text_features.features, text_features.mask)
         encoded_motion = net.encode_motion(motion, length, present)
-        z_text, z_motion = self._sample(*text), self._sample(*encoded_motion)
+        z_text = self._sample(*text)
+        z_motion = self._sample(*encoded_motion)
 
         # Both latents are decoded and compared with the motion that the encoder saw.
         subsampled, frames = net.subsample(motion, length)
-        target, mask = net.coordinates(subsampled, present), length_mask(frames, subsampled.shape[1])
+        target = net.coordinates(subsampled, present)
+        mask = length_mask(frames, subsampled.shape[1])
         both = net.decode_coordinates(torch.cat([z_text, z_motion]), length.repeat(2), motion.shape[1])
         from_text, from_motion = both.chunk(2)
         losses = {

@@ -95,10 +95,13 @@ class H2VQ(BodyHandTokenizer):
 
     def __init__(self, config: H2VQConfig, layout: MotionLayout) -> None:
         super().__init__(config, layout)
-        sizes, d = config.conv_sizes(), config.code_dim
-        hand, body = self.hand_columns, self.body_columns
+        sizes = config.conv_sizes()
+        d = config.code_dim
+        hand = self.hand_columns
+        body = self.body_columns
         if self.basis.bends:
-            hand, body = self.basis.bent, torch.cat([body, self.basis.knuckles])
+            hand = self.basis.bent
+            body = torch.cat([body, self.basis.knuckles])
         self.register_buffer("hand_input_columns", hand, persistent=False)
         self.register_buffer("body_input_columns", body, persistent=False)
         self.hand_encoder = ConvEncoder(len(hand), d, halvings=2, **sizes)
@@ -141,7 +144,8 @@ class SeparateVQ(BodyHandTokenizer):
     def __init__(self, config: SeparateConfig, layout: MotionLayout) -> None:
         super().__init__(config, layout)
         columns = {"body": self.body_columns, "hand": self.hand_columns}
-        sizes, d = config.conv_sizes(), config.code_dim
+        sizes = config.conv_sizes()
+        d = config.code_dim
         self.encoders = nn.ModuleDict(
             {
                 name: ConvEncoder(len(where), d, halvings=_HALVINGS[name], **sizes)
@@ -176,7 +180,8 @@ class SeparateVQ(BodyHandTokenizer):
             z = self.encoders[name](x[..., getattr(self, f"{name}_columns")], valid)
             absent = missing.get(name)
             out = self._book(name)(z, token_mask(valid, z.shape[1], 2**halvings, absent), update=update)
-            vectors[name], codes[name] = without(out.quantized, absent), out.codes
+            vectors[name] = without(out.quantized, absent)
+            codes[name] = out.codes
             metrics |= stream_metrics(out.metrics, name)
             penalty = penalty + out.penalty
         return Latents(self._join(vectors), penalty, codes, metrics)

@@ -21,7 +21,8 @@ def reconstruction_loss(
     `kind`: "l1" absolute error; "l2" squared error; "smooth_l1" Huber with threshold 1. `present` bool
     [B, D]; None = all.
     """
-    recon, target = recon.float(), target.float()
+    recon = recon.float()
+    target = target.float()
     error = _ERRORS[kind](recon, target, reduction="none")
     if length is None and present is None:
         return error.mean()
@@ -46,11 +47,15 @@ def tokenizer_losses(net: Tokenizer, batch: Batch) -> tuple[dict[str, Tensor], T
     each of those with a weight, and per stream `perplexity_<stream>`, `usage_`, `dead_`, `resets_`,
     `penalty_`.
     """
-    motion, length, present = batch["motion"], batch["length"], batch.get("present")
+    motion = batch["motion"]
+    length = batch["length"]
+    present = batch.get("present")
     if batch.get("full", False):
         length = present = None
-    config, out = net.config, net(motion, length, present)
-    made, target = out.reconstruction, out.input
+    config = net.config
+    out = net(motion, length, present)
+    made = out.reconstruction
+    target = out.input
     recon = reconstruction_loss(made, target, length, config.recon, present)
     terms = {"recon": recon, "commit": out.penalty}
     loss = recon + config.commitment() * out.penalty

@@ -131,7 +131,8 @@ class SingleTokenizer(Tokenizer):
             names = ("code",)
         streams = tuple(Stream(name, config.num_codes, 1) for name in names)
         super().__init__(config, layout, config.part, streams, names)
-        sizes, dim = config.conv_sizes(), config.code_dim
+        sizes = config.conv_sizes()
+        dim = config.code_dim
         self.encoder = ConvEncoder(self.dim, dim, halvings=2, **sizes)
         self.quantizer = ResidualQuantizer(config.quantizer(), len(names))
         self.decoder = ConvDecoder(dim, self.dim, doublings=2, **sizes)
@@ -187,7 +188,8 @@ class FsqTokenizer(OneCodebook):
     def __init__(self, config: FsqConfig, layout: MotionLayout) -> None:
         quantizer = FsqQuantizer(config.code_dim, config.steps)
         super().__init__(config, layout, config.part, (Stream("code", quantizer.num_codes, 1),), ("code",))
-        sizes, dim = config.conv_sizes(), config.code_dim
+        sizes = config.conv_sizes()
+        dim = config.code_dim
         self.encoder = ConvEncoder(self.dim, dim, halvings=2, **sizes)
         self.quantizer = quantizer
         self.decoder = ConvDecoder(dim, self.dim, doublings=2, **sizes)
@@ -202,7 +204,8 @@ class MotionQuantizer(OneCodebook):
 
     def __init__(self, config: MqConfig, layout: MotionLayout) -> None:
         super().__init__(config, layout, config.part, (Stream("code", config.num_codes, 1),), ("code",))
-        sizes, dim = config.conv_sizes(), config.code_dim
+        sizes = config.conv_sizes()
+        dim = config.code_dim
         self.encoder = StridedEncoder(self.dim, dim, **sizes)
         kind = GradientQuantizer if config.quantizer == "gradient" else EmaQuantizer
         self.quantizer = kind(config.codebook())

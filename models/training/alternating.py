@@ -134,7 +134,8 @@ class AlternatingModule(StageModule):
         self._parts.append(batch)
         if len(self._parts) < self.accumulate:
             return None
-        parts, self._parts = self._parts, []
+        parts = self._parts
+        self._parts = []
         # The mean over ranks is taken in every turn; a Trainer's DDP must not wait for gradients as well.
         strategy = None if self._trainer is None else self._trainer.strategy
         with getattr(strategy, "block_backward_sync", nullcontext)():
@@ -147,7 +148,8 @@ class AlternatingModule(StageModule):
 
     def _take_turns(self, parts: list[Batch]) -> Tensor:
         shared: list[dict[str, Tensor]] = [{} for _ in parts]
-        self.gauges, first = {}, None
+        self.gauges = {}
+        first = None
         for number, turn in enumerate(self._turns):
             if not turn.group.steps_at(self.step):
                 continue
@@ -177,7 +179,8 @@ class AlternatingModule(StageModule):
 
     def _step_of(self, turn: _Turn) -> None:
         """Average and clip a group's gradients and step its optimizer, if it has any gradient."""
-        group, optimizer = turn.group, turn.optimizer
+        group = turn.group
+        optimizer = turn.optimizer
         mean_gradients(turn.params)
         if all(param.grad is None for param in turn.params):
             return

@@ -55,7 +55,8 @@ def require_batch(batch: Mapping[str, object], net: nn.Module) -> None:
     for name, value in batch.items():
         if isinstance(value, Tensor) and value.dtype == torch.float64 != own:
             raise UserError(f"batch: '{name}' is float64 and the network {own}; give {name}.float()")
-    length, motion = batch.get("length"), batch.get("motion")
+    length = batch.get("length")
+    motion = batch.get("motion")
     if not isinstance(length, Tensor):
         return
     most = motion.shape[1] if isinstance(motion, Tensor) and motion.dim() == 3 else None

@@ -44,7 +44,8 @@ class AveragedWeights(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         self.begin(module.net)
-        self._step, self._over = module.step, False
+        self._step = module.step
+        self._over = False
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *_: object) -> None:
         if module.step > self._step and self.average is not None:  # behind the last part of a step

@@ -34,7 +34,9 @@ class Compiled:
     def __init__(
         self, losses: Callable[..., dict[str, Tensor]], net: nn.Module, *, graphs: bool = False
     ) -> None:
-        self.losses, self.net, self.graphs = losses, net, graphs
+        self.losses = losses
+        self.net = net
+        self.graphs = graphs
         self.compiled: Callable[..., dict[str, Tensor]] | None = None
 
     def __call__(self, *arguments: Any) -> dict[str, Tensor]:
@@ -60,7 +62,8 @@ class Compiled:
         reason = getattr(error, "inner_exception", error)
         first = next(iter(str(reason).strip().splitlines()), type(reason).__name__)
         warnings.warn(f"torch.compile failed, training goes on without: {first}", stacklevel=3)
-        self.compiled, self.graphs = self.losses, False
+        self.compiled = self.losses
+        self.graphs = False
 
     def _compile(self) -> Callable[..., dict[str, Tensor]]:
         from torch._dynamo import config

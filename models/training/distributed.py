@@ -22,7 +22,8 @@ _alone = False
 def alone() -> Iterator[None]:
     """Context in which no collective is called although a process group exists."""
     global _alone
-    before, _alone = _alone, True
+    before = _alone
+    _alone = True
     try:
         yield
     finally:

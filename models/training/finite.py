@@ -57,14 +57,16 @@ class Failure:
 
 def first_failure(module: Recorder) -> Failure | None:
     """Return the first failure among the figures of the latest steps, which are cleared."""
-    figures, norms = module.figures[:], module.norms[:]
+    figures = module.figures[:]
+    norms = module.norms[:]
     module.figures.clear()
     module.norms.clear()
     failures: list[Failure] = []
     if figures:
         values = torch.cat([part.values for part in figures]).tolist()
         for part in figures:
-            own, values = dict(zip(part.names, values, strict=False)), values[len(part.names) :]
+            own = dict(zip(part.names, values, strict=False))
+            values = values[len(part.names) :]
             terms = {name: value for name, value in own.items() if not math.isfinite(value)}
             if any(_is_loss(name) for name in terms):
                 failures.append(

@@ -38,7 +38,8 @@ class JointsModule(StageModule):
         loss: Config,
     ) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.layout, self.loss_config = layout, loss
+        self.layout = layout
+        self.loss_config = loss
         for name, values in (("mean", mean), ("std", std)):
             self.register_buffer(name, torch.as_tensor(values), persistent=False)
 

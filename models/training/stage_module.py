@@ -324,13 +324,15 @@ class StageModule(L.LightningModule, ABC):
     def saved_state(self) -> Callable[[], None]:
         """Return a function that restores buffers (codebooks) and figures, to repeat a part of a step."""
         buffers = {name: buffer.clone() for name, buffer in self.named_buffers()}
-        figures, sums = list(self.figures), dict(self._sums)
+        figures = list(self.figures)
+        sums = dict(self._sums)
 
         def restore() -> None:
             for name, buffer in self.named_buffers():
                 buffer.copy_(buffers[name])
             self.load_state_dict(buffers, strict=False)  # codebooks read from theirs whether they have begun
-            self.figures, self._sums = figures, sums
+            self.figures = figures
+            self._sums = sums
 
         return restore
 

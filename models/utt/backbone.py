@@ -80,7 +80,8 @@ class PrefixGru(nn.Module):
         """Read the prefix; a GRU needs no room, so `size` is ignored."""
         # The first position last, before it the others' real ones, in order; padding goes after them all,
         # where it is not read any more.
-        prefix, mask = prefix.roll(-1, dims=1), mask.roll(-1, dims=1)
+        prefix = prefix.roll(-1, dims=1)
+        mask = mask.roll(-1, dims=1)
         order = (~mask).long().argsort(dim=1, stable=True)
         x = prefix.gather(1, order[..., None].expand_as(prefix))
         last = (mask.sum(1) - 1).clamp(min=0)[:, None, None].expand(-1, 1, x.shape[2])

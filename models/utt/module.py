@@ -105,22 +105,29 @@ class UttModule(AlternatingModule):
 
     def sequences(self, batch: Batch) -> TokenSequence:
         """Tokens of a batch's motion, as the frozen tokenizer makes them."""
-        tokenizer, net = self.tokenizer.module, self.net.utt
+        tokenizer = self.tokenizer.module
+        net = self.net.utt
         groups = (batch["length"] // GROUP_FRAMES).clamp(min=1)
         with torch.no_grad():
             codes = tokenizer.encode(batch["motion"], groups * GROUP_FRAMES, batch.get("present"))
         return interleave(codes, net.pattern, ends=net.num_codes, groups=groups, closed=batch["closed"])
 
     def _tokens(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
-        net, config = self.net.utt, self.net.utt.config
+        net = self.net.utt
+        config = self.net.utt.config
         sequence = self.sequences(batch)
-        tokens, kinds, known = sequence.tokens, sequence.kinds, None
+        tokens = sequence.tokens
+        kinds = sequence.kinds
+        known = None
         if "present" in batch:
             recorded = self.tokenizer.module.recorded(batch["present"])
             # A clip of which no stream says what was recorded teaches nothing, not even where it ends.
             known = known_tokens(recorded, sequence, net.ends) & recorded.any(1, keepdim=True)
-        conditions, inputs, z = batch["conditions"], None, None
-        size, device = len(tokens), tokens.device
+        conditions = batch["conditions"]
+        inputs = None
+        z = None
+        size = len(tokens)
+        device = tokens.device
         # Validation drops no conditions and corrupts no tokens, so its cross-entropy compares.
         if self.training:
             drop = torch.rand(size, device=device) < config.condition_dropout
@@ -157,7 +164,9 @@ class UttModule(AlternatingModule):
     def _critic(self, batch: Batch, shared: dict[str, Tensor]) -> dict[str, Tensor]:
         critic = self.discriminator
         assert critic is not None
-        fake, glob, length = shared["motion"].detach(), shared["glob"].detach(), shared["length"]
+        fake = shared["motion"].detach()
+        glob = shared["glob"].detach()
+        length = shared["length"]
         real = batch["motion"][:, : fake.shape[1]]
         real = functional.pad(real, (0, 0, 0, fake.shape[1] - real.shape[1]))
         # At once: half as many kernels, and no weight is cast twice.

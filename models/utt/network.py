@@ -202,7 +202,8 @@ class Utt(TokenNetwork):
         if frame_condition is not None:
             # Position p predicts token first + p, and a token's group tells which frames it is about.
             token = first + at + torch.arange(x.shape[1], device=x.device)
-            group, last = token // len(self.pattern), frame_condition.shape[1] - 1
+            group = token // len(self.pattern)
+            last = frame_condition.shape[1] - 1
             music = frame_condition[:, group.clamp(max=last)]
             # End tokens and motion that outlasts its music have none.
             x = x + music.masked_fill((group > last)[:, None], 0.0).to(x.dtype)

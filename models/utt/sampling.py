@@ -114,7 +114,8 @@ def generate(
     Returns:
         The new codes per stream int64 [B, G * per_group], 0 after each sample's `groups`.
     """
-    batch, device = len(condition.glob), condition.glob.device
+    batch = len(condition.glob)
+    device = condition.glob.device
     scales = [cfg_scale] * batch if isinstance(cfg_scale, (int, float)) else list(cfg_scale)
     if len(scales) != batch:
         raise UserError(f"{len(scales)} strengths of guidance were given for {batch} conditions")
@@ -153,7 +154,9 @@ def generate(
         first = window_start(step, utt.config.block_size, size)
         fresh = state is None or first != opened
         if state is None or fresh:
-            state, seen, opened = utt.begin(condition, z), first, first
+            state = utt.begin(condition, z)
+            seen = first
+            opened = first
         kinds = utt.slots[torch.arange(seen, step, device=device) % size].expand(batch, -1)
         x = utt.embed(rows.tokens[:, seen:step], kinds)
         at = 0 if fresh else seen - first + 1

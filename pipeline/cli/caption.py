@@ -48,12 +48,14 @@ def caption(
     from motionloom.pipeline.inference.model import MotionModel
     from motionloom.pipeline.runs.snapshot import run_at
 
-    console, files = make_console(), list(clips or [])
+    console = make_console()
+    files = list(clips or [])
     if not files or Path(run_folder).suffix.lower() in _FILES:
         run_folder, files = _OURS, [Path(run_folder), *files]
     if out is not None:
         require_file_place(out, ".jsonl")
-    found, left_out = [], []
+    found = []
+    left_out = []
     with run_at(run_folder, at, CAPTIONER) as folder:
         for one in captions(MotionModel(folder, device), files, count):
             if isinstance(one, Dropped):

@@ -153,7 +153,8 @@ def field_docs(config: type[ConvertConfig]) -> dict[str, str]:
 
 def _help(config: type[ConvertConfig], key: str, docs: Mapping[str, str]) -> str:
     """The field's docstring, with the words that it takes and its default."""
-    field, text = config.model_fields[key], docs.get(key, "")
+    field = config.model_fields[key]
+    text = docs.get(key, "")
     if choices := _choices(field.annotation):
         text += f" One of: {', '.join(choices)}."
     default = field.get_default(call_default_factory=True)

@@ -138,7 +138,8 @@ def check(
         findings = [Dropped(source=problem.where, reason=problem.message) for problem in problems]
         for group in grouped(findings):
             if group.count > _ALIKE:
-                first, others = group.members[0], f"(and {group.count - 1:,} more like it; each: --json)"
+                first = group.members[0]
+                others = f"(and {group.count - 1:,} more like it; each: --json)"
                 say(console, f"{title}{first.source}: {first.reason} {others}")
                 continue
             for finding in group.members:
@@ -166,7 +167,8 @@ def report(
     """
     from motionloom.pipeline.results.data_page import write_data_report
 
-    console, path = make_console(), out or root / "report.html"
+    console = make_console()
+    path = out or root / "report.html"
     require_file_place(path, ".html")
     write_data_report(root, path, progress=console.is_terminal)
     console.print(str(path), markup=False, soft_wrap=True)

@@ -76,9 +76,11 @@ def generate(
     )
     wanted = formats_of(formats)
     posing = figure_options(figure, wanted)
-    face, begun = more.get("face"), more.get("seed_motion")
+    face = more.get("face")
+    begun = more.get("seed_motion")
     faces = None if face is None else [str(one) for one in (face if isinstance(face, list) else [face])]
-    texts, songs = list(captions or []), audio or []
+    texts = list(captions or [])
+    songs = audio or []
     file = Path(texts.pop(0)) if texts and texts[0].lower().endswith(_SCRIPTS) else None
     # All that needs no model is checked before one is opened.
     if not texts and not songs and file is None:

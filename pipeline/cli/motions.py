@@ -37,7 +37,8 @@ def write_files(
     """Write motions as `write_motions` does and list the files."""
     from motionloom.pipeline.inference.files.outputs import write_motions
 
-    console, aside = make_console(), make_console(aside=True)
+    console = make_console()
+    aside = make_console(aside=True)
     paths = write_motions(out, motions, formats, **options)
     for path in paths:
         say(console, str(path))

@@ -130,7 +130,8 @@ def fields_of(words: Sequence[str] | None, option: str) -> dict[str, Any]:
 
 def settings_of(words: Sequence[str] | None, *groups: Iterable[str]) -> list[dict[str, object]]:
     """The fields of `--set` options, one mapping for each group of keys; a key of no group is refused."""
-    fields, known = fields_of(words, "--set"), [list(group) for group in groups]
+    fields = fields_of(words, "--set")
+    known = [list(group) for group in groups]
     for key in fields:
         if not any(key in group for group in known):
             raise UserError(

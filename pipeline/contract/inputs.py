@@ -129,7 +129,8 @@ class _FilledBy:
     """A role that does not have the name of the kind that fills it."""
 
     def __init__(self, what: str) -> None:
-        self.what, self.name = what, ""
+        self.what = what
+        self.name = ""
 
     def __set_name__(self, owner: type[Inputs], name: str) -> None:
         self.name = name

@@ -85,7 +85,9 @@ def _finished(record: StageRecord, made: dict[Path, CompletedStage]) -> Complete
 
 def _loadable(record: StageRecord, made: dict[Path, CompletedStage]) -> CompletedStage:
     folder = record.folder
-    where, run, exported = str(folder / "artifact.json"), owner_of(folder), in_export(folder)
+    where = str(folder / "artifact.json")
+    run = owner_of(folder)
+    exported = in_export(folder)
     kind = stage_kind(record.kind, where, read_bundle(run).packages if exported else ())
     if record.version != kind.version and (exported or _gives(kind, record) & {GENERATOR, CAPTIONER}):
         raise UserError(
@@ -189,8 +191,11 @@ class BundleFile(Config):
 
 def open_exported(folder: Path, what: str = GENERATOR) -> list[CompletedStage]:
     """The stages of an export that generate, the default first; or that give `CAPTIONER`."""
-    path, reader, made = folder / BUNDLE_FILE, RunReader(folder), dict[Path, CompletedStage]()
-    makers, listed = [], read_bundle(folder)
+    path = folder / BUNDLE_FILE
+    reader = RunReader(folder)
+    made = dict[Path, CompletedStage]()
+    makers = []
+    listed = read_bundle(folder)
     for name in listed.captioners if what == CAPTIONER else listed.generators:
         record = reader.find(folder / name) if re.fullmatch(STAGE_NAME, name) else None
         if record is None:

@@ -372,7 +372,8 @@ def stage_kinds() -> Mapping[str, StageKind]:
 
 def stage_kind(name: str, where: str, packages: Iterable[str] = ()) -> StageKind:
     """A kind by name; `where` is what names it, and `packages` gave it where it was made, for the message."""
-    kinds, install = stage_kinds(), ", ".join(packages)
+    kinds = stage_kinds()
+    install = ", ".join(packages)
     if name not in kinds:
         raise UserError(
             f"{where}: stage kind '{name}' is not known here; {f'install {install}, or ' if install else ''}"

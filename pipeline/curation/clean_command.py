@@ -43,7 +43,8 @@ def clean(
 
     Example: `motionloom data clean shards --decisions decisions.json`
     """
-    console, page = make_console(), out or root / "clean.html"
+    console = make_console()
+    page = out or root / "clean.html"
     # Imported here, so that `--help` stays quick.
     from motionloom.pipeline.curation.clean_page import kinds_of, suspects_of, write_clean_page
     from motionloom.pipeline.curation.suspects import decide, undo

@@ -61,7 +61,8 @@ def write_clean_page(root: Path, out: Path, suspects: Mapping[Place, Suspect], c
     motions: list[ViewerMotion] = []
     choices: list[tuple[str, str] | None] = []
     for suspect in shown:
-        kind, reasons = suspect.faults[0].kind, "; ".join(fault.text for fault in suspect.faults)
+        kind = suspect.faults[0].kind
+        reasons = "; ".join(fault.text for fault in suspect.faults)
         begin = 0 if suspect.twin else suspect.faults[0].frame
         motions.append(replace(_seen(splits, suspect.place, begin), group=kind))
         choices.append((suspect.id, printable(reasons)))

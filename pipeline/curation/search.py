@@ -104,7 +104,8 @@ class Search:
     @staticmethod
     def open(root: Path, model: Path | str, *, device: str = "auto", progress: bool = False) -> Search:
         """The embeddings beside the shards; made first where there are none of these clips by this model."""
-        splits, (tma, weights) = open_splits(root, every=True), alignment_model(model, device)
+        splits = open_splits(root, every=True)
+        (tma, weights) = alignment_model(model, device)
         manifest = load_manifest(root)
         clips = manifest.model_copy(update={"excluded": {}}).dump()
         made_from = sha256_of_json([_VERSION, clips, weights])
@@ -154,7 +155,8 @@ class Search:
 
     def best(self, query: Vectors, count: int = 12, without: str = "") -> list[Hit]:
         """The clips nearest to an embedding [Z], the best first, except the one with the id `without`."""
-        scores, hits = self.vectors @ unit(query), list[Hit]()
+        scores = self.vectors @ unit(query)
+        hits = list[Hit]()
         # Enough candidates that excluded clips, were they the nearest, leave `count` others.
         some = min(len(scores), count + 1 + len(self.excluded))
         near = np.argpartition(-scores, some - 1)[:some] if some else np.zeros(0, int)
@@ -180,7 +182,8 @@ class Search:
                 theirs = others @ self.vectors[at]
                 share = float((theirs > mine.max()).mean())
                 if share > MISFIT:
-                    nearest, best = own[int(mine.argmax())], different[int(spread[int(theirs.argmax())])]
+                    nearest = own[int(mine.argmax())]
+                    best = different[int(spread[int(theirs.argmax())])]
                     text = f"'{nearest}' fits worse than {share:.0%} of all captions, such as '{best}'"
                     yield place, Fault(kind="caption disagrees", text=text, weight=float(share / MISFIT))
 
@@ -190,7 +193,8 @@ class Search:
 
 def features_for(tma: LoadedTma, joints: NDArray[np.floating], fps: float) -> tuple[Vectors, int]:
     """Return what a TMA reads of joints [T, 22 or 52, 3] of any frame rate, and the parts present in it."""
-    layout, present = tma.layout, PRESENT_ALL
+    layout = tma.layout
+    present = PRESENT_ALL
     require_rate(len(joints), fps, layout.fps)
     if layout.num_joints > joints.shape[1]:
         present &= ~HANDS  # fingers stay at the wrists, and are not looked at
@@ -205,7 +209,8 @@ def _embedded(
 ) -> Iterator[NDArray[np.float16]]:
     with Meter("embedding clips", len(places), shown=progress) as meter:
         for start in range(0, len(places), _BATCH):
-            motions, present = [], []
+            motions = []
+            present = []
             for split, clip in places[start : start + _BATCH]:
                 dataset = splits[split]
                 if dataset.layout == tma.layout:

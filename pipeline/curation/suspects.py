@@ -76,7 +76,8 @@ def find_suspects(
     with Meter("looking at clips", sum(map(len, splits.values())), shown=progress) as meter:
         for split, dataset in splits.items():
             for clip in range(len(dataset)):
-                joints, fps = floored_joints(dataset, clip), dataset.layout.fps
+                joints = floored_joints(dataset, clip)
+                fps = dataset.layout.fps
                 places.append(Place(split, clip))
                 signatures.append(signature(joints, fps))
                 stored = dataset.meta(clip).faults
@@ -86,7 +87,8 @@ def find_suspects(
                 meter.advance()
     twins: dict[Place, Place] = {}
     for first, second, shift in near(signatures):
-        one, other = places[first], places[second]
+        one = places[first]
+        other = places[second]
         again = None if other in twins else _again(splits, one, other, shift)
         if again is not None:
             twins[other] = one
@@ -113,8 +115,10 @@ def floored_joints(dataset: ShardDataset, clip: int) -> NDArray[np.float64]:
 
 def _again(splits: Splits, one: Place, other: Place, shift: int) -> Fault | None:
     """Return the fault of a clip `other` that repeats `one`; None where it does not, or is meant to."""
-    first, second = splits[one.split], splits[other.split]
-    original, copy = first.meta(one.clip), second.meta(other.clip)
+    first = splits[one.split]
+    second = splits[other.split]
+    original = first.meta(one.clip)
+    copy = second.meta(other.clip)
     declared = (original.mirror_of or original.id) == (copy.mirror_of or copy.id)
     if declared and one.split == other.split:
         return None
@@ -131,7 +135,8 @@ def _again(splits: Splits, one: Place, other: Place, shift: int) -> Fault | None
 def decide(root: Path, given: Decisions, where: str) -> Manifest:
     """Add the decisions of the file `where` to a data set and return its manifest."""
     with folder_lock(root):
-        manifest, decided = load_manifest(root), Decisions.of(root).then(given)
+        manifest = load_manifest(root)
+        decided = Decisions.of(root).then(given)
         ids = {split: set(dataset.ids) for split, dataset in open_splits(root, every=True).items()}
         unknown = sorted({*given.left_out, *given.kept}.difference(*ids.values()))
         if unknown:

@@ -81,7 +81,9 @@ def recorded_of(motion: GeneratedMotion) -> RecordedClip:
 
 def changed(clip: RecordedClip, task: EditTask) -> RecordedClip:
     """The clip mirrored, at another speed and several times in a row, as a task says."""
-    joints, face, pace = clip.joints, clip.face, clip.fps * task.speed
+    joints = clip.joints
+    face = clip.face
+    pace = clip.fps * task.speed
     posed = clip.posed or clip.figure
     if task.mirror:
         joints = mirror(joints, Skeleton.named("smplx52" if clip.has_hands else "smpl22"))
@@ -110,7 +112,8 @@ def edit_clip(
     """Edit a clip as `MotionModel.edit`."""
     require_seed(seed)
     require_samples(samples)
-    layout, generator = bundle.layout, bundle.generator
+    layout = bundle.layout
+    generator = bundle.generator
     require_work(task, clip, layout)
     if task.changes_clip:
         before = edit_frames(EditTask(), clip, layout)
@@ -136,14 +139,16 @@ def edit_clip(
             for start, end in frames.stretches
         ]
         notes = [*map(str, bundle.notes([prompt], stretches))] if words else []
-        bvh, fps = None, layout.fps
+        bvh = None
+        fps = layout.fps
         if clip.bvh is not None:
             try:
                 bvh = own_bvh(clip.bvh, frames, figure)
             except UserError as error:
                 notes.append(f"a BVH of this has a skeleton of ours, not the clip's: {error}")
         elif frames.written.drawn and not task.changes_clip:
-            figure, fps = own_figure(clip, frames, figure), clip.fps
+            figure = own_figure(clip, frames, figure)
+            fps = clip.fps
         # What is said is of the joints that a file holds.
         rounded = figure.joints.astype(np.float32) + np.array([0, frames.written.base, 0])
         rate = fps if bvh is None else bvh.motion.fps
@@ -172,7 +177,8 @@ def _note_on_hands(frames: EditFrames, joints: NDArray[np.float64]) -> list[str]
 
 def original_of(frames: EditFrames, clip: RecordedClip) -> GeneratedMotion:
     """The clip of a task: a figure of ours as it is, others as the model reads them."""
-    layout, figure = frames.layout, frames.world.figure(frames.figure)
+    layout = frames.layout
+    figure = frames.world.figure(frames.figure)
     features = frames.known.features[frames.inside][:, layout.part("bodyhand")]
     motion = GeneratedMotion(Prompt(clip.caption), features, figure.joints, frames.face, layout, bvh=clip.bvh)
     if frames.written.drawn and clip.figure is not None and clip.bvh is None:
@@ -185,7 +191,9 @@ Drawn = TypeVar("Drawn", bound=GeneratedMotion)
 
 def _drawn(motion: Drawn, figure: RigidMotion, fps: float) -> Drawn:
     """The motion with the figure that is shown of it, at the frame rate of that."""
-    joints, face, layout = figure.joints, motion.face, replace(motion.layout, fps=fps)
+    joints = figure.joints
+    face = motion.face
+    layout = replace(motion.layout, fps=fps)
     if fps == motion.fps:
         return replace(motion, figure=figure, joints=joints)
     if face is not None:

@@ -46,7 +46,8 @@ def finish(
     Returns the features of what came, the figure in the clip's world, and its headings there [T].
     `UserError` for a pin that it does not reach.
     """
-    layout, rooted = frames.layout.without_face(), frames.rooted
+    layout = frames.layout.without_face()
+    rooted = frames.rooted
     posed, heading = _posed(frames, made)
     hold = partial(_with_kept, frames, heading)
     figure = hold(posed)
@@ -55,7 +56,8 @@ def finish(
     if frames.pins:
         blend = max(2, round(_REACH_SECONDS * layout.fps))
         figure = reached(figure, frames.pins, frames.kept_joints, blend, hold)
-    joints, missed = figure.joints, {}
+    joints = figure.joints
+    missed = {}
     for (frame, joint), wanted in frames.pins.items():
         away = float(np.linalg.norm(joints[frame, joint] - np.asarray(wanted)))
         missed[f"{figure.skeleton.joints[joint]} at {(frame - frames.lead) / layout.fps:.2f} s"] = away
@@ -83,7 +85,8 @@ def own_figure(clip: RecordedClip, frames: EditFrames, made: RigidMotion) -> Rig
     """A figure in the clip's world at the frame rate of the clip's own, with its numbers where it is kept."""
     from scipy.spatial.transform import Slerp
 
-    own, fps = clip.figure, frames.layout.fps
+    own = clip.figure
+    fps = frames.layout.fps
     assert own is not None
     kept = frames.pieces[:, piece_joints(frames.layout)]
     source, at, kept = own_rows(len(own.root), clip.fps, fps, frames.lead, kept, frames.task.seconds)
@@ -93,7 +96,8 @@ def own_figure(clip: RecordedClip, frames: EditFrames, made: RigidMotion) -> Rig
     root = np.stack([np.interp(at, when, axis) for axis in made.root.T], axis=-1)
     # Rotations of kept joints count where what carries them is kept too.
     held = kept & kept[:, np.maximum(own.skeleton.parents, 0)]
-    rotations[held], root[kept[:, 0]] = own.rotations[source][held], own.root[source][kept[:, 0]]
+    rotations[held] = own.rotations[source][held]
+    root[kept[:, 0]] = own.root[source][kept[:, 0]]
     out = RigidMotion.posed(own.skeleton, rotations, root, between_rows(made.joints, at))
     whole = kept.all(axis=1)
     out.joints[whole] = own.joints[source][whole]
@@ -104,11 +108,15 @@ def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, 
     """The clip's figure in the poses that a model made, its root led to where it is kept or asked for; and
     its headings [T].
     """
-    layout, own = frames.layout.without_face(), frames.figure.skeleton
-    root, rooted, inside = _made_root(frames, made), frames.rooted, frames.inside
+    layout = frames.layout.without_face()
+    own = frames.figure.skeleton
+    root = _made_root(frames, made)
+    rooted = frames.rooted
+    inside = frames.inside
     joints = place(made, layout, np.exp(1j * root.heading), root.place)
     # Between where it is kept or asked for the root is eased, so that nothing jumps.
-    target, heading = root.place.copy(), root.heading.copy()
+    target = root.place.copy()
+    heading = root.heading.copy()
     target[inside] = np.where(rooted[inside], frames.clip_root.place, target[inside])
     heading[inside] = np.where(rooted[inside], frames.clip_root.heading, heading[inside])
     on_path = frames.known.led
@@ -120,7 +128,8 @@ def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, 
     heading[asked] = (places.heading[0].numpy() + frames.anchor.heading)[asked]
     known &= rooted | (np.arange(len(known)) % max(1, round(layout.fps / 2)) == 0)
     wrapped = np.angle(np.exp(1j * (heading - root.heading)))
-    shift, turn = eased(target - root.place, rooted | on_path), eased(wrapped, known)
+    shift = eased(target - root.place, rooted | on_path)
+    turn = eased(wrapped, known)
     # The bones' directions are the model's, their lengths the clip's.
     targets = retarget(joints, layout.skeleton, own.offsets)
     targets[..., 1] += (joints[:, 0, 1] / frames.scale + frames.lift - targets[:, 0, 1])[:, None]
@@ -133,9 +142,14 @@ def _posed(frames: EditFrames, made: NDArray[np.float32]) -> tuple[RigidMotion, 
 
 def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMotion) -> RigidMotion:
     """The figure with the clip's own poses where they are kept, and its root on its path."""
-    clip, inside, pieces = frames.figure, frames.inside, piece_joints(frames.layout)
-    rotations, root, rooted = figure.rotations.copy(), figure.root.copy(), frames.rooted[inside]
-    kept, own = frames.pieces[inside][:, pieces], rotations[inside]
+    clip = frames.figure
+    inside = frames.inside
+    pieces = piece_joints(frames.layout)
+    rotations = figure.rotations.copy()
+    root = figure.root.copy()
+    rooted = frames.rooted[inside]
+    kept = frames.pieces[inside][:, pieces]
+    own = rotations[inside]
     own[kept] = clip.rotations[kept]
     root[inside][rooted] = clip.root[rooted]
     on_path = frames.known.led
@@ -145,7 +159,8 @@ def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMo
     posing = (clip.skeleton.offsets, clip.skeleton.parents)
     _, was = forward_kinematics(clip.rotations, clip.root, *posing)
     for joint, parent in enumerate(clip.skeleton.parents):
-        loose, wanted = kept[:, joint] & ~kept[:, parent], turn @ was[:, joint]
+        loose = kept[:, joint] & ~kept[:, parent]
+        wanted = turn @ was[:, joint]
         if pieces[joint] in _TRUNK_AND_ARMS and loose.any():
             _, now = forward_kinematics(own, clip.root, *posing)
             own[loose, joint] = (now[:, parent].swapaxes(-1, -2) @ wanted)[loose]
@@ -155,7 +170,8 @@ def _with_kept(frames: EditFrames, heading: NDArray[np.float64], figure: RigidMo
 def _made_root(frames: EditFrames, made: NDArray[np.float32]) -> RootPath:
     """The root's path in what a model made, in the clip's size, seen from the clip's first frame."""
     heading, x, z = (one.numpy() for one in torch_way(torch.from_numpy(made).double(), frames.layout))
-    first, anchor = int(frames.known.places.anchor[0]), frames.anchor
+    first = int(frames.known.places.anchor[0])
+    anchor = frames.anchor
     place = (z + 1j * x) * np.exp(-1j * heading[first])
     away = (place - place[first]) * np.exp(1j * anchor.heading[0]) / frames.scale
     return RootPath(heading - heading[first] + anchor.heading[0], anchor.place[0] + away)
@@ -167,15 +183,15 @@ def report_of(
     """How near a result is to its task, by the joints [T, M, 3] of its file of some `rate`, and headings [T],
     in the clip's world.
     """
-    fps, inside, count = (
-        frames.layout.fps,
-        frames.inside,
-        min(joints.shape[1], frames.written.joints.shape[1]),
-    )
+    fps = frames.layout.fps
+    inside = frames.inside
+    count = min(joints.shape[1], frames.written.joints.shape[1])
     joints = joints[:, :count]
-    clip, rooted = frames.written.joints[:, :count], frames.rooted[inside][:, None]
+    clip = frames.written.joints[:, :count]
+    rooted = frames.rooted[inside][:, None]
     pieces = piece_joints(frames.layout)[:count]
-    names, parents = frames.layout.skeleton.joints, np.maximum(frames.layout.skeleton.parents[:count], 0)
+    names = frames.layout.skeleton.joints
+    parents = np.maximum(frames.layout.skeleton.parents[:count], 0)
     # Without the legs the figure goes elsewhere, so what is kept of it is compared bone by bone, as the
     # figure sees it; fingers are kept within a hand, which goes with its arm.
     kept = frames.pieces[inside].copy()
@@ -188,7 +204,8 @@ def report_of(
     bones = np.einsum("tij,tnj->tni", back, joints[inside] - joints[inside][:, parents])
     away = np.where(rooted[..., None], joints[inside] - clip, bones - (clip - clip[:, parents]))
     # The way is looked at where the root walks; a figure that stands may face anywhere.
-    on_path, root = frames.known.led, ground(joints[:, 0])
+    on_path = frames.known.led
+    root = ground(joints[:, 0])
     path = frames.world.places(frames.path)
     pins = {}
     for (frame, joint), pin in zip(frames.pins, frames.task.pins, strict=True):

@@ -189,7 +189,8 @@ def edit_frames(task: EditTask, clip: RecordedClip, layout: MotionLayout) -> Edi
     face = None if face is None else face[: len(features)]
     if layout.has("face") and face is None:
         remarks.append("the clip has no face, so the model makes it")
-    lead, clip_frames = round(task.lead * layout.fps), len(features)
+    lead = round(task.lead * layout.fps)
+    clip_frames = len(features)
     total = lead + (clip_frames if task.seconds is None else max(2, round(task.seconds * layout.fps)))
     # A result that is shorter than the clip takes no notice of what the clip does later.
     features = features[: total - lead]
@@ -261,9 +262,11 @@ def _known_places(
     place[inside] = clip.place
     on_path = ~np.isnan(path)
     place[on_path] = path[on_path]
-    heading_known, place_known = rooted.copy(), rooted | on_path
+    heading_known = rooted.copy()
+    place_known = rooted | on_path
     # Who walks a drawn path faces where it goes, but not at once where something is kept.
-    at, way = np.flatnonzero(place_known), np.zeros_like(place)
+    at = np.flatnonzero(place_known)
+    way = np.zeros_like(place)
     if len(at) > 1:
         way[at] = np.gradient(place[at], at) * fps
     walks = on_path & (np.abs(way) > WALKS)

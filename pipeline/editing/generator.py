@@ -44,7 +44,9 @@ class InBetweenMotion(DiffusionMotion):
         `words` are an encoded caption, one row; empty for none.
         """
         stats: FeatureStats = self.given["stats"]
-        layout, columns, device = self.layout, self.layout.part(self.part), device_of(self.net)
+        layout = self.layout
+        columns = self.layout.part(self.part)
+        device = device_of(self.net)
         guidance = sampling.guidance_of(self.part)
         if guidance != 1 and self.net.config.condition_dropout == 0:
             raise UserError(

@@ -41,7 +41,8 @@ def with_made(
     file's. `UserError` where its skeleton cannot be posed so, or no frame is kept where it was.
     """
     motion = bvh.motion.with_ends(bvh.joint_map.ends)
-    parents, (positions, turns) = motion.parents, channel_columns(motion.channels)
+    parents = motion.parents
+    (positions, turns) = channel_columns(motion.channels)
     sources = enumerate(bvh.joint_map.sources[: joints.shape[1]])
     target = {motion.joints.index(names[0]): joint for joint, names in sources if len(names) == 1}
     moving = _moving(motion, target)
@@ -58,7 +59,8 @@ def with_made(
     if not held[:, list(target)].any():
         raise UserError("no frame is kept where it was")
     posed = replace(motion, values=motion.values[source])
-    made, values = np.flatnonzero(~held.all(axis=1)), posed.values.copy()
+    made = np.flatnonzero(~held.all(axis=1))
+    values = posed.values.copy()
     if not len(made):
         return _with_rows(bvh, values, source, held, made)
     first, last, share = between_known(own | ~own.any(axis=0), made)
@@ -85,12 +87,14 @@ def _wanted(
     """Where mapped joints should be, the others as they are, [R, J, 3] in metres and the file's axes."""
     from scipy.interpolate import CubicSpline
 
-    wanted, mapped = posed.positions() * bvh.unit, list(target)
+    wanted = posed.positions() * bvh.unit
+    mapped = list(target)
     made = CubicSpline(np.arange(len(joints)), joints)(at)[:, list(target.values())]
     if bvh.up == "z":
         made = np.stack([made[..., 0], -made[..., 2], made[..., 1]], axis=-1)
     # The made figure stands on a floor at height 0; what the last kept row is away from it goes slowly.
-    named, rows = held[:, mapped], np.arange(len(at))
+    named = held[:, mapped]
+    rows = np.arange(len(at))
     away = wanted[:, mapped] - made
     shift = np.median(away[named], axis=0)
     away = (away - shift) * named[..., None]
@@ -139,7 +143,8 @@ def own_rows(
 def between_rows(joints: NDArray[np.floating], at: Floats) -> Floats:
     """Joints [T, N, 3] on straight lines at places [R] among their frames."""
     left = np.floor(at).astype(int)
-    share, right = (at - left)[:, None, None], np.minimum(left + 1, len(joints) - 1)
+    share = (at - left)[:, None, None]
+    right = np.minimum(left + 1, len(joints) - 1)
     return np.asarray(joints[left] * (1 - share) + joints[right] * share, dtype=np.float64)
 
 
@@ -186,9 +191,11 @@ def _posed(
     inside = [joint for joint in range(len(offsets)) if moving in (joint, *_above(motion, joint))]
     # From the top down each joint comes with its parent and turns, by as little as it can, so that the mapped
     # joints below it are seen where they are wanted: the search begins with the twists of the eased pose.
-    aims, turns = base.copy(), np.broadcast_to(np.eye(3), local.shape).copy()
+    aims = base.copy()
+    turns = np.broadcast_to(np.eye(3), local.shape).copy()
     for joint in inside:
-        parent, ends = motion.parents[joint], below[joint]
+        parent = motion.parents[joint]
+        ends = below[joint]
         if joint == moving:
             points = [joint] * (joint in mapped) + ends
             middle, there = (one[:, points].mean(axis=1) for one in (base, wanted))
@@ -210,7 +217,8 @@ def _posed(
     posed, place = solve_poses(
         aims[:, inside], offsets[inside], carriers, start, aims[:, moving], weights[:, inside]
     )
-    out, parent = local.copy(), motion.parents[moving]
+    out = local.copy()
+    parent = motion.parents[moving]
     out[:, inside] = posed
     if parent >= 0:
         back = world[:, parent].swapaxes(-1, -2)

@@ -61,7 +61,9 @@ class Clips:
     """The clips of a server, among its motions, and what is made of them."""
 
     def __init__(self, host: Host) -> None:
-        self._host, self._model, self._config = host, host.model, host.config
+        self._host = host
+        self._model = host.model
+        self._config = host.config
         self.kept = host.motions.kept
 
     async def post_clip(self, http: Request) -> Response:
@@ -117,7 +119,8 @@ class Clips:
         assert isinstance(made, EditedMotion)
         # JSON knows no NaN, which stands for what a task does not ask.
         report = {key: None if value != value else value for key, value in asdict(made.report).items()}
-        cells, lines = {"before": made.original, "after": made}, made.report.lines()
+        cells = {"before": made.original, "after": made}
+        lines = made.report.lines()
         facts = {"clip": name, "seed": asked.seed, "notes": list(made.remarks)}
         facts |= {"report": report, "lines": lines}
         return answer(made, asked.format, facts, "\n".join(lines), cells)
@@ -125,7 +128,8 @@ class Clips:
 
 def _open(host: Host) -> OpenPart:
     """Editing by a server's model; of one that cannot edit, why."""
-    clips, why = Clips(host), ""
+    clips = Clips(host)
+    why = ""
     try:
         host.model.ability(ABILITY)
     except UserError as error:

@@ -41,7 +41,8 @@ class InBetweenStage(DenoiserStage[InBetweenStageConfig, InBetweener]):
         return {"observations": Observations(stats.layout, columns, stats.mean, stats.std, share)}
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> InBetweenMotion:
-        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
+        net = self.load(stage, given, device)
+        part = part_of(load_facts(stage.folder))
         return InBetweenMotion(given["stats"].layout, part, given, net, stage.config.max_frames)
 
 

@@ -73,13 +73,15 @@ class TimedTask:
         """The frame at a time, which the result must have."""
         frame = round(seconds * self.layout.fps) + self.lead
         if not 0 <= frame < self.frames:
-            start, end = -self.lead / self.layout.fps, (self.frames - 1 - self.lead) / self.layout.fps
+            start = -self.lead / self.layout.fps
+            end = (self.frames - 1 - self.lead) / self.layout.fps
             raise UserError(f"{what} at {seconds:g} s: the result goes from {start:g} s to {end:.2f} s")
         return frame
 
     def pieces(self, clip_frames: int) -> NDArray[np.bool_]:
         """Mask of the pieces that are kept [T, P]."""
-        task, fps = self.task, self.layout.fps
+        task = self.task
+        fps = self.layout.fps
         out = np.zeros((self.frames, len(PIECES)), dtype=np.bool_)
         clip_end = self.lead + clip_frames
         for number, kept in enumerate(task.keep or ()):

@@ -36,7 +36,8 @@ from motionloom.pipeline.evaluation.latent_metrics import unit_length
 from motionloom.pipeline.evaluation.truth import Truth, has_caption, truth_of
 from motionloom.pipeline.store.networks import LoadedTma, TokensOfCaptions
 
-_TOP, _AT_ONCE = 3, 256
+_TOP = 3
+_AT_ONCE = 256
 
 _WORDS: tuple[tuple[str, str, Better], ...] = (
     *((f"bleu-{n}", f"BLEU-{n}", "higher") for n in range(1, 5)),  # type: ignore[misc]
@@ -118,7 +119,8 @@ def caption_figures(rows: Mapping[str, Mapping[str, Estimate]], protocol: Protoc
 
 def _states(text: TokensOfCaptions, captions: Iterable[str]) -> dict[str, Tensor]:
     """Token states [S, E] of each caption."""
-    words, out = sorted(set(captions)), dict[str, Tensor]()
+    words = sorted(set(captions))
+    out = dict[str, Tensor]()
     for start in range(0, len(words), _AT_ONCE):
         some = words[start : start + _AT_ONCE]
         tokens, mask = text.tokens(some)

@@ -100,7 +100,8 @@ def position(performance: Performance) -> Row:
         return {}
     pair = (performance.joints, performance.recorded)
     generated, real = (torch.from_numpy(np.ascontiguousarray(x[:frames, :BODY_JOINTS])) for x in pair)
-    errors, out = position_errors(generated, real), Row()
+    errors = position_errors(generated, real)
+    out = Row()
     for kind in KINDS:
         out |= weighted(f"position.ape_{kind}", errors.ape[kind] * frames, frames)
         out[f"position.ave_{kind}"] = errors.ave[kind]
@@ -117,7 +118,8 @@ def floor_and_jerk(performance: Performance) -> Row:
 
 def beat_alignment(performance: Performance) -> Row:
     """Beat Align by every public definition; nothing of music without a beat."""
-    frames, fps = performance.frames, performance.fps
+    frames = performance.frames
+    fps = performance.fps
     if performance.beats is None or frames < MIN_FRAMES:
         return {}
     # The last step has no place of its own in every definition.

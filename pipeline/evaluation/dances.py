@@ -68,7 +68,8 @@ class DanceClip:
         inside = self.beats[self.beats < seconds]
         sound = self.sound.slice(0.0, seconds)
         music = None if self.music is None else self.music[:frames]
-        motion, joints = self.motion[:frames], self.joints[:frames]
+        motion = self.motion[:frames]
+        joints = self.joints[:frames]
         return replace(self, motion=motion, joints=joints, sound=sound, beats=inside, music=music)
 
     def after(self, frames: int) -> DanceClip:
@@ -99,7 +100,8 @@ def dance_at(
     if stored is None:
         return None
     sound = Sound(np.clip(stored[0], -1.0, 1.0), stored[1])
-    fps, motion = dataset.layout.fps, np.asarray(dataset.motion(index))
+    fps = dataset.layout.fps
+    motion = np.asarray(dataset.motion(index))
     most = sound.seconds if seconds is None else min(seconds, sound.seconds)
     # Sound may end within its last frame.
     frames = min(len(motion), int(np.ceil(most * fps - 1e-6))) // unit * unit
@@ -156,7 +158,8 @@ def dances_for(
     """`dances_of` in lengths that a model can make, at most `seconds` and with `least` frames of its own;
     in whole units of the model, unless another `unit` is given.
     """
-    longest, frames = min(seconds or np.inf, bundle.max_seconds), least + seed_frames(bundle)
+    longest = min(seconds or np.inf, bundle.max_seconds)
+    frames = least + seed_frames(bundle)
     cut = None if np.isinf(longest) else float(longest)
     clips = dances_of(dataset, count, unit=unit or bundle.generator.unit_frames, seconds=cut)
     return [clip for clip in clips if len(clip.joints) >= frames]

@@ -75,7 +75,8 @@ class Diagnosis:
         self.details["actions"][of] = confusions(truths, actions)
         made = [table[name] for table in tables for name in sorted(table) if name.startswith(_MOTION)]
         for place, k in extremes(errors):
-            number, truth = len(self.details["cases"]), truths[k]
+            number = len(self.details["cases"])
+            truth = truths[k]
             self._arrays |= {
                 f"{number}.recorded": np.ascontiguousarray(truth.joints, np.float32),
                 f"{number}.{of}": made[k],

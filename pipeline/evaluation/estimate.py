@@ -40,7 +40,8 @@ def estimate(values: ArrayLike, weights: ArrayLike | None = None) -> Estimate:
     # A clip counts once, with the sum of its repeats: repeats of one clip are no further clips.
     total = (np.where(finite, measured, 0.0) * weight).sum(0)
     each = weight.sum(0)
-    total, each = total[each > 0], each[each > 0]
+    total = total[each > 0]
+    each = each[each > 0]
     mean = float(total.sum() / each.sum())
     if len(each) < 2 or np.ptp(total / each) == 0.0:  # nothing varied
         return Estimate(mean, count=len(each))

@@ -176,7 +176,8 @@ def group_figures(
             found = estimates.get(metric.name)
             if found is None or not math.isfinite(found.value):
                 continue
-            name, note = f"{prefix}{metric.name}", (notes or {}).get(metric.name, "")
+            name = f"{prefix}{metric.name}"
+            note = (notes or {}).get(metric.name, "")
             shown = (metric.unit, metric.better, row, protocol, group, metric.title)
             last = (found.over, note, found.count, found.pair)
             out.append(Figure(name, found.value, found.interval, *shown, *last))

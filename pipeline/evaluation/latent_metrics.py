@@ -80,7 +80,9 @@ class Latents:
         """The latents of some of the clips."""
         made = [one[clips] for one in self.made]
         nearest = {row: one[clips] for row, one in self.nearest.items()}
-        text, real, still = self.text[clips], self.real[clips], self.still[clips]
+        text = self.text[clips]
+        real = self.real[clips]
+        still = self.still[clips]
         return Latents(text, real, made, self.others, still, nearest)
 
 
@@ -284,7 +286,8 @@ def reconstructed_figures(
         for row, estimates in _measured(guo_precision, base, motions).items():
             rows[row] = rows.get(row, {}) | estimates
         rows[CHANCE] = _chance(base.size)
-    title, columns = f"Reconstructed motion by {whose}'s latents", (SPREAD_COLUMNS[0], *_TOPS)
+    title = f"Reconstructed motion by {whose}'s latents"
+    columns = (SPREAD_COLUMNS[0], *_TOPS)
     return group_figures(title, columns, rows, facts, prefix=f"reconstruction.{role}.")
 
 

@@ -101,7 +101,8 @@ def movement_figures(
     """
     # Clips that some repeat ends too early for features are left out of all of them.
     kept = np.logical_and.reduce([_long(real), *(_long(one) for one in rows.get(MODEL, ()))])
-    reference, real = _rows(reference, _long(reference)), _rows(real, kept)
+    reference = _rows(reference, _long(reference))
+    real = _rows(real, kept)
     found: dict[str, dict[str, Estimate]] = {}
     for row, repeats in rows.items():
         motions = [_rows(one, kept if row == MODEL else _long(one)) for one in repeats]
@@ -109,7 +110,8 @@ def movement_figures(
         found[row] = set_estimates(each, decodings_of(protocol) if row == MODEL else 1)
         if row == MODEL and kept.any():
             found[row] |= multimodality(reference, motions)
-    count, size = int(kept.sum()), len(reference["k"])
+    count = int(kept.sum())
+    size = len(reference["k"])
     facts = {**protocol, "motions": count, "reference": size}
     title = "Kinetic (k) and geometric (m) features: distance to all motions, training and test, and variety"
     notes = _few(count, size)

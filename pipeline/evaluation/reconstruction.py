@@ -213,8 +213,10 @@ def face_errors(
     if real is None:
         return {}
     columns = tokenizer.layout.slice("face")
-    rebuilt, mean = reconstruct_all(tokenizer, truth)[:, columns], tokenizer.stats.mean[columns]
-    out, frames = Row(), float(len(real))
+    rebuilt = reconstruct_all(tokenizer, truth)[:, columns]
+    mean = tokenizer.stats.mean[columns]
+    out = Row()
+    frames = float(len(real))
     for suffix, expression in (("", rebuilt), ("_mean", mean)):
         error = (expression - real).astype(np.float64)
         out |= weighted(f"expression{suffix}", float(np.linalg.norm(error, axis=-1).sum()), frames)

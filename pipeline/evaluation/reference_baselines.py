@@ -108,7 +108,8 @@ def stretch(values: NDArray[np.floating], frames: int) -> NDArray[np.float64]:
 
 def mean_poses(pool: Sequence[Joints], fps: float, lengths: Iterable[int]) -> list[Joints]:
     """The mean pose of training motions [T, N, 3], held for each of the `lengths` in frames."""
-    poses, heights = [], []
+    poses = []
+    heights = []
     for joints in pool:
         poses.append(local_joints_of(joints, fps).mean(0))
         heights.append(joints[:, 0, 1].mean())
@@ -140,7 +141,8 @@ def nearest_dances(
     deviation among the training dances **[ours]**. Dances shorter than the clip are candidates only where
     there is none as long. None where the data store no audio features.
     """
-    pool_music, wanted = _music_means(train, pool), _music_means(dataset, clips)
+    pool_music = _music_means(train, pool)
+    wanted = _music_means(dataset, clips)
     if pool_music is None or wanted is None:
         return None
     spread = pool_music.std(0)
@@ -166,7 +168,8 @@ def _music_means(dataset: ClipDataset, clips: Sequence[DanceClip]) -> NDArray[np
     return np.stack(rows)
 
 
-_ENCODER, _BATCH = "minilm", 256
+_ENCODER = "minilm"
+_BATCH = 256
 _MIN_FRAMES = 16
 """Shortest stretch that a caption is about, as in `truth_of`."""
 

@@ -51,7 +51,8 @@ def retrieve(
     """
     source = alignment_stage(run, stage)
     stage_cache = StageCache(choose_device(device))
-    model, inputs = stage_cache.get(source), _sources(run, source)
+    model = stage_cache.get(source)
+    inputs = _sources(run, source)
     data = stage_cache.get(inputs["data"])
     judge = Judge(model)
     # Latents are compared as the judge's own training compared them.
@@ -66,7 +67,8 @@ def retrieve(
         raise UserError(
             f"{run}: split '{dataset.split}' has {len(truths)} captioned clips; retrieval needs 2"
         )
-    text, motion = judge.texts(truths), judge.recorded(truths)
+    text = judge.texts(truths)
+    motion = judge.recorded(truths)
     found_by = {"A": ("whole split", recall(text, motion, distance=distance))}
     # Only a sentence encoder can tell which captions say the same.
     if "text" in inputs:
@@ -123,7 +125,8 @@ def _sources(run: Path, judge: CompletedStage) -> dict[str, CompletedStage]:
 
     The published evaluator was made from no stage of the run.
     """
-    out, finished = {}, finished_stages(run)
+    out = {}
+    finished = finished_stages(run)
     for what in ("data", "text"):
         own = [stage for stage in finished.values() if stage.kind.name == what or stage.gives(what)]
         if what in judge.inputs or own:

@@ -101,7 +101,8 @@ def truth_of(
 def truth_in(dataset: ClipDataset, index: int, span: CaptionSpan, max_frames: int | None = None) -> Truth:
     """Return the stretch of a clip that one caption is about, cut to whole groups of four frames."""
     motion = np.asarray(dataset.motion(index))
-    whole, motion = span.frames == len(motion), motion[span.first : span.end]
+    whole = span.frames == len(motion)
+    motion = motion[span.first : span.end]
     frames = min(len(motion), max_frames or len(motion)) // 4 * 4
     motion = motion[: max(frames, min(4, len(motion)))]
     return _truth(dataset, index, motion, span, dataset.meta(index).truth if whole else None)
@@ -159,7 +160,8 @@ def reconstruct_truth(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.f
 
 def reconstruct_all(tokenizer: TrainedTokenizer, truth: Truth) -> NDArray[np.float32]:
     """All columns [T, D] of the layout, likewise."""
-    mean, columns = tokenizer.stats.mean.astype(np.float32), tokenizer.columns
+    mean = tokenizer.stats.mean.astype(np.float32)
+    columns = tokenizer.columns
     out = np.tile(mean, (len(truth.features), 1))
     given = truth.columns(tokenizer.layout, mean)
     out[:, columns] = tokenizer.reconstruct(given[:, columns], truth.present)

@@ -111,7 +111,8 @@ class Bundle:
 
     def _open(self, stage: CompletedStage) -> None:
         """Load a stage's inputs, and theirs, as far as generation needs them."""
-        needed, inputs = stage.kind.exported(stage.config), self.stage_cache.given(stage.inputs)
+        needed = stage.kind.exported(stage.config)
+        inputs = self.stage_cache.given(stage.inputs)
         for role in stage.kind.roles():
             if role.name in needed and (role.name in inputs or not role.optional):
                 inputs[role.name]  # looking it up loads it, so a broken one is found before anything is made
@@ -226,7 +227,8 @@ class Bundle:
         """Return the notes on prompts, and on motions whose length is not the one asked for, in seconds."""
         from motionloom.pipeline.inference.checks import rounded_lengths, standing
 
-        texts, faces = [prompt.text for prompt in prompts], [prompt.face_text for prompt in prompts]
+        texts = [prompt.text for prompt in prompts]
+        faces = [prompt.face_text for prompt in prompts]
         remarks = dict.fromkeys(prompt.remark for prompt in prompts if prompt.remark)
         shown = [*rounded_lengths(self.generator, lengths, motions), *standing(motions)]
         shown += self.find_mismatches(motions)

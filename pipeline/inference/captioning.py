@@ -68,7 +68,8 @@ def captions(
     if isinstance(clips, (str, Path, GeneratedMotion)):
         raise UserError(f"clips is one, {clips!r:.60}; give a list, also of one")
     captioner = model.bundle.captioner
-    layout, columns = captioner.layout, captioner.layout.part(captioner.part)
+    layout = captioner.layout
+    columns = captioner.layout.part(captioner.part)
     least = max(captioner.min_frames, LEAST_FRAMES)
     for given in clips:
         if isinstance(given, GeneratedMotion):
@@ -124,7 +125,8 @@ def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped
     """Fingers where a skeleton has them; else hands at rest, which count as none."""
     given = {"source": source, "layout": layout.name, "fps": layout.fps, "uncaptioned": "keep"}
     ways = ("recorded", "missing") if layout.num_joints > BODY_JOINTS else ("recorded",)
-    read, left_out = set[str](), list[Dropped]()
+    read = set[str]()
+    left_out = list[Dropped]()
     for fingers in ways:
         config = BvhConfig.parse({**given, "min_seconds": 0, "fingers": fingers}, str(source))
         with temporary_folder() as maps:
@@ -134,7 +136,8 @@ def _of_mocap(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped
                 if fingers == ways[-1] and not read:
                     raise
                 continue  # none of these skeletons has fingers, or none is a person's
-            plan, converter = conversion.plan, conversion.converter
+            plan = conversion.plan
+            converter = conversion.converter
             left_out = [*plan.broken, *plan.rejected, *plan.dropped]
             for clip in (clip for _, clip in plan.items if clip.found.path not in read):
                 try:

@@ -44,7 +44,8 @@ def rounded_lengths(
     generator: MotionGenerator, asked: Sequence[float | None], motions: Sequence[GeneratedMotion]
 ) -> list[str]:
     """Return a sentence for each length in seconds that a motion's, in whole units, is not."""
-    fps, unit = generator.layout.fps, generator.unit_frames
+    fps = generator.layout.fps
+    unit = generator.unit_frames
     lengths = dict.fromkeys((wanted, one.seconds) for wanted, one in zip(asked, motions, strict=False))
     return [
         f"{wanted:g} s were asked for and {made:g} s are made: this model makes whole {unit / fps:.2g} s"

@@ -188,7 +188,8 @@ def _read_smpl(path: Path) -> RecordedClip:
     assert given.rotations is not None and given.trans is not None  # a motion of parameters has both
     vectors, trans = upright(given.rotations, given.trans, body)
     local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
-    root, skeleton = body.rest_joints()[0] + trans, body.skeleton
+    root = body.rest_joints()[0] + trans
+    skeleton = body.skeleton
     joints, _ = forward_kinematics(local, root, skeleton.offsets, skeleton.parents)
     figure = RigidMotion.posed(skeleton, local, root, joints)
     return RecordedClip(str(path), joints, header.fps, figure=figure)

@@ -38,7 +38,8 @@ def write_bundle(
     What is set of `sampling` goes with the model: motions are drawn so where nobody says otherwise. Returns
     licences and credits of its data, which its card says.
     """
-    bundle, sampling = Bundle.from_run(run), sampling or SamplingConfig()
+    bundle = Bundle.from_run(run)
+    sampling = sampling or SamplingConfig()
     if bundle.stages:
         bundle.require_used(sampling)
     for stage in bundle.stages:
@@ -75,7 +76,9 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
 
     Stages of other runs come along like the run's own, so an export is whole in itself.
     """
-    makers, captioners, skeleton = bundle.stages, bundle.captioners, bundle.layout.skeleton
+    makers = bundle.stages
+    captioners = bundle.captioners
+    skeleton = bundle.layout.skeleton
     needed: dict[Path, CompletedStage] = {}
     for stage in (*makers, *captioners):
         _collect(stage, needed)
@@ -83,7 +86,8 @@ def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, obj
     (out / BUNDLE_FILE).unlink(missing_ok=True)
     made: dict[str, Artifact] = {}
     for folder, stage in needed.items():
-        name, artifact = names[folder], Artifact.find(folder)
+        name = names[folder]
+        artifact = Artifact.find(folder)
         assert artifact is not None
         require_unchanged(folder)
         try:

@@ -39,7 +39,9 @@ def generate(bundle: Bundle, request: Request, at_once: int = AT_ONCE) -> list[G
 
 def _of_prompts(bundle: Bundle, request: Request, at_once: int) -> list[GeneratedMotion]:
     """One motion for each prompt, made in batches."""
-    generator, prompts, count = bundle.generator, request.prompts, request.count
+    generator = bundle.generator
+    prompts = request.prompts
+    count = request.count
     require_driven(generator, prompts)
     frames = frames_of(generator, request.lengths, prompts)
     begun = seeds_of(generator, request.seed_motions, count)
@@ -80,7 +82,8 @@ def _batch(
     bundle: Bundle, prompts: Sequence[Prompt], asked: GenerationRequest, face_seeds: Sequence[int]
 ) -> list[GeneratedMotion]:
     """Motions of prompts that all have a length or all have none."""
-    layout, part = bundle.layout, bundle.generator.part
+    layout = bundle.layout
+    part = bundle.generator.part
     body = bundle.generator.generate(asked)
     # The face takes the body's length, so that both share one time line.
     lengths = [len(motion) for motion in body]
@@ -105,8 +108,11 @@ def _along_script(bundle: Bundle, request: Request) -> list[GeneratedMotion]:
     """One motion driven by segments of text and music in turn, and other samples of it (`script.py`)."""
     from motionloom.pipeline.inference.script import segment_frames, sound_of
 
-    generator, fps, samples = bundle.generator, bundle.layout.fps, request.samples
-    segments, sampling = request.segments, bundle.drawing(request.sampling)
+    generator = bundle.generator
+    fps = bundle.layout.fps
+    samples = request.samples
+    segments = request.segments
+    sampling = bundle.drawing(request.sampling)
     drive = generator.capabilities.drive
     if drive is None:
         raise UserError(
@@ -155,7 +161,8 @@ def _motion(
     bundle: Bundle, prompt: Prompt, motion: Columns, face: Columns | None, segments: tuple[Segment, ...] = ()
 ) -> GeneratedMotion:
     """The motion of columns of the body's generator, which may hold the face too."""
-    layout, features = bundle.layout, motion
+    layout = bundle.layout
+    features = motion
     if bundle.generator.part == "all" and layout.has("face"):
         features = motion[:, layout.part("bodyhand")]
         face = motion[:, layout.part("face")] if face is None else face

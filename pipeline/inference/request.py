@@ -250,7 +250,9 @@ def frames_of(
     generator: MotionGenerator, lengths: Sequence[float | None], prompts: Sequence[Prompt]
 ) -> list[int | None]:
     """Length of each motion in frames, in whole units of the generator; None where the model decides."""
-    fps, unit, most = generator.layout.fps, generator.unit_frames, generator.max_frames
+    fps = generator.layout.fps
+    unit = generator.unit_frames
+    most = generator.max_frames
     seed_frames = generator.capabilities.seed_frames
     wanted = [p.seconds if length is None else length for length, p in zip(lengths, prompts, strict=True)]
     out: list[int | None] = []
@@ -285,7 +287,8 @@ def seeds_of(generator: MotionGenerator, given: Sequence[Path | Columns], count:
     """
     if not given:
         return None
-    layout, frames = generator.layout, generator.capabilities.seed_frames
+    layout = generator.layout
+    frames = generator.capabilities.seed_frames
     if not frames:
         raise UserError(f"this model ({generator.method}) goes on from no motion: leave the seed motion out")
     if len(given) not in (1, count):

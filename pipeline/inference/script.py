@@ -108,7 +108,8 @@ class DrivenSegment:
 
 def segment_frames(generator: MotionGenerator, segment: DrivenSegment, number: int) -> int:
     """Length of a segment in frames, in whole units of the generator; `number` is for errors."""
-    unit, fps = generator.unit_frames, generator.layout.fps
+    unit = generator.unit_frames
+    fps = generator.layout.fps
     units = round(segment.seconds * fps / unit)
     if units < 1:
         raise UserError(

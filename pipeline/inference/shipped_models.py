@@ -94,7 +94,8 @@ def find_model(name: Path | str, **options: Any) -> Path:
 
 def no_such_model(name: Path | str) -> str:
     """One sentence about a model that is not there, with the nearest folder or the shipped models."""
-    said, shipped = no_such_folder(Path(name)), list(shipped_models())
+    said = no_such_folder(Path(name))
+    shipped = list(shipped_models())
     if not shipped or len(Path(name).parts) != 1:
         return said
     near = difflib.get_close_matches(str(name), shipped, n=1, cutoff=0.6)

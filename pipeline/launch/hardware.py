@@ -139,7 +139,8 @@ class Hardware(Config):
         return "nccl" if self.resolved_accelerator() == "gpu" else "gloo"
 
     def describe(self) -> str:
-        count, nodes = self.resolved_devices(), self.nodes
+        count = self.resolved_devices()
+        nodes = self.nodes
         if self.resolved_accelerator() == "gpu":
             here = torch.cuda.is_available()
             where = f"{count} x {torch.cuda.get_device_name(0) if here else 'GPU (none is here)'}"

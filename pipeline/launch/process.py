@@ -89,7 +89,8 @@ def _call_roll(missing: list[int]) -> None:
 
     others = [rank for rank in missing if rank != dist.get_rank()]
     missing[:] = [0]
-    store, end = dist.distributed_c10d._get_default_store(), time.monotonic() + _ANSWER
+    store = dist.distributed_c10d._get_default_store()
+    end = time.monotonic() + _ANSWER
     with suppress(RuntimeError):
         store.set(f"lost/{dist.get_rank()}", "")
         while others and time.monotonic() < end:
@@ -113,7 +114,10 @@ class Interrupted(BaseException):
 
     def __init__(self, stage: str, step: int, steps: int, signal: str) -> None:
         super().__init__(f"{signal}: {stage} is saved at step {step} of {steps}")
-        self.stage, self.step, self.steps, self.signal = stage, step, steps, signal
+        self.stage = stage
+        self.step = step
+        self.steps = steps
+        self.signal = signal
 
     @property
     def exit_code(self) -> int:

@@ -169,10 +169,12 @@ def _patient_group() -> dist.ProcessGroup:
 def _meet_nodes(hardware: Hardware) -> None:
     """Refuse nodes that count other processes than the first, which no launcher has compared: they would wait
     for each other until the time-out."""
-    env, nodes = os.environ, hardware.nodes
+    env = os.environ
+    nodes = hardware.nodes
     if nodes == 1 or env.keys() & {"RANK", "LOCAL_RANK"} or srun_tasks() > 1:
         return
-    node, mine = int(env["NODE_RANK"]), f"{nodes} and hardware.devices {hardware.resolved_devices()}"
+    node = int(env["NODE_RANK"])
+    mine = f"{nodes} and hardware.devices {hardware.resolved_devices()}"
     try:
         store = _node_store(env["MASTER_ADDR"], int(env["MASTER_PORT"]), node == 0)
         store.set(f"node/{node}", mine)
@@ -211,8 +213,11 @@ def environment() -> ClusterEnvironment | None:
 
 def _require_match(hardware: Hardware) -> None:
     """Refuse to train in processes that do not know of each other: each would write the same files."""
-    world, devices, nodes = hardware.world(), hardware.resolved_devices(), hardware.nodes
-    env, tasks = os.environ, srun_tasks()
+    world = hardware.world()
+    devices = hardware.resolved_devices()
+    nodes = hardware.nodes
+    env = os.environ
+    tasks = srun_tasks()
     fix = "set hardware.devices (processes on a node) and hardware.nodes to match it"
     if "RANK" in env:
         launched = env.get("WORLD_SIZE", str(world))
@@ -241,7 +246,8 @@ def _require_match(hardware: Hardware) -> None:
                 f"node 0"
             )
         return
-    each, stated_nodes = env.get("SLURM_NTASKS_PER_NODE"), env.get("SLURM_NNODES", str(nodes))
+    each = env.get("SLURM_NTASKS_PER_NODE")
+    stated_nodes = env.get("SLURM_NNODES", str(nodes))
     if tasks != world or (each or str(devices)) != str(devices) or stated_nodes != str(nodes):
         raise UserError(
             f"srun started {tasks} processes on {stated_nodes} node(s) and the recipe asks for {devices} on "

@@ -65,7 +65,8 @@ def _drawing(
 ) -> str:
     """Limbs between some joints, fitted into the picture, and a circle with the error of each with one."""
     chosen = places[list(joints)]
-    low, high = chosen.min(0), chosen.max(0)
+    low = chosen.min(0)
+    high = chosen.max(0)
     scale = ((SIZE - 2 * MARGIN) / (high - low)).min()
     wide, tall = scale * (high - low)
     fitted = (chosen - (low[0], high[1])) * (scale, -scale) + ((SIZE - wide) / 2, MARGIN)

@@ -16,8 +16,12 @@ from html import escape
 import numpy as np
 from numpy.typing import ArrayLike
 
-WIDTH, HEIGHT = 640, 320
-LEFT, RIGHT, TOP, BOTTOM = 62, 24, 14, 46
+WIDTH = 640
+HEIGHT = 320
+LEFT = 62
+RIGHT = 24
+TOP = 14
+BOTTOM = 46
 STRETCHES = 200
 COLOURS = 8
 """Colours of the page's style, `.s0` to `.s7`."""
@@ -62,7 +66,8 @@ def line_chart(lines: Sequence[Line], title: str, marks: Sequence[float] = ()) -
     """
     curves = []
     for line in lines:
-        x, y = np.asarray(line.x, np.float64).ravel(), np.asarray(line.y, np.float64).ravel()
+        x = np.asarray(line.x, np.float64).ravel()
+        y = np.asarray(line.y, np.float64).ravel()
         good = np.isfinite(x) & np.isfinite(y)
         curves.append((x[good], y[good]))
     filled = [(x, y) for x, y in curves if len(x)]
@@ -72,7 +77,8 @@ def line_chart(lines: Sequence[Line], title: str, marks: Sequence[float] = ()) -
     high_x = max(float(x.max()) for x, _ in filled)
     low_y = min(float(y.min()) for _, y in filled)
     high_y = max(float(y.max()) for _, y in filled)
-    x_axis, y_axis = _Axis(low_x, high_x, LEFT, WIDTH - RIGHT), _Axis(low_y, high_y, HEIGHT - BOTTOM, TOP)
+    x_axis = _Axis(low_x, high_x, LEFT, WIDTH - RIGHT)
+    y_axis = _Axis(low_y, high_y, HEIGHT - BOTTOM, TOP)
     parts = _axes(x_axis, y_axis, "step", "")
     for at in (x_axis(step) for step in marks if low_x <= step <= high_x):
         parts.append(f'<line class="mark" x1="{at:.1f}" x2="{at:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>')
@@ -83,7 +89,8 @@ def line_chart(lines: Sequence[Line], title: str, marks: Sequence[float] = ()) -
             keep = {0, len(x) - 1}
             for stretch in np.array_split(np.arange(len(x)), STRETCHES):
                 keep |= {int(stretch[np.argmin(y[stretch])]), int(stretch[np.argmax(y[stretch])])}
-            x, y = x[sorted(keep)], y[sorted(keep)]
+            x = x[sorted(keep)]
+            y = y[sorted(keep)]
         points = [
             (round(x_axis(a), 1), round(y_axis(b), 1)) for a, b in zip(x.tolist(), y.tolist(), strict=True)
         ]
@@ -118,15 +125,21 @@ def histogram(
     below = np.zeros(bins)
     for index, (name, values) in enumerate(stacks.items()):
         for number, value in enumerate(values.tolist()):
-            low, high = edges[0] + number * step, edges[0] + (number + 1) * step
-            left, right = x_axis(low), x_axis(high)
+            low = edges[0] + number * step
+            high = edges[0] + (number + 1) * step
+            left = x_axis(low)
+            right = x_axis(high)
             gap = min(0.5, 0.1 * (right - left))
-            base, top = y_axis(below[number]), y_axis(below[number] + value)
-            kind, tall = f"stack s{index % COLOURS}", base - top
+            base = y_axis(below[number])
+            top = y_axis(below[number] + value)
+            kind = f"stack s{index % COLOURS}"
+            tall = base - top
             if not value:  # an unused code, which is worth seeing
                 if len(stacks) > 1:
                     continue
-                kind, top, tall = "dead", base, 5.0
+                kind = "dead"
+                top = base
+                tall = 5.0
             tip = f"<title>{escape(f'{name}, {low:.4g} to {high:.4g}: {value:g}')}</title>"
             parts.append(
                 f'<rect class="{kind}" x="{left + gap:.2f}" y="{top:.1f}" '
@@ -142,13 +155,15 @@ class _Axis:
     def __init__(self, low: float, high: float, start: float, end: float, nice: bool = True) -> None:
         if high - low < 1e-12 * max(abs(low), abs(high), 1e-300):
             pad = abs(low) * 0.1 or 0.5
-            low, high = low - pad, high + pad
+            low = low - pad
+            high = high + pad
         rough = (high - low) / 5
         power = 10 ** math.floor(math.log10(rough))
         self.step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough * 0.999)
         self.low = math.floor(low / self.step) * self.step if nice else low
         self.high = math.ceil(high / self.step) * self.step if nice else high
-        self.start, self.end = start, end
+        self.start = start
+        self.end = end
 
     def __call__(self, value: float) -> float:
         return self.start + (value - self.low) / (self.high - self.low) * (self.end - self.start)

@@ -37,7 +37,8 @@ class Page:
     """Collects blocks in order; `write` makes the file. Each `add_` returns the page, so calls chain."""
 
     def __init__(self, title: str, subtitle: str = "") -> None:
-        self.title, self.subtitle = title, subtitle
+        self.title = title
+        self.subtitle = subtitle
         self._blocks: list[str] = []
         self._contents: list[tuple[str, str]] = []
         self._viewers = 0
@@ -182,7 +183,8 @@ class Page:
 
         `choices` are name and reason of a motion, or None where there is nothing to decide.
         """
-        self._choosing, name = True, f"viewer-{self._viewers}"
+        self._choosing = True
+        name = f"viewer-{self._viewers}"
         data = safe_json({"choices": choices, "file": file})
         self._blocks.append(
             f'<div class="choices" id="{name}-choices"></div>'

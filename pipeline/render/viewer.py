@@ -229,7 +229,8 @@ def _detail(name: str) -> dict[str, object]:
 
 def pose_data(posing: Posing) -> dict[str, object]:
     """The bones, and rotations of the joints that turn by themselves (`turning`); arrays are base64."""
-    skeleton, parents = posing.skeleton, np.asarray(posing.skeleton.parents)
+    skeleton = posing.skeleton
+    parents = np.asarray(posing.skeleton.parents)
     known = human_skeleton(skeleton.parents)
     assert known is not None  # only bodies are posed
     alike = np.abs(posing.turns - posing.turns[:, parents]).max(axis=(0, 2, 3)) < _STILL
@@ -282,7 +283,8 @@ def viewer_script(bodies: bool = True) -> str:
     """
     body = "\n".join(resource(f"viewer/{name}.js") for name in SCRIPTS)
     mesh = safe_json(mesh_data()) if bodies else "null"
-    head, foot = f"'use strict';\nconst BODY = {mesh};", "window.motionloomViewer = mountViewer;"
+    head = f"'use strict';\nconst BODY = {mesh};"
+    foot = "window.motionloomViewer = mountViewer;"
     return f"(function () {{\n{head}\n{body}\n{foot}\n}})();"
 
 

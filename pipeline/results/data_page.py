@@ -54,7 +54,8 @@ class Records:
 
     def add(self, dataset: ShardDataset, clip: int, *, example: bool) -> None:
         """Count one clip's record; an `example` shows its first caption on the page."""
-        meta, captions = dataset.meta(clip), dataset.texts(clip)
+        meta = dataset.meta(clip)
+        captions = dataset.texts(clip)
         self.captions += len(captions)
         self.captioned[dataset.split] += bool(captions)
         for caption in captions:
@@ -139,7 +140,8 @@ def watch(
         joints = resample(joints, fps, WATCH_FPS)
         face = None if face is None else resample(face, fps, WATCH_FPS)
         fps = WATCH_FPS
-    place, caption = f"{dataset.split} · {dataset.ids[clip]}", _main_caption(dataset.texts(clip))
+    place = f"{dataset.split} · {dataset.ids[clip]}"
+    caption = _main_caption(dataset.texts(clip))
     return ViewerMotion(
         joints, fps, layout.skeleton.parents, place, caption or "no caption", face_controls=face
     )

@@ -69,7 +69,8 @@ def read_animation(path: Path, label: str) -> bytes:
 
 def _ours(rig: Rig, turns: Floats, places: Floats) -> tuple[Floats, Floats]:
     """Local rotations [T, J, 3, 3] and root [T, 3] of world rotations [T, N, 3, 3] and places of the hips."""
-    parents, names = rig.skeleton.parents, rig.skeleton.joints
+    parents = rig.skeleton.parents
+    names = rig.skeleton.joints
     world = np.empty((len(turns), len(names), 3, 3))
     for joint, name in enumerate(names):
         if (node := rig.nodes.get(name)) is None:

@@ -26,7 +26,8 @@ MOST_NODES, MOST_KEYS = 10_000, 2_000_000
 """Nodes of a file, and numbers of an animation's channel: an hour at 120 frames a second has 1.7 million."""
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
+_JSON = 0x4E4F534A
+_BIN = 0x004E4942
 
 
 @dataclass
@@ -126,7 +127,8 @@ class Gltf:
         """The numbers of an accessor [count, width]."""
         try:
             about = self.json["accessors"][accessor]
-            width, kind = _WIDTHS[about["type"]], np.dtype(_KINDS[about["componentType"]])
+            width = _WIDTHS[about["type"]]
+            kind = np.dtype(_KINDS[about["componentType"]])
             count = int(about["count"])
             if not 0 < count <= MOST_KEYS or "sparse" in about:
                 raise ValueError("a count beyond bounds, or sparse numbers")

@@ -133,7 +133,8 @@ def _thumb(bone: str) -> str:
 
 def _guessed(gltf: Gltf, places: NDArray[np.float64]) -> dict[str, int]:
     """What names of common tools say."""
-    order, names = gltf.in_order(), gltf.names()
+    order = gltf.in_order()
+    names = gltf.names()
     row = {node: number for number, node in enumerate(order, 1)}
     parents = tuple(row.get(gltf.parents[node], 0) for node in order)
     above = np.concatenate([np.zeros((1, 3)), places[order]])

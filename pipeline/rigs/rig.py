@@ -67,7 +67,8 @@ class Rig:
         """The character of a GLB or VRM file; `own` is a JSON file of names."""
         gltf = Gltf.read(path)
         rest = _rest_worlds(gltf)
-        places, scales = rest[:, :3, 3], np.linalg.norm(rest[:, :3, :3], axis=1)
+        places = rest[:, :3, 3]
+        scales = np.linalg.norm(rest[:, :3, :3], axis=1)
         nodes = nodes_of(gltf, places, own)
         hands = any(joint in nodes for joint in WHOLE.joints[BODY_JOINTS:])
         skeleton = WHOLE if hands else Skeleton.named("smpl22")
@@ -110,7 +111,8 @@ class Rig:
         _, world = forward_kinematics(worn.rotations, worn.root, self.skeleton.offsets, parents)
         numbered = enumerate(self.skeleton.joints)
         ours = {self.nodes[joint]: number for number, joint in numbered if joint in self.nodes}
-        frames, hips = len(worn.root), self.nodes["pelvis"]
+        frames = len(worn.root)
+        hips = self.nodes["pelvis"]
         turned = np.empty((len(self.gltf.parents), frames, 3, 3))
         tracks: dict[tuple[int, str], Floats] = {}
         for node in self.gltf.in_order():
@@ -132,7 +134,8 @@ class Rig:
 
 def _of_joints(figure: RigidMotion, skeleton: Skeleton) -> RigidMotion:
     """The figure with hands or without, as a skeleton has them."""
-    have, want = len(figure.skeleton), len(skeleton)
+    have = len(figure.skeleton)
+    want = len(skeleton)
     if have < want:
         return with_hands(figure)
     if have == want:

@@ -25,7 +25,8 @@ def put_on(rig: Rig, clips: list[OutputClip]) -> list[str]:
     said = rig.lacks()
     names: set[str] = set()
     for number, clip in enumerate(clips, 1):
-        figure, values = clip.shown.figure, face_values(clip)
+        figure = clip.shown.figure
+        values = face_values(clip)
         if not (np.isfinite(figure.rotations).all() and np.isfinite(figure.root).all()):
             raise UserError(f"'{clip.shown.motion.caption}' holds NaN or infinite values; a GLB file cannot")
         faces = face_tracks(rig.gltf, values)

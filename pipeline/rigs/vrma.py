@@ -44,7 +44,8 @@ def write_vrma(path: Path, outputs: Outputs) -> None:
     """The motion of one clip."""
     [clip] = outputs.clips
     worn = on_bones(clip.shown.figure, t_pose(clip.shown.figure.skeleton))
-    skeleton, frames = worn.skeleton, len(worn.root)
+    skeleton = worn.skeleton
+    frames = len(worn.root)
     lift = -float(body_for(skeleton).vertices[:, 1].min())
     nodes: list[dict[str, Any]] = []
     for joint, name in enumerate(skeleton.joints):

@@ -206,7 +206,8 @@ def evaluate_run(
     console = console or make_console()
     changes = {"clips": clips, "repeats": repeats}
     with run_at(folder, at) as run:
-        out, share = _beside(folder, run) / "evaluate", share and at is None
+        out = _beside(folder, run) / "evaluate"
+        share = share and at is None
         return _stages_again(run, "figures", out, console, changes, device, share)
 
 
@@ -228,12 +229,14 @@ def report_run(
 
     With `at` it shows what the trainings make at a checkpoint (`snapshot.run_at`), and lies in RUN/at.
     """
-    folder, out = Path(folder), None if out is None else Path(out)
+    folder = Path(folder)
+    out = None if out is None else Path(out)
     console = console or make_console()
     if out is not None:
         require_file_place(out, ".html")
     with run_at(folder, at) as run:
-        state, made = run_state(run), _beside(folder, run) / "report"
+        state = run_state(run)
+        made = _beside(folder, run) / "report"
         page = _stages_again(run, "page", made, console, {}, device, state=state) / "report.html"
     if missing := [stage for stage in state.unfinished if stage.kind != "report"]:
         console.print(f"not finished: {', '.join(f'{stage.name} ({stage.say()})' for stage in missing)}")
@@ -260,7 +263,8 @@ def export_run(
     otherwise. With `at` trainings that are not finished are taken from a checkpoint (`snapshot.run_at`);
     their artifacts say the step.
     """
-    folder, out = Path(folder), Path(out)
+    folder = Path(folder)
+    out = Path(out)
     from motionloom.pipeline.inference.exported import CARD, write_bundle
 
     console = console or make_console()

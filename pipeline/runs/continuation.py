@@ -85,7 +85,8 @@ def continuation(
     stage: Stage, wanted: TrainingFacts | None, before: Started, folder: Path
 ) -> Continuation | str:
     """How the training in `folder` goes on with other settings, or why it cannot, in words."""
-    old, step = before.training, newest_step(folder)
+    old = before.training
+    step = newest_step(folder)
     if wanted is None or old is None or step is None:
         return "there is no checkpoint to go on from"
     config: TrainedStageConfig = stage.config
@@ -104,7 +105,8 @@ def continuation(
     # What was to be trained further, and was not, is finished where it was.
     if step > config.train.steps or (step == config.train.steps and set(keys) - {_STEPS}):
         return f"step {step} is its last; raise {stage.name}.{_STEPS}"
-    differs, schedule = ", ".join(changes) or "as it was trained", config.schedule_of_length()
+    differs = ", ".join(changes) or "as it was trained"
+    schedule = config.schedule_of_length()
     reason = f"{differs}: goes on from step {step}"
     if _STEPS in keys and schedule is not None:
         reason += f"; {schedule} now ends with step {config.train.steps}, which is not the same as at once"

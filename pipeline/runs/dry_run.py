@@ -95,7 +95,8 @@ def estimate(
     `measure`, which takes seconds, there are no others.
     """
     stages = {stage.name: stage for stage in recipe.stages} | dict(recipe.outside)
-    known, keys = Sizes.read(), {row.stage.name: _key(recipe, row) for row in plan}
+    known = Sizes.read()
+    keys = {row.stage.name: _key(recipe, row) for row in plan}
     cards: dict[str, ModelCard] = {}
     new: dict[str, ModelCard | None] = {}
     for stage in recipe.stages:
@@ -157,7 +158,8 @@ def estimate_table(cards: Mapping[str, ModelCard], times: Mapping[str, float]) -
         if card.codebook:
             parameters += f" + {_count(card.codebook)} codebook"
         took = f"about {duration(times[name])}" if name in times else "not known here"
-        memory, disk = _size(card.memory_bytes), _size(card.checkpoint_bytes)
+        memory = _size(card.memory_bytes)
+        disk = _size(card.checkpoint_bytes)
         once = f" ({card.local_batch} at once)" if card.local_batch < card.batch else ""
         cells = f"{card.batch}{once}", f"{card.steps:,}", took, memory, disk, card.note
         table.add_row(name, parameters, *cells)
@@ -241,7 +243,8 @@ def replaced_stages(run: Path, plan: Sequence[PlannedStage]) -> list[Replaced]:
     """Stages that are guarded and that the plan would replace."""
     out = []
     for row in plan:
-        folder, trained = stage_folder(run, row.stage.name), row.stage.kind.trains
+        folder = stage_folder(run, row.stage.name)
+        trained = row.stage.kind.trains
         if row.action != "run" or row.again is not None:
             continue
         if Artifact.find(folder) is not None:

@@ -70,7 +70,8 @@ def execute(recipe: Recipe, run: Path, plan: Sequence[PlannedStage], console: Co
                 say(console, doubt, "yellow")
             _begin(recipe, run, plan)
         for row in todo:
-            stage, folder = row.stage, stage_folder(run, row.stage.name)
+            stage = row.stage
+            folder = stage_folder(run, row.stage.name)
             begin = time.perf_counter()
             if leads:
                 place = f"{plan.index(row) + 1}/{len(plan)}"
@@ -233,7 +234,8 @@ def _note(folder: Path, row: PlannedStage) -> None:
 
 
 def _artifact(recipe: Recipe, run: Path, row: PlannedStage, plan: Sequence[PlannedStage]) -> Artifact:
-    stage, rows = row.stage, {planned.stage.name: planned for planned in plan}
+    stage = row.stage
+    rows = {planned.stage.name: planned for planned in plan}
     inputs = {role: _input(recipe, run, row, rows, name) for role, name in stage.inputs.items()}
     return Artifact(
         stage=stage.name,

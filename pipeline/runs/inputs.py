@@ -34,7 +34,8 @@ class Sources:
 
     def resolve(self, stage: Stage, written: object) -> dict[str, str]:
         """Role -> stage; a role that is filled by several stages has one entry for each (`Every.key`)."""
-        roles, at = stage.kind.roles(), f"{self.where}: stages.{stage.name}.inputs"
+        roles = stage.kind.roles()
+        at = f"{self.where}: stages.{stage.name}.inputs"
         if not isinstance(written, dict):
             raise UserError(f"{at} must map roles to stages, like {{data: other_data}}")
         for name in written:

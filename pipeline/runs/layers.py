@@ -46,7 +46,8 @@ def find_recipe(name_or_path: str) -> Path:
         if not is_file(path):
             raise UserError(f"{path}: no such recipe file")
         return path
-    shipped, name = shipped_recipes(), name_or_path.replace("/", "-")
+    shipped = shipped_recipes()
+    name = name_or_path.replace("/", "-")
     if name not in shipped:
         raise UserError(f"no recipe '{name_or_path}'{nearest(name, list(shipped))} (or give a .yaml file)")
     return shipped[name]
@@ -100,7 +101,8 @@ def _read(path: Path, depth: int = 0) -> Tree:
     # A file next to this one goes before a shipped recipe of the same name.
     beside = path.parent / (str(base) if str(base).endswith((".yaml", ".yml")) else f"{base}.yaml")
     extended = _read(beside if is_file(beside) else find_recipe(str(base)), depth + 1)
-    old, new = extended.get("stages"), data.get("stages")
+    old = extended.get("stages")
+    new = data.get("stages")
     out = merge(extended, {key: value for key, value in data.items() if key != "stages"})
     if not isinstance(old, dict) or not isinstance(new, dict):
         return {**out, "stages": new if "stages" in data else old}
@@ -133,7 +135,8 @@ def _override(data: Tree, text: str, hint: Hint) -> Tree:
     parts = key.strip().split(".")
     if not equals or not all(parts):
         raise UserError(f"--set {text}: write it as stage.field=value")
-    new, stages = load_yaml(value, f"--set {text}"), data.get("stages") or {}
+    new = load_yaml(value, f"--set {text}")
+    stages = data.get("stages") or {}
     if parts[0] not in _TOP:
         if parts[0] not in stages:
             meant = hint(parts, stages) or nearest(parts[0], [*stages, *_TOP], list(stages))
@@ -164,7 +167,8 @@ def _put(data: object, parts: Sequence[str], value: object) -> Any:
 
 def place_name(folder: Path) -> str:
     """A stage outside the run as a loaded recipe names it: from the current folder if it is below it."""
-    place, here = folder.resolve(), Path.cwd()
+    place = folder.resolve()
+    here = Path.cwd()
     name = str(place.relative_to(here)) if place.is_relative_to(here) else str(place)
     return name if is_place(name) else f"./{name}"
 

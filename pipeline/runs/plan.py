@@ -95,18 +95,23 @@ def make_plan(
     # In the recipe's order, since a fingerprint needs those of the inputs.
     for stage in recipe.stages:
         require_elsewhere(run, stage, recipe.outside)
-        facts, folder = _facts(recipe, stage, rows), stage_folder(run, stage.name)
-        before, again = Started.find(folder), asdict(select) if stage.name in forced else None
+        facts = _facts(recipe, stage, rows)
+        folder = stage_folder(run, stage.name)
+        before = Started.find(folder)
+        again = asdict(select) if stage.name in forced else None
         started = Started(fingerprint=fingerprint_of(facts), training=training_facts(stage, facts))
         action, reason = _decide(recipe, stage, started, before, folder, rows)
         if again is not None and not goes_on_again:
-            action, reason = "run", f"from {select.first}"
+            action = "run"
+            reason = f"from {select.first}"
         changed = before.changed if before is not None and action == "resume" else ()
         goes_on: Continuation | str | None = None
         if before is not None and action == "run" and again is None:
             goes_on = continuation(stage, started.training, before, folder)
             if isinstance(goes_on, Continuation) and (stage.name in go_on or not goes_on.knowingly):
-                action, reason, changed = "resume", goes_on.reason, goes_on.changed
+                action = "resume"
+                reason = goes_on.reason
+                changed = goes_on.changed
             elif reason == _UNFINISHED:
                 reason += f": {goes_on if isinstance(goes_on, str) else goes_on.differs}"
         if stage.name in go_on and action == "run":
@@ -114,7 +119,8 @@ def make_plan(
             raise UserError(f"--go-on {stage.name}: {why}")
         # A stage outside the selection is left as it is, outdated or not.
         if stage.name not in wanted and action != "skip":
-            action, reason = "leave", "not selected"
+            action = "leave"
+            reason = "not selected"
         started = started.model_copy(update={"changed": changed})
         identities = {n: _fingerprint(recipe, n, rows) for n in stage.inputs.values() if n in recipe.outside}
         rows[stage.name] = PlannedStage(
@@ -135,7 +141,8 @@ def require_fit(stages: Iterable[Stage], hardware: Hardware) -> None:
 
 def selected(recipe: Recipe, select: Selection) -> set[str]:
     """Names of the stages that may run; refuses selections that contradict each other."""
-    first, until = select.first, select.until
+    first = select.first
+    until = select.until
     last = [name.strip() for name in until.split(",")] if until is not None else []
     named = [("--from", first), *(("--until", name) for name in last)]
     for option, name in named:
@@ -215,7 +222,8 @@ def _decide(
 def _difference(recipe: Recipe, artifact: Artifact, stage: Stage, rows: Mapping[str, PlannedStage]) -> str:
     if artifact.kind != stage.kind.name or artifact.version != stage.kind.version:
         return f"{artifact.kind} v{artifact.version} is now {stage.kind.name} v{stage.kind.version}"
-    old_fields, fields = flatten(artifact.config), flatten(stage.config.dump())
+    old_fields = flatten(artifact.config)
+    fields = flatten(stage.config.dump())
     changes = [
         f"{key} {old_fields.get(key)} -> {fields.get(key)}"
         for key in sorted(old_fields.keys() | fields.keys())
@@ -278,7 +286,8 @@ def doubts(recipe: Recipe, run: Path, stages: Iterable[Stage]) -> list[str]:
 
 def _doubts(recipe: Recipe, run: Path, stage: Stage) -> Iterator[str]:
     yield from stage.config.doubts()
-    batch, steps = stage.config.train.batch_size, stage.config.train.steps
+    batch = stage.config.train.batch_size
+    steps = stage.config.train.steps
     for name in dict.fromkeys(stage.inputs.values()):
         outside = recipe.outside.get(name)
         source = outside or recipe.stage(name)

@@ -154,7 +154,8 @@ def load_recipe(name_or_path: str | Path, overrides: Sequence[str] = (), *, stri
 
 def _parse(entries: Mapping[str, dict[str, Any]], where: str) -> list[tuple[Stage, object]]:
     """The stages without their inputs, and what was written of those."""
-    kinds, parsed = stage_kinds(), []
+    kinds = stage_kinds()
+    parsed = []
     for name, entry in entries.items():
         fields = dict(entry)
         kind_name = fields.pop("kind", None)

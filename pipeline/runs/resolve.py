@@ -64,7 +64,8 @@ def _in_steps(tree: Any) -> Any:
     """Settings whose epochs over a number of clips became steps, at any depth."""
     if not isinstance(tree, dict):
         return tree
-    train, out = tree.get("train"), {key: _in_steps(value) for key, value in tree.items()}
+    train = tree.get("train")
+    out = {key: _in_steps(value) for key, value in tree.items()}
     if isinstance(train, dict) and "epochs" in train:
         per_epoch = train["clips"] / train["batch_size"]
         kept = {key: value for key, value in train.items() if key not in ("epochs", "clips")}
@@ -87,7 +88,9 @@ def resolve(path: Path, overrides: Sequence[str], where: str) -> Tree:
     _require_used(read_file(path).get("defaults"), as_written.get("stages"), str(path))
     inherited = set(as_written.get("defaults") or ())
     data = layered(path, overrides, _place_of)
-    name, stages, defaults = data.pop(START, None), data.get("stages"), data.pop("defaults", None) or {}
+    name = data.pop(START, None)
+    stages = data.get("stages")
+    defaults = data.pop("defaults", None) or {}
     if not isinstance(defaults, dict):
         raise UserError(f"{where}: defaults must map kinds of stages to settings")
     published = published_settings() if defaults.pop(PUBLISHED, False) is True else {}
@@ -193,7 +196,8 @@ class StartingModel:
                 f"{where}: {START} = '{name}': trainings start from a model whose body is made by a stage of "
                 f"kind gpt; this one has {kinds}"
             )
-        gpt, tokenizer = gpts[0], gpts[0].inputs["tokenizer"]
+        gpt = gpts[0]
+        tokenizer = gpts[0].inputs["tokenizer"]
         stages = {"gpt": gpt, "tokenizer": tokenizer, "stats": tokenizer.inputs["stats"]}
         if "tma" in gpt.inputs:
             stages["tma"] = gpt.inputs["tma"]

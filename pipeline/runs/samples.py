@@ -42,17 +42,20 @@ def draw_samples(run: Path, stage: str) -> Path:
     the motions ("drawn/...") and of what was recorded ("recorded/...").
     """
     with run_at(run, f"{stage}:{NEWEST}") as folder:
-        artifact, bundle = Artifact.find(stage_folder(folder, stage)), Bundle.from_run(folder)
+        artifact = Artifact.find(stage_folder(folder, stage))
+        bundle = Bundle.from_run(folder)
         assert artifact is not None and artifact.step is not None
         data = next(one for one in bundle.main.upstream() if one.gives("data"))
         clips = bundle.stage_cache.get(data).held_out()
         fps = clips.layout.fps
         if "text" in bundle.generator.modalities:
-            metrics, truths = metrics_of("captions"), spread_truths(clips, _COUNT)
+            metrics = metrics_of("captions")
+            truths = spread_truths(clips, _COUNT)
             made = perform(bundle, truths)
             real = [Performance(one.joints, one.joints, fps, one.face, one.truth) for one in truths]
         else:
-            metrics, dances = metrics_of("dances"), dances_for(bundle, clips, _COUNT, seconds=_DANCE_SECONDS)
+            metrics = metrics_of("dances")
+            dances = dances_for(bundle, clips, _COUNT, seconds=_DANCE_SECONDS)
             if not dances:
                 raise UserError(f"{data.folder}: no clip of the validation split has music to dance to")
             made = dance_to(bundle, dances)

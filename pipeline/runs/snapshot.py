@@ -65,7 +65,8 @@ def run_at(run: P, at: str | None, what: str = GENERATOR) -> Iterator[P]:
     if not folder.exists() and str(run) in shipped_models():
         raise UserError(f"--at {at}: {run} comes with the package and is finished; leave --at out")
     require_run(folder)
-    recipe, finished = load_recipe(folder / "recipe.yaml"), finished_stages(folder)
+    recipe = load_recipe(folder / "recipe.yaml")
+    finished = finished_stages(folder)
     chosen = _chosen(folder, recipe, finished, at, what)
     if not chosen:
         yield run  # all trainings that have begun are finished
@@ -127,10 +128,12 @@ def _write(
     """Write the run folder into `place`, and say how far each training is; returns it. `exact`: the first was
     asked for by its step.
     """
-    first, aside = next(iter(chosen)), make_console(aside=True)
+    first = next(iter(chosen))
+    aside = make_console(aside=True)
     label = f"{first}-{chosen[first]}"
     folder = place / f"{run.resolve().name}-{label}"
-    own, outside = list[Stage](), dict(recipe.outside)
+    own = list[Stage]()
+    outside = dict(recipe.outside)
     names = {name: name for name in outside}  # in the new recipe: stages outside it have paths
     for stage in recipe.stages:
         given = {role: names[source] for role, source in stage.inputs.items() if source in names}
@@ -163,7 +166,9 @@ def _write(
     write_text(folder / "recipe.yaml", new.to_yaml(folder))
     for stage in own:
         if not stage.kind.trains and _gives(stage, GENERATOR, CAPTIONER):
-            home, cache, seed = stage_folder(folder, stage.name), StageCache(), new.seed
+            home = stage_folder(folder, stage.name)
+            cache = StageCache()
+            seed = new.seed
             home.mkdir(parents=True)
             there = {**outside, **finished_stages(folder)}
             inputs = {role: there[source] for role, source in stage.inputs.items()}
@@ -177,7 +182,8 @@ def _asked_first(stages: Sequence[Stage], first: str) -> list[Stage]:
     """Stages, each behind its inputs, and as early as can be the generators that `first` is part of: the
     first generator is the default, of a run as of a stage that reads every one.
     """
-    named, ordered = {stage.name: stage for stage in stages}, dict[str, Stage]()
+    named = {stage.name: stage for stage in stages}
+    ordered = dict[str, Stage]()
 
     def above(stage: Stage) -> list[Stage]:
         return [named[name] for name in stage.inputs.values() if name in named]
@@ -222,8 +228,10 @@ def _take(
     from motionloom.models.training.averaging import AveragedWeights
     from motionloom.pipeline.training.trained_stage import describe
 
-    source, home = path.parents[1], stage_folder(folder, name)
-    hyper, run = content["hyper_parameters"], path.parents[3]
+    source = path.parents[1]
+    home = stage_folder(folder, name)
+    hyper = content["hyper_parameters"]
+    run = path.parents[3]
     for role, place in hyper["inputs"].items():
         if identity_of((source / place).resolve()) != hyper["identities"][role]:
             raise UserError(
@@ -232,7 +240,8 @@ def _take(
             )
     kind, config, given, seed = describe(content, path, {})
     net, facts = kind.build(config, kind.inputs.of(StageCache().given(given)), seed)
-    weights, prefix = content["state_dict"], "net."
+    weights = content["state_dict"]
+    prefix = "net."
     try:
         net.load_state_dict({k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)})
     except RuntimeError as error:
@@ -245,7 +254,8 @@ def _take(
     write_text(home / FILE_NAME, "".join(f"{json.dumps(row)}\n" for row in rows))
     places = {role: str(stage.folder.resolve()) for role, stage in given.items()}
     outside.update(zip(places.values(), given.values(), strict=True))
-    stage, done = Stage(name, kind, config, places), content["global_step"]
+    stage = Stage(name, kind, config, places)
+    done = content["global_step"]
     _finish(stage, folder, outside, seed, done, Started.find(source))
     averaged = "" if content["average"] is None else ", averaged weights"
     say(aside, f"{name} at step {done:,} of {content['steps']:,}{averaged}")
@@ -286,9 +296,11 @@ def _finish(
     inputs = {}
     for role, name in stage.inputs.items():
         place = outside[name].folder if name in outside else stage_folder(folder, name)
-        made, seen = str(identity_of(place)), place_from(folder, place)
+        made = str(identity_of(place))
+        seen = place_from(folder, place)
         inputs[role] = InputStage(stage=place.name, fingerprint=made, folder=seen)
-    config, made_of = stage.config.dump(), [source.fingerprint for source in inputs.values()]
+    config = stage.config.dump()
+    made_of = [source.fingerprint for source in inputs.values()]
     home = stage_folder(folder, stage.name)
     Artifact(
         stage=stage.name,

@@ -71,14 +71,16 @@ def finish(module: StageModule, run: str | Path, stage: str) -> Path:
         UserError: The module was trained with other settings or inputs than the run has, or the stage has
             begun or is finished there already.
     """
-    folder, hyper = Path(run), dict(module.hparams)
+    folder = Path(run)
+    hyper = dict(module.hparams)
     if not {"kind", "config", "inputs", "identities"} <= hyper.keys():
         raise UserError(
             f"finish: the module has no settings of a stage; train the one of training({stage!r})"
         )
     recipe = load_recipe(folder / "recipe.yaml")
     opened = recipe.stage(stage)
-    kind, plan = opened.kind, make_plan(recipe, folder)
+    kind = opened.kind
+    plan = make_plan(recipe, folder)
     row = next(row for row in plan if row.stage.name == stage)
     place = stage_folder(folder, stage)
     if not isinstance(kind, TrainedStage) or hyper["kind"] != kind.name:

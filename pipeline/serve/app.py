@@ -41,11 +41,15 @@ class Site:
     """A model and its answers, made one after another in a thread of its own, first come first served."""
 
     def __init__(self, model: MotionModel, config: ServeConfig, name: str) -> None:
-        self.model, self.config, self.name = model, config, name
+        self.model = model
+        self.config = config
+        self.name = name
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="model")
         self._asked = 0
-        self.sounds, self.motions = Sounds(config), Motions(model, config)
-        self._bodies, self._uploads = Bodies(config.patience), asyncio.Semaphore(_UPLOADS)
+        self.sounds = Sounds(config)
+        self.motions = Motions(model, config)
+        self._bodies = Bodies(config.patience)
+        self._uploads = asyncio.Semaphore(_UPLOADS)
         discover()
         self.parts = {part.name: part.open(self) for part in SERVED.values()}
         webs = [_WEB, *(part.web for part in SERVED.values())]
@@ -97,7 +101,8 @@ class Site:
         return Response(self._assets[name], media_type=f"{kind}; charset=utf-8")
 
     async def info(self, http: Request) -> Response:
-        bundle, limits = self.model.bundle, self.config
+        bundle = self.model.bundle
+        limits = self.config
         longest = min(limits.max_seconds, self.model.max_seconds)
         skeleton = bundle.layout.skeleton
         return JSONResponse(
@@ -175,9 +180,12 @@ _REFUSALS = (HTTPException, UserError, ClientDisconnect)
 
 async def refused(http: Request, error: Exception) -> Response:
     """Return a refusal as JSON of one sentence."""
-    status, words, headers = 400, str(error), dict[str, str]()
+    status = 400
+    words = str(error)
+    headers = dict[str, str]()
     if isinstance(error, HTTPException):
-        status, headers = error.status_code, dict(error.headers or {})
+        status = error.status_code
+        headers = dict(error.headers or {})
         words = {404: "no such page", 405: "no such method here"}.get(status, error.detail)
     return JSONResponse({"error": words}, status, headers)
 

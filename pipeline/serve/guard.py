@@ -111,7 +111,8 @@ class OwnPage:
 
     @staticmethod
     def _refusal(headers: Headers, method: str) -> str | None:
-        host, origin = headers.get("host", ""), headers.get("origin")
+        host = headers.get("host", "")
+        origin = headers.get("origin")
         if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
             return f"a page of {origin[:80]!r} asks; only this server's own page may"
         # A link to the page may be followed from anywhere; browsers send no Origin with such a GET.
@@ -125,7 +126,9 @@ class Bodies:
     """Reads bodies within limits: of each of them, and of all that are held at a time."""
 
     def __init__(self, patience: float, most: int = MOST_HELD) -> None:
-        self.patience, self.most, self._held = patience, most, 0
+        self.patience = patience
+        self.most = most
+        self._held = 0
 
     @asynccontextmanager
     async def read(self, request: Request, what: str, most: int) -> AsyncIterator[bytes]:
@@ -134,13 +137,15 @@ class Bodies:
         comes of one that is refused is read and dropped (`Connection`): a client whose connection is closed
         while it sends sees a reset in place of the sentence.
         """
-        pieces, size = list[bytes](), 0
+        pieces = list[bytes]()
+        size = 0
 
         async def read() -> None:
             nonlocal size
             async for piece in request.stream():
                 pieces.append(piece)
-                size, self._held = size + len(piece), self._held + len(piece)
+                size = size + len(piece)
+                self._held = self._held + len(piece)
                 if size > most:
                     words = f"{what} is larger than this server takes: at most {most} bytes"
                     raise HTTPException(413, words)

@@ -150,7 +150,8 @@ class Motions:
     """The motions used last: those that are asked for, and what parts of the server keep."""
 
     def __init__(self, model: MotionModel, config: ServeConfig) -> None:
-        self._model, self._config = model, config
+        self._model = model
+        self._config = config
         self.kept = Recent[GeneratedMotion](config.clips, "the clip")
 
     def generate(self, asked: MotionRequest, sound: Sound | None) -> Answer:
@@ -230,7 +231,8 @@ class Recent(Generic[T]):
     """A cache of the last used, by name, for several threads; messages call them `what`."""
 
     def __init__(self, most: int, what: str) -> None:
-        self._most, self._what = most, what
+        self._most = most
+        self._what = what
         self._kept: OrderedDict[str, T] = OrderedDict()
         self._lock = threading.Lock()
 

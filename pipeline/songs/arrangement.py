@@ -33,7 +33,8 @@ Array = NDArray[np.float64]
 STEMS = ("drums", "bass", "others")
 BASSES = range(32, 40)
 """General MIDI programs."""
-_KICKS, _SNARES = (35, 36), (37, 38, 39, 40)
+_KICKS = (35, 36)
+_SNARES = (37, 38, 39, 40)
 _AS_WRITTEN = ("all", "back-beat", "hats", "kick between")
 _DRAWN = ("free", "half-time", "double-time", "four to the floor", "blast")
 
@@ -76,7 +77,8 @@ def hidden(piece: Arrangement, rng: np.random.Generator) -> Arrangement:
     begun = -1  # what lies before the first bar is played as written
     while begun < len(bars) - 1:
         ended = min(len(bars) - 1, begun + int(rng.choice([4, 4, 8, 16]))) if begun >= 0 else 0
-        first, last = (bars[begun] if begun >= 0 else 0), bars[ended]
+        first = bars[begun] if begun >= 0 else 0
+        last = bars[ended]
         inside = (numbers >= first - 0.05) & (numbers < last - 0.05)
         section = [piece.notes[k] for k in np.flatnonzero(inside).tolist()]
         if begun >= 0 and rng.random() < 0.7:
@@ -120,7 +122,8 @@ def _drawn(
     """Drums of a section, a pattern of two bars in sixteenths; `late` delays each second eighth, in beats."""
     steps = 4 * max(1, bars[1] - bars[0] if len(bars) > 1 else 4)
     at = np.arange(2 * steps)
-    beat, place = at % 4 == 0, at % steps
+    beat = at % 4 == 0
+    place = at % steps
     middle = at % 8 == 4 if steps % 8 == 0 else beat & (place > 0)
     # Chances of a stroke in each sixteenth.
     kick = np.where(place == 0, 0.85, np.where(beat, 0.45, np.where(at % 2 == 0, 0.3, 0.12)))

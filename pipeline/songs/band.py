@@ -31,7 +31,15 @@ DRUMS = 9
 """The channel of drums."""
 _DRUM_BANK = 128
 
-KICK, SNARE, _CLAP, HAT, OPEN_HAT, CRASH, RIDE, SHAKER, _RIM = 36, 38, 39, 42, 46, 49, 51, 70, 37
+KICK = 36
+SNARE = 38
+_CLAP = 39
+HAT = 42
+OPEN_HAT = 46
+CRASH = 49
+RIDE = 51
+SHAKER = 70
+_RIM = 37
 _TOMS = (50, 48, 45, 43)
 _BASS, _CHORDS, _PAD, _LEAD = range(4)
 _PROGRAMS = {
@@ -137,7 +145,8 @@ def score(song: Song) -> list[Note]:
     notes: list[Note] = []
     energies = [song.section_of(bar * song.meter) for bar in range(bars + 1)]
     for bar in range(bars):
-        section, following = energies[bar], energies[bar + 1]
+        section = energies[bar]
+        following = energies[bar + 1]
         begins = bar == 0 or energies[bar - 1] is not section
         if section.energy == 0.0:
             notes += _break(song, bar, line_up, begins)
@@ -189,7 +198,9 @@ def perform(
         at = max(0.0, note.at)
         strokes.append((round(at * rate), True, note))
         strokes.append((round((at + note.seconds) * rate), False, note))
-    total, blocks, now = round(seconds * rate), [], 0
+    total = round(seconds * rate)
+    blocks = []
+    now = 0
     # Of what is at one time, notes end before others begin.
     for at, begins, note in sorted(strokes, key=lambda stroke: stroke[:2]):
         if at >= total:
@@ -216,8 +227,10 @@ def _drums(
     """The drums of one bar; what is quiet leaves the kick and the snare out."""
     if how.kit == "none":
         return
-    genre, steps = song.style, 4 * song.meter
-    half, double = how.feel == "half", how.feel == "double"
+    genre = song.style
+    steps = 4 * song.meter
+    half = how.feel == "half"
+    double = how.feel == "double"
     middle = steps // 2 if song.meter == 4 else 4
     backbeat = (
         {middle} if half else set(range(2, steps, 4)) if double else {4, 12} if song.meter == 4 else {4, 8}
@@ -256,7 +269,8 @@ def _drums(
 
 def _harmony(song: Song, bar: int, section: Section, how: LineUp, rng: np.random.Generator) -> Iterator[Note]:
     """Bass, chords, pad and melody of one bar."""
-    genre, steps = song.style, 4 * song.meter
+    genre = song.style
+    steps = 4 * song.meter
     degree = genre.progressions[section.kind][bar % 4]
     loud = 0.5 + 0.5 * section.energy
     root = 33 + song.key + genre.semitones(degree)  # A1 is 33

@@ -53,7 +53,8 @@ class Score:
         struck = np.array([note.at for note in self.notes])
         numbers = np.interp(struck[struck < self.beats[-1]], self.beats, np.arange(len(self.beats)))
         away = np.abs(numbers - np.round(numbers))
-        on, between = float(np.mean(away < 0.125)), float(np.mean(away > 0.375))
+        on = float(np.mean(away < 0.125))
+        between = float(np.mean(away > 0.375))
         return on >= ON_BEAT and on > between
 
 
@@ -105,8 +106,11 @@ def read_score(data: bytes, name: str) -> Score:
     except (OSError, EOFError, ValueError, KeyError, IndexError) as error:
         raise UserError(f"{name}: no MIDI file ({error}); leave it out") from None
     quarter = file.ticks_per_beat
-    now, ticks, tempo = 0.0, 0, 500_000
-    tempi, meters = [(0, 0.0)], [(0, quarter, 4)]
+    now = 0.0
+    ticks = 0
+    tempo = 500_000
+    tempi = [(0, 0.0)]
+    meters = [(0, quarter, 4)]
     notes: list[Note] = []
     programs: list[tuple[float, int, int]] = []
     sounding: dict[tuple[int, int], tuple[float, int]] = {}
@@ -140,7 +144,8 @@ def read_score(data: bytes, name: str) -> Score:
 
 def excerpt(score: Score, seconds: float, rng: np.random.Generator) -> Arrangement:
     """A part of a piece, so many seconds from a place that is drawn, in an arrangement of its own."""
-    first, last = score.notes[0].at, float(score.beats[-1])
+    first = score.notes[0].at
+    last = float(score.beats[-1])
     speed = min(float(np.exp(rng.uniform(-0.2, 0.2))), (last - first) / seconds)
     start = float(rng.uniform(first, last - speed * seconds))
     key = int(rng.integers(-5, 6))

@@ -106,7 +106,9 @@ class AnnotatedSong:
     def load(cls, path: Path) -> AnnotatedSong:
         """Read what `save` wrote; `UserError` for a file that is missing or damaged."""
         with NpzFile(path) as file:
-            stems, beats, downbeats = file.array("stems"), file.numbers("beats"), file.array("downbeats")
+            stems = file.array("stems")
+            beats = file.numbers("beats")
+            downbeats = file.array("downbeats")
         if stems.ndim != 3 or stems.dtype != np.float16 or beats.shape != downbeats.shape or beats.ndim != 1:
             raise UserError(f"{path}: not a song; run the stage that made it again")
         return cls(stems, beats, downbeats.astype(bool))

@@ -80,7 +80,8 @@ class BeatsStage(TrainedStage[BeatsConfig, BeatsInputs, BeatNet]):
 
     def example(self, config: BeatsConfig, net: BeatNet, inputs: BeatsInputs, batch: int) -> Example:
         rows = config.rows
-        levels, targets = torch.empty(batch, rows, BANDS), torch.empty(batch, rows, 2)
+        levels = torch.empty(batch, rows, BANDS)
+        targets = torch.empty(batch, rows, 2)
         example = {"levels": levels, "targets": targets, "length": torch.full((batch,), rows)}
         return Example(example, f"{rows} rows")
 

@@ -135,7 +135,8 @@ def _changed(heard: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np
     from scipy.ndimage import gaussian_filter1d
 
     rows = len(heard)
-    across, along = np.arange(BANDS) / BANDS, np.arange(rows) / rows
+    across = np.arange(BANDS) / BANDS
+    along = np.arange(rows) / rows
     out = heard + 0.3 * _curve(across, rng) + 0.2 * _curve(along, rng)[:, None]
     if rng.random() < 0.35:  # a compressor takes loudness back, as fast as it hears it
         loudness = gaussian_filter1d(out.mean(axis=1), float(np.exp(rng.uniform(0.5, 3.5))))

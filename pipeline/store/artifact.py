@@ -261,7 +261,9 @@ def require_unchanged(folder: Path, *, again: bool = False) -> int:
     Those of an export are compared each time, those of a run once, or `again`. Shards are left
     to whoever reads them (`verify_shards.py`).
     """
-    artifact, run, exported = Artifact.find(folder), owner_of(folder), in_export(folder)
+    artifact = Artifact.find(folder)
+    run = owner_of(folder)
+    exported = in_export(folder)
     if artifact is None:
         return 0
     known = Compared(files={}) if exported or again else Compared.read(run / NOTE)
@@ -271,7 +273,8 @@ def require_unchanged(folder: Path, *, again: bool = False) -> int:
         # Shards may be terabytes: whoever reads them compares them.
         if name.endswith(".tar"):
             continue
-        key, state = f"stages/{folder.name}/{name}", state_of(path)
+        key = f"stages/{folder.name}/{name}"
+        state = state_of(path)
         if known.knows(key, info.sha256, state):
             continue
         if not state or state[0] != info.bytes or sha256_of(path) != info.sha256:

@@ -96,7 +96,8 @@ class Data:
 
     def held_out(self, *, prefer: str = "val") -> ClipDataset:
         """A split for validation: the preferred one, else the other held-out one, else train."""
-        splits, other = self.splits, "test" if prefer == "val" else "val"
+        splits = self.splits
+        other = "test" if prefer == "val" else "val"
         return self.split(next(split for split in (prefer, other, "train") if split in splits))
 
     @property

@@ -101,7 +101,8 @@ class LoadedEvaluator:
     @torch.no_grad()
     def embed_captions(self, captions: Sequence[str], tokens: Sequence[Sequence[str]]) -> Tensor:
         """Latents [n, Z] of captions, and their `word/POS` tags as in `CaptionReader`, on the CPU."""
-        device, out = device_of(self.net), []
+        device = device_of(self.net)
+        out = []
         for start in range(0, len(captions), _BATCH):
             rows = slice(start, start + _BATCH)
             words = self.words.read(captions[rows], tokens[rows])
@@ -125,7 +126,8 @@ def embed_motions(
     `present` [n]: what each holds (all when None); the rest is 0, the mean, as in training.
     """
     columns = judge.layout.part(judge.part)
-    mean, std = judge.stats.mean[columns], judge.stats.std[columns]
+    mean = judge.stats.mean[columns]
+    std = judge.stats.std[columns]
     order = np.argsort([len(m) for m in motions], kind="stable")
     masks = judge.layout.present_columns[:, columns][
         [PRESENT_ALL] * len(motions) if present is None else present

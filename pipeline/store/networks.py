@@ -60,11 +60,13 @@ class TrainedTokenizer:
         """
         groups = torch.tensor([len(motion) // GROUP_FRAMES for motion in motions])
         batch = torch.zeros(len(motions), int(groups.max()) * GROUP_FRAMES, self.net.dim)
-        mean, std = self.stats.mean[self.columns], self.stats.std[self.columns]
+        mean = self.stats.mean[self.columns]
+        std = self.stats.std[self.columns]
         for row, motion, count in zip(batch, motions, (groups * GROUP_FRAMES).tolist(), strict=True):
             row[:count] = torch.from_numpy(((motion[:count] - mean) / std).astype(np.float32))
         device = device_of(self.net)
-        groups, held = groups.to(device), None
+        groups = groups.to(device)
+        held = None
         if present is not None:
             held = torch.from_numpy(self.layout.present_columns[list(present)][:, self.columns]).to(device)
         return Codes(self.net.encode(batch.to(device), groups * GROUP_FRAMES, held), groups)
@@ -101,8 +103,10 @@ class TrainedTokenizer:
 
         `present` says what the clip holds; of what it does not hold, nothing is read and the mean comes back.
         """
-        columns, device = self.columns, device_of(self.net)
-        mean, std = self.stats.mean[columns], self.stats.std[columns]
+        columns = self.columns
+        device = device_of(self.net)
+        mean = self.stats.mean[columns]
+        std = self.stats.std[columns]
         motion = torch.from_numpy(((features - mean) / std).astype(np.float32))[None].to(device)
         mask = torch.from_numpy(self.layout.present_columns[present, columns])[None].to(device)
         rebuilt = self.net.decode(self.net.encode(motion, present=mask), present=mask)
@@ -192,7 +196,8 @@ def stream_facts(tokenizer: Tokenizer) -> dict[str, object]:
 def require_streams(facts: ModelFacts, tokenizer: Tokenizer, what: str) -> None:
     """`UserError` unless the tokenizer has the streams and the pattern that the network was trained on."""
     here = stream_facts(tokenizer)
-    streams, pattern = facts.fact("streams", dict), facts.fact("pattern", list)
+    streams = facts.fact("streams", dict)
+    pattern = facts.fact("pattern", list)
     if (streams, pattern) != (here["streams"], here["pattern"]):
         raise UserError(
             f"{facts.where}: this {what} was trained on streams {streams} in the order {pattern}, the "

@@ -40,7 +40,9 @@ MAX_FRAMES = 196
 MAX_WORDS = 20
 """Words of a caption behind these are not read."""
 
-_FIRST, _LAST, _UNKNOWN = "sos", "eos", "unk"
+_FIRST = "sos"
+_LAST = "eos"
+_UNKNOWN = "unk"
 _OTHER = "OTHER"
 """The class of words that have none."""
 

@@ -77,10 +77,13 @@ class RunReader:
         return self._found[key]
 
     def _read(self, folder: Path) -> StageRecord | None:
-        artifact, exported, run = Artifact.find(folder), in_export(folder), owner_of(folder)
+        artifact = Artifact.find(folder)
+        exported = in_export(folder)
+        run = owner_of(folder)
         if artifact is None:
             return None
-        inputs, gone = dict[str, StageRecord](), dict[str, Path]()
+        inputs = dict[str, StageRecord]()
+        gone = dict[str, Path]()
         for role, source in artifact.inputs.items():
             # An export may come from anywhere: nothing outside its folder is ever followed.
             stage = None if exported and source.folder is not None else self.find(source.place(folder))

@@ -147,7 +147,8 @@ class TextSource:
         different = list(dict.fromkeys(captions))
         if known is None or not different:
             return []
-        out, encoded = [], self._sentences.encode(different)
+        out = []
+        encoded = self._sentences.encode(different)
         pieces = (encoded.mask.sum(1) - _MARKS).tolist()
         for caption, vector, count in zip(different, encoded.sentence, pieces, strict=True):
             is_known = judge(caption)

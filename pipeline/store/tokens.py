@@ -88,7 +88,8 @@ class TokenStore:
             raise UserError(f"{path}: no tokens; run the tokens stage for this split")
         try:
             tensors = load_file(path)
-            starts, whole = tensors["starts"].numpy(), tensors["whole"].numpy()
+            starts = tensors["starts"].numpy()
+            whole = tensors["whole"].numpy()
         except (SafetensorError, KeyError, TypeError) as error:
             raise UserError(f"{path}: cannot be read ({error}); run the tokens stage again") from None
         codes = {k.removeprefix("codes."): v.long() for k, v in tensors.items() if k.startswith("codes.")}
@@ -221,7 +222,9 @@ class TokenBatches(Dataset[dict[str, Any]]):
         self, items: NDArray[np.int64], turns: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """A caption of each clip, and first group and length of its stretch, at most a block; each [B]."""
-        own, chosen, skipped = self.captions, self.captions.starts[items], np.zeros_like(items)
+        own = self.captions
+        chosen = self.captions.starts[items]
+        skipped = np.zeros_like(items)
         choices = own.starts[items + 1] - chosen
         if self.training:
             # Seeded by clip and turn, so that no order of batches and no number of ranks changes a draw: as
@@ -239,7 +242,8 @@ class TokenBatches(Dataset[dict[str, Any]]):
         self, begin: NDArray[np.int64], groups: NDArray[np.int64], closed: NDArray[np.bool_]
     ) -> TokenSequence:
         """The sequences of `groups` [B] groups from group `begin` [B] of the split on."""
-        codes, count = self.store.stretches(begin, groups), torch.from_numpy(groups)
+        codes = self.store.stretches(begin, groups)
+        count = torch.from_numpy(groups)
         batch = interleave(codes, self.pattern, ends=self.ends, groups=count, closed=torch.from_numpy(closed))
         longest = int(batch.length.max())  # the longest row may have no End
         return TokenSequence(batch.tokens[:, :longest], batch.kinds[:, :longest], batch.length)
@@ -293,7 +297,8 @@ def gpt_clips(
     rows: dict[str, int] = {}
     captions = []
     for number, index in enumerate(clips.tolist()):
-        clip_captions, frames = captions_of(dataset, index, face=face), int(dataset.frames[index])
+        clip_captions = captions_of(dataset, index, face=face)
+        frames = int(dataset.frames[index])
         spans = caption_spans(clip_captions, dataset.layout.fps, frames, min_frames)
         groups = int(own.groups[number])
         captions.append([_caption(span, groups, tokenizer.group_frames, rows) for span in spans])

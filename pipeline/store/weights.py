@@ -137,7 +137,9 @@ def built(folder: Path, build: Callable[[], N]) -> N:
     except (OSError, SafetensorError) as error:
         raise UserError(f"{path}: cannot be read as weights ({error}); copy the folder again") from None
     # Sizes come from the file alone: a hostile config must not reserve memory that the weights do not fill.
-    largest, modules, parameters = max(sizes, default=0), 0, dict[int, torch.nn.Parameter]()
+    largest = max(sizes, default=0)
+    modules = 0
+    parameters = dict[int, torch.nn.Parameter]()
 
     def weighed(_: torch.nn.Module, name: str, part: torch.nn.Parameter | None) -> None:
         if part is not None and _BUILDING.get() == path:
@@ -282,7 +284,8 @@ def load_weights(folder: Path, net: torch.nn.Module) -> None:
     path = folder / "model.safetensors"
     try:
         require_plain(path)
-        own, fix = net.state_dict(), "run its stage again"
+        own = net.state_dict()
+        fix = "run its stage again"
         net.load_state_dict(
             {
                 name: _as_type(value, own[name].dtype, f"{path}: '{name}'", fix) if name in own else value

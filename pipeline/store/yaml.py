@@ -58,7 +58,8 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode) or key.tag == f"{_TAG}merge":
                 continue
-            line, name = key.start_mark.line + 1, (key.tag, key.value)
+            line = key.start_mark.line + 1
+            name = (key.tag, key.value)
             if name in seen:
                 raise yaml.constructor.ConstructorError(
                     None, None, f"key '{key.value}' is in line {seen[name]} already; keep one", key.start_mark
@@ -122,7 +123,8 @@ def load_yaml(text: str, where: str) -> Any:
 
 def _require_few(data: object, where: str) -> None:
     """Refuse aliases of aliases, which stand for more values than fit in memory."""
-    todo, count = [data], 0
+    todo = [data]
+    count = 0
     while todo:
         value = todo.pop()
         count += 1

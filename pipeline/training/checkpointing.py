@@ -111,7 +111,8 @@ class BackgroundWriter(CheckpointIO):
     """
 
     def __init__(self, *, keep: int, keep_every: int = 0) -> None:
-        self.keep, self.keep_every = keep, keep_every
+        self.keep = keep
+        self.keep_every = keep_every
         self._thread: threading.Thread | None = None
         self._error: BaseException | None = None
 
@@ -145,7 +146,8 @@ class BackgroundWriter(CheckpointIO):
             self._thread.join()
             self._thread = None
         if self._error is not None:
-            error, self._error = self._error, None
+            error = self._error
+            self._error = None
             raise error
 
     def _run(self, state: object, path: Path) -> None:
@@ -263,7 +265,8 @@ def _check_seal(path: Path) -> None:
         if seal is None:
             raise DamagedError("its end with the checksum is cut off or damaged")
         file.seek(0)
-        digest, block = hashlib.sha256(), memoryview(bytearray(_BLOCK))
+        digest = hashlib.sha256()
+        block = memoryview(bytearray(_BLOCK))
         while size > 0:
             count = file.readinto(block[: min(size, _BLOCK)])
             if not count:

@@ -168,7 +168,9 @@ class TrainedStageConfig(StageConfig):
 
     def doubts(self) -> list[str]:
         """Return a warning for each setting that probably does not do what is meant."""
-        found, steps, loss = optimizers_of(self), self.train.steps, getattr(self, "loss", None)
+        found = optimizers_of(self)
+        steps = self.train.steps
+        loss = getattr(self, "loss", None)
         begins = {key: getattr(loss, key, 0) for key in ("align_from", "adversarial_start")}
         return [
             *(f"{key}.{doubt}" for key, optim in found for doubt in optim.doubts(steps)),

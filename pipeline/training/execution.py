@@ -42,7 +42,8 @@ graphs [on an H100 the tokenizer and TMA wait for Python, the GPT of 228 million
 
 def compile_module(module: StageModule, config: TrainConfig, hardware: Hardware) -> None:
     """Compile the losses as `train.compile` says, or where it is known to be worth it."""
-    on_gpu, world = hardware.resolved_accelerator() == "gpu", hardware.world()
+    on_gpu = hardware.resolved_accelerator() == "gpu"
+    world = hardware.world()
     cut = config.strategy == "fsdp" and world > 1
     if config.compile or (config.compile is None and on_gpu and module.compilable and not cut):
         size = sum(param.numel() for param in module.parameters())

@@ -43,7 +43,8 @@ class FailureGuard:
     """Finds what is not finite in the training of a stage, on all ranks at the same steps."""
 
     def __init__(self, name: str, module: StageModule) -> None:
-        self.name, self.module = name, module
+        self.name = name
+        self.module = module
 
     def check(self) -> None:
         """Collective: raise `NotFiniteError` if any rank has failed."""
@@ -54,7 +55,8 @@ class FailureGuard:
         ].tolist()
         if not math.isfinite(min(orders)):
             return
-        first, text = orders.index(min(orders)), [""]
+        first = orders.index(min(orders))
+        text = [""]
         if first == rank():
             assert failure is not None
             where = f" (rank {first})" * (world_size() > 1)
@@ -140,7 +142,9 @@ class StallTimer:
     """Ends this process, with the tracebacks of all threads, if it makes no progress for some time."""
 
     def __init__(self, path: Path, seconds: float, console: Console) -> None:
-        self.path, self.seconds, self.console = path, seconds, console
+        self.path = path
+        self.seconds = seconds
+        self.console = console
         self._armed = -math.inf
         self._file: IO[str] | int = 2  # standard error, where `path` cannot be written
 

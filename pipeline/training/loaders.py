@@ -50,7 +50,9 @@ class StageData(L.LightningDataModule):
 
     def __init__(self, batches: Batches, train: TrainConfig, hardware: Hardware | None = None) -> None:
         super().__init__()
-        self.batches, self.config, self.hardware = batches, train, hardware or Hardware()
+        self.batches = batches
+        self.config = train
+        self.hardware = hardware or Hardware()
         self.waiting: Callable[[], AbstractContextManager[object]] = nullcontext
         """Gives a context around each wait for a training batch."""
         self._held_out: Loader | None = None
@@ -73,7 +75,8 @@ class StageData(L.LightningDataModule):
         module = None if trainer is None else trainer.lightning_module
         parts = module.accumulate if isinstance(module, StageModule) else self.config.accumulate
         steps = self.config.steps if trainer is None or trainer.max_steps < 0 else trainer.max_steps
-        size, batches = self.config.batch_size, self.batches.train
+        size = self.config.batch_size
+        batches = self.batches.train
 
         def make(rank: int, world: int) -> Numbered[Batch]:
             return batches(size, Share(rank, world, parts))
@@ -157,7 +160,8 @@ class SharedBatches(IterableDataset[Packed]):
     """
 
     def __init__(self, steps: Steps[Batch], rooms: int) -> None:
-        self.steps, self.rooms = steps, rooms
+        self.steps = steps
+        self.rooms = rooms
 
     def __len__(self) -> int:
         return len(self.steps)
@@ -195,7 +199,10 @@ class Loader:
 
     def __init__(self, steps: Steps[Batch], hardware: Hardware, device: torch.device, *, once: bool) -> None:
         """With `once` no worker is kept for the next epoch, which would begin where this one did."""
-        self.steps, self.hardware, self.device, self.once = steps, hardware, device, once
+        self.steps = steps
+        self.hardware = hardware
+        self.device = device
+        self.once = once
         self.waiting: Callable[[], AbstractContextManager[object]] = nullcontext
         """Gives a context around each wait for a batch."""
         self._opened: DataLoader[Batch] | None = None

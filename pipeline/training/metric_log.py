@@ -55,9 +55,12 @@ class MetricLog:
     def __init__(
         self, folder: Path, names: Sequence[LoggerName], project: str, title: str, console: Console
     ) -> None:
-        self.path, self.folder = folder / FILE_NAME, folder / FOLDER
+        self.path = folder / FILE_NAME
+        self.folder = folder / FOLDER
         self.names = tuple(dict.fromkeys(names))
-        self.project, self.title, self.console = project, title, console
+        self.project = project
+        self.title = title
+        self.console = console
         self.rows: list[Row] = []
         self._loggers: dict[LoggerName, Logger] = {}
         self._sent: dict[str, int] = {}
@@ -73,7 +76,8 @@ class MetricLog:
         return {"rows": f"[{rows}]", "gauges": f"[{gauges}]"}
 
     def load_state_dict(self, state: LogState) -> None:
-        self.rows, gauges = json.loads(state["rows"]), json.loads(state["gauges"])
+        self.rows = json.loads(state["rows"])
+        gauges = json.loads(state["gauges"])
         pairs = zip(self.rows, gauges, strict=True)
         self._texts = [(json.dumps(row), json.dumps(more)) for row, more in pairs]
 

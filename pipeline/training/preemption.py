@@ -132,16 +132,21 @@ class Agreement:
         seconds = time.monotonic() - self._time
         agreed = torch.tensor([float(self.signals.number), seconds], dtype=torch.float64)
         dist.all_reduce(agreed, dist.ReduceOp.MAX, self.group)
-        steps, seconds = self._count - self._last, float(agreed[1])
+        steps = self._count - self._last
+        seconds = float(agreed[1])
         if steps > 0:  # the slowest rank's clock decides for all
             fitting = int(steps * _BETWEEN / max(seconds, 1e-6))
             self._every = max(1, min(fitting, _GROWTH * self._every))
-        self._last, self._next, self._time = self._count, self._count + self._every, time.monotonic()
+        self._last = self._count
+        self._next = self._count + self._every
+        self._time = time.monotonic()
         return int(agreed[0])
 
     def restart_pace(self) -> None:
         """Measure the interval anew: calls change from steps to batches of a validation, or back."""
-        self._every, self._last, self._time = 1, self._count, time.monotonic()
+        self._every = 1
+        self._last = self._count
+        self._time = time.monotonic()
         self._next = self._count + 1
 
     def barrier(self) -> None:

@@ -99,7 +99,9 @@ class Telemetry:
     def __init__(
         self, folder: Path, module: StageModule, batch_size: int, console: Console, at_peak: float
     ) -> None:
-        self.module, self.batch_size, self.console = module, batch_size, console
+        self.module = module
+        self.batch_size = batch_size
+        self.console = console
         self.waits = WaitTimes(module.device)
         self.note = ""
         """Speed, MFU and goodput of the last row, in words."""
@@ -115,7 +117,8 @@ class Telemetry:
         """Without the wait for the batch."""
         self._latest: deque[float] = deque(maxlen=100)
         self._lengths: list[Tensor] = []
-        self._units, self._unit = 0.0, ""
+        self._units = 0.0
+        self._unit = ""
         if module.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats(module.device)  # of the trainings before in this process
         rows: list[dict[str, float]] = []
@@ -140,7 +143,8 @@ class Telemetry:
 
     def begin_step(self) -> None:
         """Start the clock of a step, after validations and checkpoints."""
-        self._step_start, self._waited_before = time.perf_counter(), self.waits.process
+        self._step_start = time.perf_counter()
+        self._waited_before = self.waits.process
 
     def end_step(self) -> None:
         seconds = time.perf_counter() - self._step_start
@@ -158,10 +162,15 @@ class Telemetry:
         self.waits["ranks"] += waited_in_steps(late, rank())
         self.waits.read()
         now = time.perf_counter()
-        wall, self._row_start = max(now - self._row_start, 1e-9), now
-        waited, self._before = self.waits.shares(self._before, wall), dict(self.waits)
-        seconds, self._seconds, self._own = self._seconds, [], []
-        units, latest = self._read_lengths(), sorted(self._latest)
+        wall = max(now - self._row_start, 1e-9)
+        self._row_start = now
+        waited = self.waits.shares(self._before, wall)
+        self._before = dict(self.waits)
+        seconds = self._seconds
+        self._seconds = []
+        self._own = []
+        units = self._read_lengths()
+        latest = sorted(self._latest)
         first = self.module.step - self._first == len(seconds)
         mean, use = self._use.row(len(seconds) - first, self.waits.aside + self._start_seconds)
         row: dict[str, float] = {
@@ -184,7 +193,8 @@ class Telemetry:
             self._shown.insert(0, f"MFU {100 * row['mfu']:.1f} %")
         speed = [f"{row[f'{self._unit}_per_second']:,.0f} {self._unit}/s"] if self._unit else []
         self.note = "  ".join(speed + self._shown)
-        path, self._log = self._log, None
+        path = self._log
+        self._log = None
         if path is not None:
             with self._optional(), open_own(path, "a") as file:
                 gauges = {name: float(value) for name, value in self.module.gauges.items()}
@@ -194,7 +204,8 @@ class Telemetry:
 
     def summary(self) -> str:
         """Return a sentence on speed and waits since this process began to train; "" if it took no step."""
-        steps, wall = self.module.step - self._first, time.perf_counter() - self._start
+        steps = self.module.step - self._first
+        wall = time.perf_counter() - self._start
         self._read_lengths()
         self.waits.read()
         if not steps:
@@ -255,7 +266,9 @@ class StepProgress:
     """Progress on rank 0: a bar on a terminal, a line every 15 s elsewhere."""
 
     def __init__(self, name: str, first: int, steps: int, console: Console) -> None:
-        self.name, self.steps, self.console = name, steps, console
+        self.name = name
+        self.steps = steps
+        self.console = console
         self.pace = Pace(steps, first)
         self._next = 0.0
         self._bar: Progress | None = None
@@ -295,7 +308,8 @@ class SampleProcess:
 
     def __init__(self, context: StageContext, every: int) -> None:
         """`every` is in steps; 0, or a stage that makes no motion, draws nothing."""
-        self.context, self.every = context, every if context.draws else 0
+        self.context = context
+        self.every = every if context.draws else 0
         self._process: subprocess.Popen[bytes] | None = None
         self._failed = False
 
@@ -304,7 +318,9 @@ class SampleProcess:
         code = 0 if self._process is None else self._process.poll()
         if code is None or not self.every or step % self.every:
             return
-        log, failed, self._failed = self.context.folder / SAMPLES / "log.txt", self._failed, code != 0
+        log = self.context.folder / SAMPLES / "log.txt"
+        failed = self._failed
+        self._failed = code != 0
         with optional(f"{self.context.name}: what train.sample_every draws", self.context.console):
             if code and not failed:
                 raise UserError(f"the last process failed, {log} says why")

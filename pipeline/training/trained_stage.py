@@ -158,7 +158,8 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
     def run(self, context: StageContext) -> None:
         from motionloom.pipeline.training.trainer import fit
 
-        config, inputs = context.config, self.inputs.of(context.given)
+        config = context.config
+        inputs = self.inputs.of(context.given)
         seed = config.train.seed_of(context.seed)
         net, facts = self.build(config, inputs, seed)
         log = _printer(context)
@@ -191,11 +192,13 @@ class TrainedStage(StageKind[C], Generic[C, I, N]):
 
     def preview_of_finished(self, stage: CompletedStage, given: Inputs) -> object:
         """Return the network of a stage outside the recipe's run, without its weights."""
-        facts, inputs = load_facts(stage.folder), self.inputs.of(given)
+        facts = load_facts(stage.folder)
+        inputs = self.inputs.of(given)
         return self.loaded(_frozen(self.network(facts, inputs)), facts, inputs)
 
     def load(self, stage: CompletedStage, given: Inputs, device: torch.device) -> Any:
-        facts, inputs = load_facts(stage.folder), self.inputs.of(given)
+        facts = load_facts(stage.folder)
+        inputs = self.inputs.of(given)
         net = built(stage.folder, lambda: self.network(facts, inputs))
         load_weights(stage.folder, net)
         return self.loaded(_frozen(net.to(device)), facts, inputs)

@@ -130,10 +130,18 @@ class Training(L.Callback):
         signals: Signals,
         at_peak: float,
     ) -> None:
-        self.context, self.config, self.data, self.writer = context, config, data, writer
-        self.average, self.extra, self.signals, self.at_peak = average, extra, signals, at_peak
+        self.context = context
+        self.config = config
+        self.data = data
+        self.writer = writer
+        self.average = average
+        self.extra = extra
+        self.signals = signals
+        self.at_peak = at_peak
         self.folder = context.folder / "checkpoints"
-        console, name, hardware = context.console, context.name, context.hardware
+        console = context.console
+        name = context.name
+        hardware = context.hardware
         self.every = min(config.checkpoint_every, config.steps)
         # Validations fall on checkpoints, so that a resumed training makes the same ones.
         checkpoints = -(-config.validate_every // self.every)
@@ -144,7 +152,9 @@ class Training(L.Callback):
         self.ended_by_user = False
         self._open: ExitStack | None = None
         self._restored: dict[str, Any] | None = None
-        self._saved, self._writing, self._validation_is_due = -1, False, False
+        self._saved = -1
+        self._writing = False
+        self._validation_is_due = False
 
     # Lightning's hooks, in the order of their calls.
 
@@ -222,7 +232,8 @@ class Training(L.Callback):
 
     def sum_up(self, module: StageModule) -> None:
         """Print speed and waits, and that the loss has risen."""
-        console, name = self.context.console, self.context.name
+        console = self.context.console
+        name = self.context.name
         if summary := self.telemetry.summary():
             console.print(f"    {name}: {summary}")
         if rank() == 0 and (risen := rise_of_loss(self.metrics.rows)):
@@ -230,14 +241,19 @@ class Training(L.Callback):
 
     def _begin(self, trainer: L.Trainer, module: StageModule) -> None:
         """Open logs and watches at the step that the training goes on from."""
-        context, config, console = self.context, self.config, self.context.console
-        self.trainer, self.module, self._step = trainer, module, module.step
+        context = self.context
+        config = self.config
+        console = self.context.console
+        self.trainer = trainer
+        self.module = module
+        self._step = module.step
         self.signals.note()
         if self.average is not None and self.average.average is None:
             self.average.begin(module.net)
         if self._restored is not None:
             load_row(module, self._restored["row"])
-            self._saved, self._validation_is_due = module.step, self._restored["validate"]
+            self._saved = module.step
+            self._validation_is_due = self._restored["validate"]
             longer = self._restored["steps"] < config.steps
             begins = f"{context.name} continues from" if longer else f"resuming {context.name} at"
             if rank() == 0:
@@ -282,7 +298,9 @@ class Training(L.Callback):
 
     def _validate(self) -> None:
         """Log the mean losses on all held-out batches, weighted by rows; a signal ends it after a batch."""
-        module, trainer, loader = self.module, self.trainer, self.data.val_dataloader()
+        module = self.module
+        trainer = self.trainer
+        loader = self.data.val_dataloader()
         assert not isinstance(loader, list)
         # Weights that are not finite would make the validation a figure that nobody can read.
         self.failures.check()
@@ -290,7 +308,8 @@ class Training(L.Callback):
         modes = [(part, part.training) for part in module.modules()]
         module.eval()
         sums: dict[str, Tensor] = {}
-        rows, cut = 0, False
+        rows = 0
+        cut = False
         self.agreement.restart_pace()  # batches of a validation take another time than steps
         averaged = self.average.swapped(module.net) if self.average else nullcontext()
         with self.telemetry.waits.waiting_for("validation"), averaged, torch.no_grad():

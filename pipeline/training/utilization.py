@@ -76,11 +76,13 @@ class Utilization:
         at_peak: float,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        self._at_peak, self._clock = at_peak, clock
+        self._at_peak = at_peak
+        self._clock = clock
         kept = [row for row in rows if row["step"] <= step]
         self._spent = rows[-1].get("elapsed_seconds", 0.0) if rows else 0.0
         self._good = kept[-1].get("elapsed_seconds", 0.0) * kept[-1].get("goodput", 0.0) if kept else 0.0
-        self._since, self._aside = clock(), 0.0
+        self._since = clock()
+        self._aside = 0.0
 
     def row(self, steps: int, aside: float) -> tuple[float, dict[str, float]]:
         """Mean seconds of `steps` steps, and figures of their row; call it where the device is waited for.
@@ -91,7 +93,8 @@ class Utilization:
         good = max(0.0, now - self._since - (aside - self._aside))
         self._spent += now - self._since
         self._good += good
-        self._since, self._aside = now, aside
+        self._since = now
+        self._aside = aside
         seconds = max(good, 1e-9) / max(steps, 1)
         figures = {"elapsed_seconds": self._spent, "goodput": self._good / max(self._spent, 1e-9)}
         if self._at_peak and steps:

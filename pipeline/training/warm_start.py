@@ -45,7 +45,8 @@ def require_same_start(
     start = others.get(stage.inputs.get(START, ""))
     if start is None:
         return
-    ours, theirs = stage.config, start.config
+    ours = stage.config
+    theirs = start.config
     sizes = [name for name in type(ours.net).model_fields if name not in free]
     wrong = [f"net.{name}" for name in sizes if getattr(ours.net, name) != getattr(theirs.net, name, None)]
     if stage.kind.name != start.kind.name:
@@ -64,7 +65,8 @@ def require_same_start(
 
 def _alike(role: str, stage: Stage, start: Stage, others: Mapping[str, Stage]) -> bool:
     """Whether both have the same input in a role, or the stage's was trained from the start's."""
-    own, first = stage.inputs.get(role, ""), start.inputs.get(role, "")
+    own = stage.inputs.get(role, "")
+    first = start.inputs.get(role, "")
     if role == "text":
         return same_encoder(first, own, others)
     return (not first or own == first) if role == "stats" else starts_from(own, first, others)
@@ -80,7 +82,8 @@ def same_encoder(one: str, other: str, stages: Mapping[str, Stage]) -> bool:
     """Whether the text stages of these names are one stage, or two of one encoder; unknown ones pass."""
     if one == other or one not in stages or other not in stages:
         return True
-    first, second = stages[one], stages[other]
+    first = stages[one]
+    second = stages[other]
     return first.kind.name == second.kind.name and _encoder(first) == _encoder(second)
 
 

@@ -17,7 +17,7 @@ def register_toys(monkeypatch: pytest.MonkeyPatch, *kinds: StageKind) -> None:
     """Put kinds into the table until the test ends, also in place of one of the same name."""
     registry.stage_kinds()  # ours are there first, or they would meet the toys' names later
     for kind in kinds:
-        monkeypatch.setitem(registry.KINDS, kind.name, kind)
+        monkeypatch.setitem(registry.KINDS._things, kind.name, kind)
 
 
 class MadeStage(StageKind):

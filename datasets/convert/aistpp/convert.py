@@ -109,7 +109,8 @@ class Aistpp(BodyRelease[AistppConfig]):
             )
         music = self._music()
         for name in (file.removesuffix(".pkl") for file in files_in(folder, ".pkl")):
-            match, file = _SEQUENCE.fullmatch(name), f"{MOTIONS}/{name}.pkl"
+            match = _SEQUENCE.fullmatch(name)
+            file = f"{MOTIONS}/{name}.pkl"
             if match is None:
                 draft.mark_unreadable(file, UserError("not an AIST++ name like gBR_sBM_cAll_d04_mBR0_ch01"))
                 continue
@@ -129,7 +130,8 @@ class Aistpp(BodyRelease[AistppConfig]):
 
     def split_lists(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, Split] | None:
         """Return the splits, without the sequences of `ignore_list.txt`."""
-        listed, path = super().split_lists(draft), self.config.source / "ignore_list.txt"
+        listed = super().split_lists(draft)
+        path = self.config.source / "ignore_list.txt"
         if path.is_file():
             ids, repeated = read_ids(path)
             self.ignored = set(ids)
@@ -144,7 +146,8 @@ class Aistpp(BodyRelease[AistppConfig]):
 
     def _music(self) -> dict[str, str]:
         """Music files by name without suffix, with their folder."""
-        folder, sound = self.sound_folder, self.config.sound
+        folder = self.sound_folder
+        sound = self.config.sound
         if sound == "none" or self.config.has_band:
             return {}
         if not folder.is_dir():
@@ -177,7 +180,8 @@ class Aistpp(BodyRelease[AistppConfig]):
         return super().options() | ({"band": player(PLAYED).version()} if self.config.has_band else {})
 
     def convert(self, clip: ReleaseClip) -> Sample:
-        sample, config = super().convert(clip), self.config
+        sample = super().convert(clip)
+        config = self.config
         if not config.has_band:
             return sample
         facts = clip.entry.facts

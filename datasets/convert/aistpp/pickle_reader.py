@@ -57,7 +57,8 @@ def read_aist_motion(path: Path, name: str = "") -> tuple[NDArray[np.float32], N
         raw = read_plain(path, MAX_BYTES, name)
         _require_bounded(raw)
         data = _Unpickler(io.BytesIO(raw), encoding="latin1").load()
-        poses, trans = _frames(data, "smpl_poses", POSE_WIDTH), _frames(data, "smpl_trans", 3)
+        poses = _frames(data, "smpl_poses", POSE_WIDTH)
+        trans = _frames(data, "smpl_trans", 3)
         scaling = _numbers_of(data, "smpl_scaling").reshape(-1)
         if len(poses) != len(trans):
             raise _Refused(f"{len(poses)} frames of smpl_poses, but {len(trans)} of smpl_trans")
@@ -115,7 +116,8 @@ class _Record:
     __match_args__ = ("name", "arguments", "state")
 
     def __init__(self, name: str, arguments: tuple[object, ...] = ()) -> None:
-        self.name, self.arguments = name, arguments
+        self.name = name
+        self.arguments = arguments
         self.state: object = None
 
     def __call__(self, *arguments: object) -> _Record:

@@ -85,7 +85,8 @@ class BodyRelease(Release[Cfg]):
 
     def __init__(self, config: Cfg) -> None:
         super().__init__(config)
-        model, skeleton = config.body_model, cast("SkeletonName", self.layout.skeleton_name)
+        model = config.body_model
+        skeleton = cast("SkeletonName", self.layout.skeleton_name)
         self.body = BodyModel.load(model, skeleton) if model else BodyModel.neutral(skeleton)
         found = self.body.statement["kind"]
         if config.body_model is not None and found != self.model:
@@ -124,14 +125,16 @@ class BodyRelease(Release[Cfg]):
             gap = self.config.max_music_gap
             plan.notes.append(f"{self._cut} clips end with their sound, at most {gap:g} s early")
         if self._longer:
-            count, most = len(self._longer), max(self._longer)
+            count = len(self._longer)
+            most = max(self._longer)
             plan.notes.append(
                 f"the sound of {count} clips goes on after the motion, {most:.1f} s at most; cut"
             )
         return plan
 
     def with_sound(self, entries: Sequence[Entry], draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
-        silent, lengths = 0, self._sounds
+        silent = 0
+        lengths = self._sounds
         folder = "" if self.sound_folder == self.config.source else f"{self.sound_folder.name}/"
         for sound in dict.fromkeys(entry.sound for entry in entries if self.config.sound != "none"):
             if sound is not None:
@@ -194,7 +197,8 @@ class BodyRelease(Release[Cfg]):
         return figure.rotations, figure.trans
 
     def convert(self, clip: ReleaseClip) -> Sample:
-        layout, figure = self.layout, self.read(clip)
+        layout = self.layout
+        figure = self.read(clip)
         joints = self.posed(figure)
         if layout.family == "raw":
             require_human(joints, clip.fps)
@@ -216,7 +220,8 @@ class BodyRelease(Release[Cfg]):
             hands=layout.num_joints > BODY_JOINTS and float(fingers.max(initial=0.0)) > FINGERS_MOVE,
             face=layout.has("face") and figure.face is not None and bool(figure.face.any()),
         )
-        rows, wav = None, None
+        rows = None
+        wav = None
         if clip.entry.sound is not None:
             seconds = len(motion) / layout.fps
             start = clip.first / clip.fps
@@ -240,7 +245,8 @@ def cut_of(
     features, samples = piece
     rows: NDArray[np.float32] | None = None
     if features is not None:
-        first, count = round(start * config.fps), max(1, round(seconds * config.fps))
+        first = round(start * config.fps)
+        count = max(1, round(seconds * config.fps))
         # The last frame may lie at the very end of the music, past the last row by a rounding.
         rows = features[np.minimum(np.arange(first, first + count), len(features) - 1)]
     if samples is None:

@@ -177,7 +177,8 @@ class Amass(Release[AmassConfig]):
         return header.frames, header.fps
 
     def fitted(self, entry: Entry, frames: int, fps: float, draft: ConversionPlan[ReleaseClip]) -> Entry:
-        header, parts = self.headers[entry.file], PurePosixPath(entry.file).parts
+        header = self.headers[entry.file]
+        parts = PurePosixPath(entry.file).parts
         subset = parts[-3] if len(parts) > 2 else "."
         entry = replace(
             entry,
@@ -230,15 +231,18 @@ class Amass(Release[AmassConfig]):
 
     def figure(self, clip: ReleaseClip) -> Figure:
         """The frames of a clip."""
-        fingers, palms = self.layout.num_joints > BODY_JOINTS, self.layout.name == "smpl75"
-        frames, label = slice(clip.first, clip.last), clip.entry.file
+        fingers = self.layout.num_joints > BODY_JOINTS
+        palms = self.layout.name == "smpl75"
+        frames = slice(clip.first, clip.last)
+        label = clip.entry.file
         return read_motion(self.path_of(label), label, hands=fingers, palms=palms, frames=frames)
 
     def joints(self, clip: ReleaseClip) -> SourceJoints:
         return SourceJoints(self._posed(clip, self.figure(clip)), clip.fps)
 
     def convert(self, clip: ReleaseClip) -> Sample:
-        figure, raw = self.figure(clip), self.layout.name == "smpl75"
+        figure = self.figure(clip)
+        raw = self.layout.name == "smpl75"
         assert figure.rotations is not None
         # Resampling would take every 6th frame as it is (120 to 20 a second).
         ratio = clip.fps / self.layout.fps
@@ -265,7 +269,9 @@ class Amass(Release[AmassConfig]):
     def _parameters(self, clip: ReleaseClip, figure: Figure, step: int) -> NDArray[np.float32]:
         """Columns of `smpl75` [T', 75]."""
         assert figure.rotations is not None and figure.trans is not None
-        body, poses, trans = self._body(clip), figure.rotations[::step], figure.trans[::step]
+        body = self._body(clip)
+        poses = figure.rotations[::step]
+        trans = figure.trans[::step]
         if self.config.up == "z":
             poses, trans = upright(poses, trans, body)
         if clip.entry.mirror_of is not None:
@@ -276,7 +282,8 @@ class Amass(Release[AmassConfig]):
     def _posed(self, clip: ReleaseClip, figure: Figure) -> NDArray[np.float64]:
         """World joints [T, N, 3], Y up."""
         assert figure.rotations is not None and figure.trans is not None
-        body, count = self._body(clip), self.layout.num_joints
+        body = self._body(clip)
+        count = self.layout.num_joints
         rotations = figure.rotations[:, : BODY_JOINTS if self.layout.name == "smpl75" else count]
         joints = smpl_joints(rotations, figure.trans, body, figure.betas)
         if self.config.up == "z":

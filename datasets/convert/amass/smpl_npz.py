@@ -66,7 +66,8 @@ def read_motion_header(path: Path, label: str, fps: float | None = None) -> Moti
                 raise UserError(
                     f"{label}: poses is [T, {width}]; SMPL has 72 columns, SMPL-H 156, SMPL-X 165"
                 )
-            kind, hands = KINDS[width], width > 72
+            kind = KINDS[width]
+            hands = width > 72
         else:
             if "root_orient" not in file.names or "pose_body" not in file.names:
                 names = ", ".join(sorted(file.names)) or "nothing"

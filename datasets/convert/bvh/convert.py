@@ -88,7 +88,8 @@ class Bvh(Converter[BvhConfig, BvhClip]):
 
     def encode(self, clip: BvhClip, joints: NDArray[np.floating]) -> NDArray[np.float32]:
         """Features [T', D] of the joints [T, N, 3] of a clip."""
-        config, joint_map = self.config, self.maps[clip.found.skeleton]
+        config = self.config
+        joint_map = self.maps[clip.found.skeleton]
         try:
             if len(self.layout.skeleton) > joints.shape[1]:
                 joints = with_resting_hands(joints)
@@ -96,7 +97,8 @@ class Bvh(Converter[BvhConfig, BvhClip]):
                 joints = mirror(joints, self.layout.skeleton)
             return features_of(joints, clip.fps, self.layout, same_bones=config.retarget)
         except UserError as error:
-            unit, up = joint_map.unit or config.unit, joint_map.up or config.up
+            unit = joint_map.unit or config.unit
+            up = joint_map.up or config.up
             raise UserError(f"{clip.label()}: {error} (read with unit '{unit}', up '{up}')") from None
 
     def world(self, clip: BvhClip, motion: BvhMotion) -> tuple[NDArray[np.float64], JointMap]:

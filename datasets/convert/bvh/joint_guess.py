@@ -95,7 +95,9 @@ class _Figure:
         chosen = np.unique(np.linspace(0, motion.frames - 1, _POSES).round().astype(int))
         self.motion = replace(motion, values=motion.values[chosen])
         ended = self.motion.with_ends()
-        self.joints, self.parents, self.poses = ended.joints, ended.parents, ended.positions()
+        self.joints = ended.joints
+        self.parents = ended.parents
+        self.poses = ended.positions()
         self.named = by_word(motion.joints)
         self.extent = float(np.median(np.ptp(self.poses, axis=1).max(axis=-1)))
 
@@ -126,7 +128,8 @@ class _Figure:
 
     def way(self, above: int, below: int) -> list[int]:
         """Joints from `above` (left out) down to `below`, without those that lie on the one before them."""
-        out, up = [above], self.ancestors(below)
+        out = [above]
+        up = self.ancestors(below)
         for joint in reversed(up[: up.index(above)]):
             if self.length(joint, out[-1]) >= _SAME_PLACE * self.extent:
                 out.append(joint)

@@ -196,7 +196,8 @@ def _kept(guess: JointMap, key: str, joints: Sequence[str], folder: Path | None)
     so that files that come later change nothing for the others. Where there is none, the guess is written
     there, and returned if it is certain.
     """
-    where, certain = _place(key, guess.target), not guess.open_rows
+    where = _place(key, guess.target)
+    certain = not guess.open_rows
     if folder is not None:
         path = folder / where
         if not path.exists():

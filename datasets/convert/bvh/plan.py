@@ -81,7 +81,8 @@ def _decide(config: BvhConfig, folder: Path, found: list[FoundFile], stated: str
         )
         notes = [] if reason else draft.notes
         texts = captions_within(listing.texts_of(clip.path), frames / fps, clip_id, notes)
-        split, about = listing.split_of(clip.path), config.about(clip.path)
+        split = listing.split_of(clip.path)
+        about = config.about(clip.path)
         planned = BvhClip(folder, clip, clip_id, split, texts, frames, fps, about, config.licence)
         keep = config.uncaptioned == "keep"
         draft.add(planned, reason, captioned=bool(texts), wanted=config.has_captions, keep=keep)
@@ -102,7 +103,8 @@ def _decide_by_index(
     draft.notes += notes
     apart: list[str] = []
     for one in index_clips(config, found, listed):
-        file, row = files[one.file or ""], one.row
+        file = files[one.file or ""]
+        row = one.row
         if file.problem:
             continue
         fps = config.source_fps or row.true_fps(file.fps)
@@ -115,6 +117,7 @@ def _decide_by_index(
         apart += [f"{clip.label()}: {wrong}"] if wrong else []
         unlisted = listed is not None and one.id not in listed
         reason = wrong or broken or ("in no split file" if unlisted else config.length_problem(clip.seconds))
-        keep, wanted = config.uncaptioned == "keep", config.has_captions
+        keep = config.uncaptioned == "keep"
+        wanted = config.has_captions
         draft.add(clip, reason, captioned=bool(texts), wanted=wanted, keep=keep)
     settle_index(config, draft, apart)

@@ -33,7 +33,8 @@ MAX_SKELETON_BYTES = 1 << 20
 def list_files(source: Path) -> tuple[Path, list[str]]:
     """Return a folder and the motion files in it by name: those under `source`, or `source` itself."""
     if source.is_file():
-        root, names = source.parent, [source.name]
+        root = source.parent
+        names = [source.name]
     elif source.is_dir():
         root = source
         names = walk_files(source)
@@ -121,8 +122,10 @@ def _read_header(data: bytes, label: str) -> tuple[int, float, str, tuple[str, .
     text, where = load_text(data, label)
     section = find_motion(text, where)
     frames = count_frames(text, section, where)
-    key, names = "", tuple[str, ...]()
+    key = ""
+    names = tuple[str, ...]()
     with suppress(UserError):  # a broken hierarchy is reported when the clip is converted
         joints = parse_hierarchy(text[: section.start], where)
-        key, names = skeleton_key(joints.names, joints.parents), tuple(joints.names)
+        key = skeleton_key(joints.names, joints.parents)
+        names = tuple(joints.names)
     return frames, section.fps, key, names, frames != section.frames

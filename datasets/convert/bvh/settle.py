@@ -66,7 +66,8 @@ def added_frames(joints: NDArray[np.floating]) -> int:
     if steps[0] < max(_JUMP_METRES, _JUMP_TIMES * usual):
         return 0
     # A jump alone may be a lost marker: a writer's pose also has straight limbs and spread arms.
-    arms, legs = joints[0][_ARMS], joints[0][_LEGS]
+    arms = joints[0][_ARMS]
+    legs = joints[0][_LEGS]
     ways = arms[:, 2] - arms[:, 0]
     cosine = float(ways[0] @ ways[1] / max(float(np.prod(np.linalg.norm(ways, axis=-1))), 1e-9))
     if cosine > _SPREAD or not all(_is_straight(limb) for limb in (*arms, *legs)):

@@ -130,8 +130,10 @@ class IndexRow:
         """
         lead = LEADS.get(self.subset, 0)
         there = int((frames - 1) * INDEX_FPS / fps + 1e-3) + 1 - lead
-        start, end = self.start, self.end + (there if self.end < 0 else 0)
-        past, problem = (end - there) / INDEX_FPS, ""
+        start = self.start
+        end = self.end + (there if self.end < 0 else 0)
+        past = (end - there) / INDEX_FPS
+        problem = ""
         if past > TOLERANCE:
             problem = (
                 f"the index ends {past:.2f} s after the {frames / fps:.2f} s of the file: not the recording "
@@ -249,7 +251,8 @@ def find_originals(
 
     What is not there, is in no row, or waits for a `licence` that names it, is said in the plan.
     """
-    used, by_end = set[str](), defaultdict[str, list[str]](list)
+    used = set[str]()
+    by_end = defaultdict[str, list[str]](list)
     for path in paths:
         for end in _ends(path):
             by_end[end].append(path)
@@ -267,7 +270,8 @@ def find_originals(
         )
     found: list[tuple[IndexRow, str | None]] = []
     for subset, mine in rows.items():
-        licence, here = ORIGINALS[subset], [file for _, file, _ in mine if file]
+        licence = ORIGINALS[subset]
+        here = [file for _, file, _ in mine if file]
         used.update(here)
         alike = licence.startswith("CC-BY-SA")
         if not any(file or why for _, file, why in mine):
@@ -295,7 +299,8 @@ def settle_index(config: HumanmlConfig, draft: ConversionPlan[C], apart: Sequenc
     """
     if config.uncaptioned != "stop":
         return
-    bare, decide = draft.words.bare, "get the originals and HumanML3D's texts, or leave them out: --set "
+    bare = draft.words.bare
+    decide = "get the originals and HumanML3D's texts, or leave them out: --set "
     if apart or (bare and config.has_captions):
         reason = f"{len(apart)} clips do not agree with their recordings ({apart[0]})" if apart else ""
         reason = (

@@ -52,7 +52,8 @@ def parse_caption(line: str, *, seconds: float | None, source: str = "humanml3d"
     if not 4 <= len(fields) <= _MOST_FIELDS:
         raise UserError(f"{len(fields)} of the 4 fields caption#tokens#start#end")
     text, tokens = _caption_and_tokens(fields[:-2])
-    start, end = _seconds(fields[-2], "start"), _seconds(fields[-1], "end")
+    start = _seconds(fields[-2], "start")
+    end = _seconds(fields[-1], "end")
     cleaned = clean_caption(text)
     if not usable_caption(text):
         raise UserError(f"no usable caption ('{cleaned[:60]}')" if cleaned else "the caption is empty")

@@ -204,7 +204,8 @@ def list_clips(
 ) -> Listing:
     """Find the file of every caption row and of every name in the split files (`listed`)."""
     names = FileNames(paths)
-    matches, rows = _Matches(names), list(rows)
+    matches = _Matches(names)
+    rows = list(rows)
     # A catalogue lists a whole collection under other folders, so only the ends of its paths can fit, and
     # clips that are not here are no mistake.
     own = [row for row in rows if not row.catalogue]
@@ -216,7 +217,8 @@ def list_clips(
             f"captions name files in '{prefix}', which the source does not have: it is taken for that"
         )
     notes += [f"{row.where}: {matches.refused[row.id]}" for row in own if row.id in matches.refused]
-    found, missing = matches.found, matches.missing
+    found = matches.found
+    missing = matches.missing
     # Split files may use the ids that the captions give to files.
     for path, row in found.items():
         names.call(row.id, path)
@@ -353,9 +355,11 @@ def settle_captions(config: CaptionConfig, draft: ConversionPlan[C], found: List
     draft.notes += found.empty_splits({clip.label(): split for split, clip in draft.items})
     if not config.captions:
         return
-    bare_clips, captioned = draft.words.bare, draft.words.captioned
+    bare_clips = draft.words.bare
+    captioned = draft.words.captioned
     places = [place_of(place)[0] for place in config.captions]
-    file, total = ", ".join(place.name for place in places), captioned + len(bare_clips)
+    file = ", ".join(place.name for place in places)
+    total = captioned + len(bare_clips)
     become = {"stop": "", "drop": " and are left out", "keep": " and are kept"}[config.uncaptioned]
     sentences = [f"{captioned} of {total} clips have captions in {file}"]
     if bare_clips:
@@ -383,7 +387,8 @@ def _unused(found: Listing) -> str:
     """Count the clips that have captions and no file, and name the first with the nearest names."""
     if all(row.catalogue for row in found.unused):
         return f"{len(found.unused)} clips of its collection that are not in the source"
-    shown, stems = [], {_stem(path): path for path in sorted(found.free, reverse=True)}
+    shown = []
+    stems = {_stem(path): path for path in sorted(found.free, reverse=True)}
     for name in (row.file or row.id for row in found.unused[:_SHOWN]):
         near = [stems[stem] for stem in difflib.get_close_matches(_stem(name), list(stems), n=2)]
         shown.append(f"'{name}'" + (f", nearest: {' and '.join(near)}" if near else ""))

@@ -148,7 +148,8 @@ def _text_keys(keys: tuple[str, ...]) -> tuple[str, ...]:
 def joined(before: CaptionRow, row: CaptionRow) -> CaptionRow:
     """One row of two records of the same clip."""
     for what in ("file", "split"):
-        old, new = getattr(before, what), getattr(row, what)
+        old = getattr(before, what)
+        new = getattr(row, what)
         apart = what == "file" and before.origin != row.origin  # in each its own way of naming it
         if old is not None and new is not None and old != new and not apart:
             raise UserError(
@@ -211,9 +212,11 @@ def _by_name(path: Path, text: str) -> list[tuple[str, dict[str, object] | UserE
         return None
     records: list[tuple[str, dict[str, object] | UserError]] = []
     for name, value in named.items():
-        where, record = f"{path}: '{name}'", {"id": name, CATALOGUE: True}
+        where = f"{path}: '{name}'"
+        record = {"id": name, CATALOGUE: True}
         if isinstance(value, dict) and {"path", "annotations"} <= value.keys():
-            place, value = str(value["path"]), value["annotations"]
+            place = str(value["path"])
+            value = value["annotations"]
             if place.startswith("M/"):
                 continue
             record |= {"id": _AMASS.sub("", place), "file": place}

@@ -45,7 +45,8 @@ def check_array_header(path: Path, *, width: int | tuple[int, ...], name: str | 
 
 
 def _check_header(header: ArrayHeader, width: int | tuple[int, ...], label: str) -> None:
-    shape, dtype = header.shape, header.dtype
+    shape = header.shape
+    dtype = header.dtype
     columns = (width,) if isinstance(width, int) else width
     if len(shape) > 1 and shape[0] == 0:
         raise UserError(f"{label}: zero length, no frames")

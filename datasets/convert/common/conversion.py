@@ -48,7 +48,8 @@ class Conversion(Generic[C]):
     def options(self) -> dict[str, object]:
         """Everything the output depends on, as plain JSON; never a local path."""
         clips = [clip for _, clip in self.plan.items]
-        read, settings = self.converter.depends_on, self.settings
+        read = self.converter.depends_on
+        settings = self.settings
         content = [*read_in_threads(read, clips, workers=settings.workers, progress=settings.progress)]
         return self.converter.options() | {"source_sha256": sha256_of_json(content)}
 
@@ -77,12 +78,14 @@ class Conversion(Generic[C]):
         """Read and measure a few clips of every subset (`config.look`); None when none is to be looked at."""
         if not self.config.look or not self.plan.items:
             return None
-        clips, converter = [clip for _, clip in self.plan.items], self.converter
+        clips = [clip for _, clip in self.plan.items]
+        converter = self.converter
         return look_at(clips, converter.joints, converter.subset, self.config, label=_label)
 
     def share(self, part: Part) -> dict[str, int]:
         """Numbers of shards and clips that a part would make."""
-        plan, how = self.plan, WriteOptions()
+        plan = self.plan
+        how = WriteOptions()
         tasks = plan_shards(
             Path(), plan.items, self.facts(), how, _label, self.converter.depends_on, plan.removed
         )

@@ -43,7 +43,8 @@ class Condition:
         if known is None:
             return False
         if self.sign in _ORDER:
-            left, right = _number(known), _number(self.value)
+            left = _number(known)
+            right = _number(self.value)
             return left is not None and right is not None and _ORDER[self.sign](left, right)
         values = known if isinstance(known, tuple) else (known,)
         return any(_same(one, self.value) for one in values) == (self.sign == "=")
@@ -81,7 +82,8 @@ def _number(value: Fact) -> float | None:
 
 
 def _same(known: Fact, value: str) -> bool:
-    left, right = _number(known), _number(value)
+    left = _number(known)
+    right = _number(value)
     if left is not None and right is not None:
         return left == right
     return str(known).strip().lower() == value.lower()

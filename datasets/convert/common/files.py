@@ -78,7 +78,8 @@ def inside(root: Path, relative: str, name: str | None = None) -> Path:
     """
     name = relative if name is None else name
     check_id(relative, name)
-    path, linked = root, False
+    path = root
+    linked = False
     for part in relative.split("/"):
         path = path / part
         linked = linked or path.is_symlink()
@@ -111,13 +112,16 @@ def walk(root: Path, skip: Path | None = None) -> Walk:
     Folders behind links are followed, each folder once: by its own name where it lies under `root` itself,
     else by the first link.
     """
-    found, seen = Walk(), set[tuple[int, int]]()
+    found = Walk()
+    seen = set[tuple[int, int]]()
     left = None if skip is None or not skip.is_dir() else _identity(skip)
-    folders, links = [""], list[str]()
+    folders = [""]
+    links = list[str]()
     while folders or links:
         folder = folders.pop() if folders else links.pop(links.index(min(links)))
         try:
-            identity, entries = _identity(root / folder), list(os.scandir(root / folder))
+            identity = _identity(root / folder)
+            entries = list(os.scandir(root / folder))
         except OSError as error:
             found.unread[f"{folder}/"] = _reason(error)
             continue

@@ -116,7 +116,8 @@ def _suggest_unit(height: float, config: ConvertConfig) -> Suggestion:
         value = f"{ADULT_METRES / max(in_files, 1e-9):.4g}"
         why = f"the figures are {height:.3g} m tall, and no unit makes 1.2 to 2.2 m of it"
     else:
-        value, why = unit, f"then the figures are {in_files * METRES[unit]:.2f} m tall"
+        value = unit
+        why = f"then the figures are {in_files * METRES[unit]:.2f} m tall"
     if own is None:
         return Suggestion("source", f"scale the files to metres, from {value}", why)
     return Suggestion("unit", value, why)

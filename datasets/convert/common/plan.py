@@ -156,7 +156,8 @@ class ConversionPlan(Generic[C]):
         """Add a clip, or skip it: for `reason`, because another has its id, because `config.where` asks
         for others, or, where captions are `wanted` and those without any not to `keep`, for want of them.
         """
-        ids, words = self.known.ids, self.words
+        ids = self.known.ids
+        words = self.words
         if clip.id in ids:
             reason = f"second file for clip id '{clip.id}'; the first is {ids[clip.id]}"
         else:
@@ -293,7 +294,8 @@ class ConversionPlan(Generic[C]):
         bins: dict[str, Counter[str]] = {}
         for line in self.known.lines:
             counts = bins.setdefault(line.place.rpartition(":")[0], Counter())
-            clip, reason = clips.get(line.key), line.reason
+            clip = clips.get(line.key)
+            reason = line.reason
             if clip is not None and line.words and not reason and not line.words & words_of(clip):
                 reason = "none of its captions is of the clip's time"
             is_known = line.key in self.known.limited or fates.get(line.key, "missing") != "missing"
@@ -331,7 +333,9 @@ class ConversionPlan(Generic[C]):
 
     def table(self) -> Table:
         table = Table("what", "clips", "frames", "detail", title=escape(f"plan: {self.name}"))
-        counts, totals, uncaptioned = self.counts(), self.totals, self.words.uncaptioned
+        counts = self.counts()
+        totals = self.totals
+        uncaptioned = self.words.uncaptioned
         table.add_row("found in the source", str(totals.found), "", "")
         for split in SPLITS:
             table.add_row(split, str(counts[split]), str(totals.frames.get(split, 0)), "")

@@ -169,7 +169,8 @@ class Release(Converter[Cfg, ReleaseClip]):
         """The whole motion file of a clip."""
 
     def plan(self, settings: PlanSettings) -> ConversionPlan[ReleaseClip]:
-        config, self.settings = self.config, settings
+        config = self.config
+        self.settings = settings
         if not config.source.is_dir():
             raise UserError(f"{config.source}: no such folder")
         draft = ConversionPlan[ReleaseClip](config, stated=self.stated())
@@ -199,7 +200,8 @@ class Release(Converter[Cfg, ReleaseClip]):
             elif not isinstance(state, Exception):
                 clip, problem = self._clip(entry, state, draft)
                 reason = clip.entry.problem or problem
-                captioned, keep = bool(clip.entry.texts), config.uncaptioned == "keep"
+                captioned = bool(clip.entry.texts)
+                keep = config.uncaptioned == "keep"
                 draft.add(clip, reason, captioned=captioned, wanted=config.has_captions, keep=keep)
         draft.limit(lambda clip: clip.id)
         return draft.finish(
@@ -260,7 +262,8 @@ class Release(Converter[Cfg, ReleaseClip]):
         self, entry: Entry, state: tuple[int, float], draft: ConversionPlan[ReleaseClip]
     ) -> tuple[ReleaseClip, str]:
         """The clip of an entry whose file is there, and why it is left out."""
-        config, (frames, fps) = self.config, state
+        config = self.config
+        (frames, fps) = state
         entry = self.fitted(entry, frames, fps, draft)
         last, mute = self.cut_to_sound(entry, min(frames if entry.last is None else entry.last, frames), fps)
         seconds = max(last - entry.first, 0) / fps

@@ -107,7 +107,8 @@ def remove(root: Path, *, ids: Sequence[str] = (), subjects: Sequence[str] = ())
     if not root.is_dir():
         raise UserError(f"{root}: no such folder")
     with folder_lock(root):
-        aside, finished = root / OLD_FOLDER, root / MANIFEST_FILE
+        aside = root / OLD_FOLDER
+        finished = root / MANIFEST_FILE
         pending = aside / MANIFEST_FILE
         if finished.exists() or not pending.exists():
             manifest = load_manifest(root)
@@ -140,7 +141,9 @@ def remove(root: Path, *, ids: Sequence[str] = (), subjects: Sequence[str] = ())
             sync_folder(root)
         write_json(root / REMOVED_FILE, record.dump())
         kept = _unnamed(manifest, gone, record)
-        licences, results, written = Counter(manifest.licences), list[Result](), 0
+        licences = Counter(manifest.licences)
+        results = list[Result]()
+        written = 0
         for shard in manifest.shards:
             index = indices[shard.name]
             dropped = [drop for drop in index.dropped if not record.has("", drop.source)]
@@ -149,7 +152,8 @@ def remove(root: Path, *, ids: Sequence[str] = (), subjects: Sequence[str] = ())
             if concerned:
                 licences.subtract(_put_aside(root, shard, concerned))
                 info = _rewritten(root, kept, shard, index, concerned)
-                index, written = ShardIndex.load_json(index_path(root / shard.name)), written + 1
+                index = ShardIndex.load_json(index_path(root / shard.name))
+                written = written + 1
             if concerned or len(dropped) < len(index.dropped):
                 write_json(
                     index_path(root / shard.name), index.model_copy(update={"dropped": dropped}).dump()
@@ -199,7 +203,8 @@ def _rewritten(
     root: Path, manifest: Manifest, shard: ShardInfo, index: ShardIndex, gone: Sequence[ClipEntry]
 ) -> ShardInfo | None:
     """Write a shard again without some clips; None when no clip of it is left."""
-    old, left = root / OLD_FOLDER / shard.name, {clip.made_from for clip in gone}
+    old = root / OLD_FOLDER / shard.name
+    left = {clip.made_from for clip in gone}
     items = {
         clip.made_from: ShardItem(clip.source, clip.made_from, None)
         for clip in index.clips

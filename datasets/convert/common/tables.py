@@ -42,7 +42,8 @@ def read_json_lines(path: Path, name: str, bad: BadRows) -> Iterator[tuple[str, 
     """(place, record) of every line that is not blank; those that are no record go into `bad`."""
     for number, line in enumerate(read_text_file(path, name).split("\n"), start=1):
         if line.strip():
-            place, record = f"{name}:{number}", None
+            place = f"{name}:{number}"
+            record = None
             with reading_row(place, bad):
                 record = require_record(parse_json(line, place), place)
             if record is not None:
@@ -89,7 +90,8 @@ def table_rows(
     """
     at = 0
     while at < len(lines):
-        place, begin = f"{name}:{first + at}", at
+        place = f"{name}:{first + at}"
+        begin = at
         # The reader wants the newlines back: those inside quotes belong to the text.
         reader = csv.reader(
             (f"{line}\n" for line in lines[at : at + _LONGEST_ROW]), delimiter=delimiter, strict=True

@@ -40,7 +40,8 @@ from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.sample import Sample
 
 FPS = 20.0
-VECS, JOINTS = "new_joint_vecs", "new_joints"
+VECS = "new_joint_vecs"
+JOINTS = "new_joints"
 SAME_METRES, _COMPARED = 0.01, 20
 """Distance of joints of the two copies of a motion, at most, in so many frames: 4e-8 was measured."""
 WIDTHS: dict[str, int | tuple[int, ...]] = {VECS: 263, JOINTS: (22, 3)}
@@ -86,7 +87,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
     lists = ("",)
 
     def entries(self, draft: ConversionPlan[ReleaseClip]) -> Iterable[Entry]:
-        files, folder = self._motion(draft), self._texts()
+        files = self._motion(draft)
+        folder = self._texts()
         texts_here = files_in(self.config.source / folder, ".txt") if folder else []
         listed = {name.removesuffix(".txt") for name in texts_here}
         if folder and (strays := len(listed - files.keys())):
@@ -107,7 +109,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
 
     def _motion(self, draft: ConversionPlan[ReleaseClip]) -> dict[str, str]:
         """Clip id -> its preferred motion file."""
-        source, wanted = self.config.source, self.config.folders
+        source = self.config.source
+        wanted = self.config.folders
         if not any((source / folder).is_dir() for folder in wanted):
             raise UserError(
                 f"{source}: no {'/ or '.join(wanted)}/ in it; give the folder HumanML3D/ of the release"
@@ -137,7 +140,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
         return inside(self.config.source / folder, name, file)
 
     def length(self, path: Path, label: str) -> tuple[int, float]:
-        frames, other = _frames(path, label), _other(label)
+        frames = _frames(path, label)
+        other = _other(label)
         if is_file(self.path_of(other)) and (there := _frames(self.path_of(other), other)) != frames:
             raise UserError(
                 f"{label}: {frames} frames, but {other}, which holds the same motion, has {there}"
@@ -152,7 +156,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
         return Figure(joints=_joints(self._load(clip.entry.file)))
 
     def convert(self, clip: ReleaseClip) -> Sample:
-        config, layout = self.config, self.layout
+        config = self.config
+        layout = self.layout
         stored = self._load(clip.entry.file)
         joints = _joints(stored)
         require_human(joints, FPS)
@@ -171,7 +176,8 @@ class HumanMl3d(Release[HumanMl3dConfig]):
 
     def _load(self, file: str) -> NDArray[np.floating]:
         """A motion file; `UserError` where the release's other copy of it shows another motion."""
-        stored, other = _load(self.path_of(file), file), _other(file)
+        stored = _load(self.path_of(file), file)
+        other = _other(file)
         if is_file(self.path_of(other)):
             beside = _load(self.path_of(other), other)
             apart = np.abs(_joints(stored[:_COMPARED]) - _joints(beside[:_COMPARED])).max()

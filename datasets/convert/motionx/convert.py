@@ -173,10 +173,12 @@ class MotionX(Release[MotionXConfig]):
 
     def _entry(self, files: MotionXFiles, clip_id: str) -> _Found:
         """A clip with its texts. Segments of humanml's captions are checked when its length is known."""
-        source, said = self.config.source, ConversionPlan[ReleaseClip](self.config)
+        source = self.config.source
+        said = ConversionPlan[ReleaseClip](self.config)
 
         def read(kind: Kind, reader: Callable[..., tuple[list[Caption], list[str]]]) -> tuple[Caption, ...]:
-            file, texts = files.by_kind[kind].get(clip_id), list[Caption]()
+            file = files.by_kind[kind].get(clip_id)
+            texts = list[Caption]()
             if file is not None:
                 with said.reading(file):
                     texts, wrong = reader(source / file, name=file)
@@ -185,7 +187,8 @@ class MotionX(Release[MotionXConfig]):
 
         in_grammar = subset_of(clip_id) == HUMANML
         captions = partial(read_humanml_captions, seconds=None) if in_grammar else read_sentences
-        face, stored = None, files.by_kind["face motion"].get(clip_id)
+        face = None
+        stored = files.by_kind["face motion"].get(clip_id)
         if stored is not None:
             with said.reading(stored):
                 check_array_header(source / stored, width=FACE_WIDTH, name=stored)
@@ -221,7 +224,9 @@ class MotionX(Release[MotionXConfig]):
         return Figure(joints=parameters_to_joints(self.parameters(clip), self.body))
 
     def convert(self, clip: ReleaseClip) -> Sample:
-        config, layout, entry = self.config, self.layout, _with_face(clip)
+        config = self.config
+        layout = self.layout
+        entry = _with_face(clip)
         values = self.parameters(clip)
         has_face = bool(values[:, EXPRESSION].any())
         joints = parameters_to_joints(values, self.body)
@@ -247,8 +252,10 @@ class MotionX(Release[MotionXConfig]):
 
     def parameters(self, clip: ReleaseClip) -> NDArray[np.float64]:
         """The clip's columns [T, 322], repaired: metres, face motion written in."""
-        entry, subset = _with_face(clip), subset_of(clip.id)
-        path, limits = self.path_of(entry.file), value_limits()
+        entry = _with_face(clip)
+        subset = subset_of(clip.id)
+        path = self.path_of(entry.file)
+        limits = value_limits()
         values = load_array(path, width=RAW.dim, name=entry.file, limit=limits).astype(np.float64)
         if len(values) != clip.last:
             raise UserError(

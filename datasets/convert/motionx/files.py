@@ -164,7 +164,8 @@ def _place(parts: tuple[str, ...]) -> _Place | None:
                 rest = _subset_first(parts[depth:])
                 return _Place(kind, "/".join(parts[: depth + 1]), rest, smplx=kind == "motion")
             continue
-        end, smplx = depth + 1, bool(_SMPLX.fullmatch(part))
+        end = depth + 1
+        smplx = bool(_SMPLX.fullmatch(part))
         while end < len(parts) and (_PATTERNS[kind].fullmatch(parts[end]) or _SMPLX.fullmatch(parts[end])):
             smplx = smplx or bool(_SMPLX.fullmatch(parts[end]))
             end += 1

@@ -28,7 +28,10 @@ from motionloom.datasets.convert.common.tables import BadRows, captions_of, read
 from motionloom.datasets.motion.layout import FACE_DIMS
 from motionloom.datasets.motion.npz import NpzFile
 
-MOTION, SPEECH, WORDS, LISTS = "smplxflame_30", "wave16k", "textgrid", "train_test_split.csv"
+MOTION = "smplxflame_30"
+SPEECH = "wave16k"
+WORDS = "textgrid"
+LISTS = "train_test_split.csv"
 _SPLITS: dict[str, Split] = {"train": "train", "val": "val", "test": "test"}
 _ITEM = re.compile(r"^[ \t]*item[ \t]*\[", re.MULTILINE)
 """Where a tier begins. `\\s` would run over empty lines, and over all of them again from each."""
@@ -103,7 +106,8 @@ class Beat2(BodyRelease[Beat2Config]):
         if has_list and kind is None:
             problem = f"not in {LISTS}"
         split: Split | None = "train" if kind == "additional" else _SPLITS.get(kind or "")
-        sound, texts = f"{below}{SPEECH}/{name}.wav", tuple(self._words(below, name, draft))
+        sound = f"{below}{SPEECH}/{name}.wav"
+        texts = tuple(self._words(below, name, draft))
         return Entry(
             f"{below}{name}", f"{below}{MOTION}/{name}.npz", texts, split, name, facts,
             sound if is_file(self.config.source / sound) else None, problem=problem,
@@ -128,11 +132,14 @@ class Beat2(BodyRelease[Beat2Config]):
             if phrase and begin - end > self.config.pause:
                 yield from captions_of(" ".join(phrase), "speech", start, end)
                 phrase = []
-            start, end, phrase = (start if phrase else begin), stop, [*phrase, word]
+            start = start if phrase else begin
+            end = stop
+            phrase = [*phrase, word]
         yield from captions_of(" ".join(phrase), "speech", start, end)
 
     def figure(self, clip: ReleaseClip) -> Figure:
-        figure, label = super().figure(clip), clip.entry.file
+        figure = super().figure(clip)
+        label = clip.entry.file
         with NpzFile(self.path_of(label), label) as file:
             face = (
                 file.numbers("expressions")

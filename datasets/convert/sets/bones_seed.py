@@ -83,7 +83,8 @@ def _rows(folder: Path) -> tuple[dict[str, Row], BadRows]:
     found: dict[str, Row] = {}
     needed = ("filename", "move_duration_frames", "is_mirror", "actor_uid")
     for place, row in read_csv(tables[-1], needed, bad):
-        name, seconds = row["filename"], -1.0
+        name = row["filename"]
+        seconds = -1.0
         with reading_row(name, bad):
             seconds = whole(row["move_duration_frames"], f"{place}: '{name}': move_duration_frames") / FPS
         if seconds < 0:

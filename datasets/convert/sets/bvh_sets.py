@@ -58,7 +58,8 @@ class BvhSetConfig(BvhConfig):
             return super().listing(paths)
         if not self.rows and self.bad_rows:
             raise UserError(next(iter(self.bad_rows.values())))
-        known, here = self.rows, {stem(path): path for path in paths}
+        known = self.rows
+        here = {stem(path): path for path in paths}
         rows = [
             CaptionRow(name, row.texts, here[name], hash_split(row.group), name)
             for name, row in known.items()

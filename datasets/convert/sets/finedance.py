@@ -28,7 +28,9 @@ from motionloom.datasets.convert.sets.vectors import rotvecs_of_rows
 
 JOINTS = 52
 WIDTH = 3 + 6 * JOINTS
-MOTION, MUSIC, LABELS = "motion", "music_wav", "label_json"
+MOTION = "motion"
+MUSIC = "music_wav"
+LABELS = "label_json"
 
 _UNPAIRED = frozenset({116, 117, 118, 119, 120, 121, 122, 123, 130, 202})
 """Numbers that the authors' own code leaves out."""

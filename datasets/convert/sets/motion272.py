@@ -38,7 +38,8 @@ from motionloom.datasets.convert.common.tables import captions_of
 from motionloom.datasets.convert.sets.vectors import walked
 from motionloom.datasets.motion.layout import BODY_JOINTS
 
-FPS, WIDTH = 30.0, 272
+FPS = 30.0
+WIDTH = 272
 _STEP, _TURN, _POSITIONS = slice(0, 2), slice(2, 8), slice(8, 8 + 3 * BODY_JOINTS)
 _MOTION = ("motion_data/vector_272", "motion_data")
 _STREAMED = re.compile(r"(?P<first>[^*]+)\*(?P<second>.+)#(?P<frames>\d+)\s*")

@@ -31,9 +31,11 @@ from motionloom.datasets.convert.common.release import Entry, Figure, Release, R
 from motionloom.datasets.convert.common.tables import captions_of, read_json, require_record
 from motionloom.datasets.convert.sets.vectors import walked
 
-FPS, JOINTS = 30.0, 24
+FPS = 30.0
+JOINTS = 24
 WIDTH = 4 + 12 * JOINTS + 4
-FEATURES, CAPTIONS = "renamed_feats", "all_caption_clean.json"
+FEATURES = "renamed_feats"
+CAPTIONS = "all_caption_clean.json"
 _POSITIONS = slice(4 + 6 * JOINTS, 4 + 9 * JOINTS)
 
 ORDER = (15, 16, 20, 1, 17, 21, 2, 18, 22, 3, 19, 23, 4, 7, 11, 6, 8, 12, 9, 13, 10, 14)

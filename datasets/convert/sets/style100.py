@@ -18,7 +18,8 @@ from motionloom.datasets.convert.bvh.convert import Bvh
 from motionloom.datasets.convert.common.tables import BadRows, captions_of, read_csv, reading_row
 from motionloom.datasets.convert.sets.bvh_sets import BvhSetConfig, Row, stem
 
-CUTS, STYLES = "Frame_Cuts.csv", "Dataset_List.csv"
+CUTS = "Frame_Cuts.csv"
+STYLES = "Dataset_List.csv"
 MOVEMENTS = {
     "FW": "walks forward",
     "BW": "walks backward",
@@ -108,7 +109,8 @@ def _rows(source: Path, cuts: Iterable[str], bad: BadRows) -> dict[str, Row]:
     found = {}
     for name in cuts:
         style, _, movement = name.rpartition("_")
-        words, does = _words(style), f"a person {MOVEMENTS[movement]}"
+        words = _words(style)
+        does = f"a person {MOVEMENTS[movement]}"
         texts = captions_of(f"{does} in the style {words}", "style")
         texts += captions_of(f"{does}: {described[words]}", "description") if words in described else []
         found[name] = Row(tuple(texts), style, {"style": style, "movement": movement})

@@ -21,7 +21,8 @@ def walked(
     root = np.concatenate([[0j], np.cumsum((steps[:, 1] + 1j * steps[:, 0]) * back[:-1])])
     plane = ground(positions) * back[:, None] + root[:, None]
     out = np.array(positions, dtype=np.float64)
-    out[..., 2], out[..., 0] = plane.real, plane.imag
+    out[..., 2] = plane.real
+    out[..., 0] = plane.imag
     return out
 
 
@@ -33,7 +34,8 @@ def rotvecs_of_rows(rows: NDArray[np.float64], label: str) -> NDArray[np.float64
     """First two rows of matrices [T, N, 6] -> axis-angles [T, N, 3]; `UserError` for rows of length 0."""
     from scipy.spatial.transform import Rotation
 
-    first, second = rows[..., :3], rows[..., 3:]
+    first = rows[..., :3]
+    second = rows[..., 3:]
     x = _unit(first, label)
     y = _unit(second - (x * second).sum(axis=-1, keepdims=True) * x, label)
     matrices = np.stack([x, y, np.cross(x, y)], axis=-2)

@@ -48,7 +48,8 @@ def solve_poses(
     """
     frames, count = targets.shape[:2]
     shares = np.broadcast_to(np.ones(count) if weights is None else weights, (frames, count))
-    turned, placed = np.empty((frames, count, 3, 3)), np.empty((frames, 3))
+    turned = np.empty((frames, count, 3, 3))
+    placed = np.empty((frames, 3))
     for start in range(0, frames, _CHUNK):
         rows = slice(start, start + _CHUNK)
         solver = _Solver(targets[rows], offsets, parents, shares[rows])
@@ -80,7 +81,8 @@ class _Solver:
 
     def solve(self, rotations: NDArray[np.floating], root: NDArray[np.floating]) -> tuple[Floats, Floats]:
         """Levenberg-Marquardt, each frame with its own damping."""
-        local, place = np.array(rotations, dtype=np.float64), np.array(root, dtype=np.float64)
+        local = np.array(rotations, dtype=np.float64)
+        place = np.array(root, dtype=np.float64)
         joints, world = forward_kinematics(local, place, self.offsets, self.parents)
         cost = self._cost(joints, slice(None))
         damping = np.full(len(local), _FIRST_DAMPING)
@@ -133,7 +135,8 @@ class _Solver:
         """One step of the given frames: the root's displacement [t, 3] and turns [t, J, 3, 3] of `inner`."""
         from scipy.spatial.transform import Rotation
 
-        points, frames = joints.swapaxes(0, 1), len(joints)
+        points = joints.swapaxes(0, 1)
+        frames = len(joints)
         weight = self.weights[:, rows]
         hessian = weight[..., None, None] * np.eye(3)
         gradient = weight[..., None] * (points - self.targets[:, rows])
@@ -150,7 +153,8 @@ class _Solver:
             size = _sum_by(np.square(bones).sum(axis=-1) * weight[children], owner) + 1e-12
             firm += (damping * size)[..., None, None] * np.eye(3)
             both = np.linalg.solve(firm, np.concatenate([mixed, force[..., None]], axis=-1))
-            ratio, rest = both[..., :3], both[..., 3]
+            ratio = both[..., :3]
+            rest = both[..., 3]
             across = mixed.swapaxes(-1, -2)
             hessian[joints_here] += _sum_by(hessian[children], owner) - across @ ratio
             gradient[joints_here] += _sum_by(gradient[children], owner) - (across @ rest[..., None])[..., 0]
@@ -186,7 +190,13 @@ def _sum_by(values: Floats, owner: Sequence[int]) -> Floats:
 def _skew(vectors: Floats) -> Floats:
     """Matrices [..., 3, 3] with S v = vector x v."""
     out = np.zeros((*vectors.shape, 3))
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = z, -y, x
+    x = vectors[..., 0]
+    y = vectors[..., 1]
+    z = vectors[..., 2]
+    out[..., 0, 1] = -z
+    out[..., 0, 2] = y
+    out[..., 1, 2] = -x
+    out[..., 1, 0] = z
+    out[..., 2, 0] = -y
+    out[..., 2, 1] = x
     return out

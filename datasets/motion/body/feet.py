@@ -95,7 +95,8 @@ def plant_feet(
     that are `fixed` [T] have no contacts; a foot that stands beside one is pinned where it stands there.
     Without them, joints under the floor, which is at height 0, come up to it.
     """
-    skeleton, balls = motion.skeleton, _balls(motion.skeleton)
+    skeleton = motion.skeleton
+    balls = _balls(motion.skeleton)
     before = _slide(motion.joints[:, balls], contacts, fps)
     sunk = fixed is None and float(motion.joints[..., 1].min()) < -SUNK
     if not contacts.any() and not sunk:

@@ -41,7 +41,8 @@ def landed(
     root = plane[:, :1]
     plane = root + (plane - root) * np.exp(1j * heading_change)[:, None] + place_change[:, None]
     out = np.array(joints, dtype=np.float64)
-    out[..., 2], out[..., 0] = plane.real, plane.imag
+    out[..., 2] = plane.real
+    out[..., 0] = plane.imag
     return out, heading + heading_change
 
 
@@ -60,7 +61,8 @@ def reached(
             fixed frame is nearer.
         hold: Puts back what is kept of a figure, bit for bit.
     """
-    skeleton, out = figure.skeleton, figure
+    skeleton = figure.skeleton
+    out = figure
     missing = {key: np.asarray(place) - figure.joints[key] for key, place in pinned.items()}
     pinned_joints = sorted({joint for _, joint in pinned})
     firm = np.where(fixed, _PINNED, _FREE)
@@ -70,7 +72,8 @@ def reached(
     # The solver trades pins against the rest, so it falls short of them by a little. Each round aims past a
     # pin by what was missed.
     for _ in range(_ROUNDS):
-        targets, weights = figure.joints.copy(), firm.copy()
+        targets = figure.joints.copy()
+        weights = firm.copy()
         still: NDArray[np.bool_] = np.all(fixed, axis=1)
         changes = {joint: _track(joint, missing, still, blend) for joint in pinned_joints}
         for joint in pinned_joints:
@@ -86,7 +89,8 @@ def reached(
         weights[:, pinned_joints] = _PINNED
         weights[fixed] = _PINNED
         rows = np.flatnonzero(np.any([change.any(axis=1) for change in changes.values()], axis=0))
-        turned, root = figure.rotations.copy(), figure.root.copy()
+        turned = figure.rotations.copy()
+        root = figure.root.copy()
         turned[rows], root[rows] = solve_poses(
             targets[rows], skeleton.offsets, skeleton.parents, turned[rows], root[rows], weights[rows]
         )

@@ -64,14 +64,16 @@ def with_resting_hands(
     out[:, : len(_BODY)] = body
     left, right = (relaxed_fingers(),) * 2 if fingers is None else fingers
     for side, turns, first in (("left", left, 22), ("right", right * _MIRROR, 22 + _FINGERS)):
-        wrist, elbow = _WHOLE.index(f"{side}_wrist"), _WHOLE.index(f"{side}_elbow")
+        wrist = _WHOLE.index(f"{side}_wrist")
+        elbow = _WHOLE.index(f"{side}_elbow")
         own = list(range(first, first + _FINGERS))
         place = {wrist: 0} | {joint: number for number, joint in enumerate(own, start=1)}
         parents = [-1, *(place[_WHOLE.parents[joint]] for joint in own)]
         bone = float(np.median(np.linalg.norm(body[:, wrist] - body[:, elbow], axis=-1)))
         size = bone / float(np.linalg.norm(_WHOLE.offsets[wrist]))
         local = np.empty((frames, 1 + _FINGERS, 3, 3))
-        local[:, 0], local[:, 1:] = world[:, wrist], turns
+        local[:, 0] = world[:, wrist]
+        local[:, 1:] = turns
         offsets = np.concatenate([np.zeros((1, 3)), _WHOLE.offsets[own] * size])
         out[:, own] = forward_kinematics(local, body[:, wrist], offsets, parents)[0][:, 1:]
     return out

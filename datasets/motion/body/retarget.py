@@ -93,7 +93,8 @@ class SourceFigure:
 
 def carried(source: SourceFigure, skeleton: Skeleton) -> RigidMotion:
     """The motion on our joints, with the source's bones, its rotations and the twists of these."""
-    parents, count = np.asarray(skeleton.parents), len(skeleton)
+    parents = np.asarray(skeleton.parents)
+    count = len(skeleton)
     points = np.asarray(source.joints, dtype=np.float64)
     own = measured_skeleton(points, skeleton)
     seen = slice(None, None, max(1, len(points) // _MEASURED))
@@ -208,8 +209,11 @@ def on_one_skeleton(motions: Sequence[RigidMotion]) -> list[RigidMotion]:
 
 def with_hands(figure: RigidMotion) -> RigidMotion:
     """A figure without fingers, with hands at rest."""
-    whole, body = Skeleton.named("smplx52"), figure.skeleton
-    frames, sizes, local = len(figure.root), [], relaxed_hands()
+    whole = Skeleton.named("smplx52")
+    body = figure.skeleton
+    frames = len(figure.root)
+    sizes = []
+    local = relaxed_hands()
     for side in ("left", "right"):
         wrist = whole.index(f"{side}_wrist")
         forearm = np.linalg.norm(np.stack([body.offsets[wrist], whole.offsets[wrist]]), axis=-1)
@@ -226,7 +230,8 @@ def _axes_of(source: SourceFigure, own: Skeleton, seen: slice) -> tuple[Floats, 
     ahead = upright_turn(source.rest, own)
     if _stands(source.rest @ ahead.T, own):
         return np.repeat(ahead.T[None], len(own), axis=0), True
-    points, turns = source.joints[seen], source.turns[seen]
+    points = source.joints[seen]
+    turns = source.turns[seen]
     _, shown = forward_kinematics(joints_to_rotations(points, own), points[:, 0], own.offsets, own.parents)
     # Positions say nothing of a head: on the whole it looks where the chest does.
     shown[:, own.index("head")] = shown[:, own.index("spine3")]

@@ -175,7 +175,8 @@ def _leaning(points: Floats, own: Skeleton, skeleton: Skeleton) -> Skeleton:
     if lean.any():
         offsets[head] = lean / np.linalg.norm(lean) * np.linalg.norm(offsets[head])
     for side in ("left", "right"):
-        ankle, ball = own.index(f"{side}_ankle"), own.index(f"{side}_foot")
+        ankle = own.index(f"{side}_ankle")
+        ball = own.index(f"{side}_foot")
         offsets[ball] = flat_foot(points[:, ankle], points[:, ball], offsets[ball])
     return with_offsets(own, offsets)
 
@@ -183,7 +184,8 @@ def _leaning(points: Floats, own: Skeleton, skeleton: Skeleton) -> Skeleton:
 def flat_foot(ankle: Floats, ball: Floats, bone: Floats) -> Floats:
     """The bone [3] from ankle to ball, as steep as between `ankle` and `ball` [T, 3] of a standing foot."""
     low = ankle[:, 1] <= np.quantile(ankle[:, 1], _STANDS)
-    way, size = ball[low] - ankle[low], float(np.linalg.norm(bone))
+    way = ball[low] - ankle[low]
+    size = float(np.linalg.norm(bone))
     length = np.linalg.norm(way, axis=-1)
     steep = float(np.median(way[:, 1] / np.where(length > _NO_BONE, length, np.inf)))
     across = np.array([bone[0], 0.0, bone[2]])
@@ -200,7 +202,8 @@ def share_twist(rotations: Floats, skeleton: Skeleton) -> Floats:
 
     out = rotations.copy()
     for side in ("left", "right"):
-        elbow, wrist = skeleton.index(f"{side}_elbow"), skeleton.index(f"{side}_wrist")
+        elbow = skeleton.index(f"{side}_elbow")
+        wrist = skeleton.index(f"{side}_wrist")
         bone = skeleton.offsets[wrist]
         if wrist not in skeleton.parents or not bone.any():
             continue
@@ -236,7 +239,8 @@ def moved(figure: RigidMotion, turn: float, place: complex, height: float) -> Ri
 
 def mirrored(figure: RigidMotion) -> RigidMotion:
     """The figure's mirror image: left and right swapped, x negated."""
-    skeleton, flip = figure.skeleton, np.array([-1.0, 1.0, 1.0])
+    skeleton = figure.skeleton
+    flip = np.array([-1.0, 1.0, 1.0])
     swapped = with_offsets(skeleton, skeleton.offsets[skeleton.mirror] * flip)
     rotations = figure.rotations[:, skeleton.mirror] * np.outer(flip, flip)
     return RigidMotion.posed(swapped, rotations, figure.root * flip, mirror(figure.joints, skeleton))

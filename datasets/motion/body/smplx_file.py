@@ -54,8 +54,10 @@ def smplx_parameters(
     vectors[:, :count] = turns.reshape(frames, count, 3)
     vectors[:, 0] = (upright * Rotation.from_matrix(worn.rotations[:, 0])).as_rotvec()
     flat = vectors.reshape(frames, -1).astype(np.float32)
-    trunk, hands = flat[:, 3 : 3 * BODY_JOINTS], flat[:, 3 * BODY_JOINTS :]
-    jaw, eyes = np.zeros((frames, 3), np.float32), np.zeros((frames, 6), np.float32)
+    trunk = flat[:, 3 : 3 * BODY_JOINTS]
+    hands = flat[:, 3 * BODY_JOINTS :]
+    jaw = np.zeros((frames, 3), np.float32)
+    eyes = np.zeros((frames, 6), np.float32)
     arrays = {
         "poses": np.concatenate([flat[:, :3], trunk, jaw, eyes, hands], axis=1),
         "root_orient": flat[:, :3],

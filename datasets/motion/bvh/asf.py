@@ -61,7 +61,8 @@ def read_amc(asf: bytes, amc: bytes, *, name: str) -> BvhMotion:
     """Read one motion of a subject, in centimetres; a `UserError` names file, bone and fault."""
     skeleton = _skeleton(asf, f"{name} (its .asf)")
     numbers, frames = _frames(amc, skeleton.bones, name)
-    names, parents = tuple(skeleton.bones), skeleton.parents
+    names = tuple(skeleton.bones)
+    parents = skeleton.parents
     ends = [skeleton.bones[bone].end for bone in names]
     turned = [
         _turned(bone, numbers.get(key), frames, skeleton.degree) for key, bone in skeleton.bones.items()

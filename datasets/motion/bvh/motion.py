@@ -150,7 +150,8 @@ def channel_columns(
     rotations: list[tuple[str, list[int]]] = []
     column = 0
     for joint, names in enumerate(channels):
-        order, columns = "", []
+        order = ""
+        columns = []
         for name in names:
             if name.endswith("position"):
                 positions.append((joint, "XYZ".index(name[0]), column))
@@ -192,7 +193,8 @@ def write_bvh(path: Path, skeleton: Skeleton, rotations: NDArray, root: NDArray,
     `rotations` are local rotation matrices [T, N, 3, 3] against the skeleton's rest pose, `root` the position
     of joint 0 [T, 3] in metres. The file appears whole or not at all (temporary file, flush to disk, rename).
     """
-    rotations, root = np.asarray(rotations, dtype=np.float64), np.asarray(root, dtype=np.float64)
+    rotations = np.asarray(rotations, dtype=np.float64)
+    root = np.asarray(root, dtype=np.float64)
     frames = len(root)
     if rotations.shape != (frames, len(skeleton), 3, 3) or root.shape != (frames, 3) or frames == 0:
         raise UserError(

@@ -62,9 +62,11 @@ class Hierarchy:
 def load_text(source: Path | str | bytes, name: str | None) -> tuple[bytes, str]:
     """The bytes with LF line ends, without BOM and padding at the end, and what errors call them."""
     if isinstance(source, bytes):
-        data, where = source, name or "BVH data"
+        data = source
+        where = name or "BVH data"
     elif isinstance(source, str) and "\n" in source:
-        data, where = source.encode(), name or "BVH text"
+        data = source.encode()
+        where = name or "BVH text"
     else:
         where = name or str(source)
         try:
@@ -92,7 +94,8 @@ def find_motion(data: bytes, where: str) -> MotionSection:
         raise UserError(
             f"{where}: line {line}: expected 'Frames: <count>' and 'Frame Time: <seconds>' after MOTION"
         )
-    frames, fps = header.group(1), _frame_rate(header.group(2), where)
+    frames = header.group(1)
+    fps = _frame_rate(header.group(2), where)
     if not frames.isdigit() or len(frames) > 12:
         raise UserError(f"{where}: 'Frames: {shown(frames)}' is not a whole number")
     if int(frames) == 0:

@@ -138,7 +138,8 @@ def encode_exact(
         _put(out[..., :-1, layout.slice("velocities")], step, rise)
         out[..., :-1, layout.slice("root_yaw_velocity")] = np.diff(angle, axis=-1)[..., None]
         root = out[..., :-1, layout.slice("root_xz_velocity")]
-        root[..., 0], root[..., 1] = step[..., 0].imag, step[..., 0].real
+        root[..., 0] = step[..., 0].imag
+        root[..., 1] = step[..., 0].real
         for field in ("velocities", "root_yaw_velocity", "root_xz_velocity"):
             out[..., -1, layout.slice(field)] = out[..., -2, layout.slice(field)]
     return out
@@ -152,9 +153,11 @@ def place(
     joints = np.empty((*lead, frames, layout.num_joints, 3), dtype=np.float64)
     local = features[..., layout.slice("positions")].reshape(*lead, frames, layout.num_joints - 1, 3)
     plane = ground(local) * turn[..., None] + root[..., None]
-    joints[..., 0, 0], joints[..., 0, 2] = root.imag, root.real
+    joints[..., 0, 0] = root.imag
+    joints[..., 0, 2] = root.real
     joints[..., 0, 1] = features[..., layout.slice("root_height")][..., 0]
-    joints[..., 1:, 0], joints[..., 1:, 2] = plane.imag, plane.real
+    joints[..., 1:, 0] = plane.imag
+    joints[..., 1:, 2] = plane.real
     joints[..., 1:, 1] = local[..., 1]
     return joints
 
@@ -162,4 +165,6 @@ def place(
 def _put(columns: NDArray[np.float32], plane: NDArray[np.complex128], height: NDArray[np.floating]) -> None:
     """Write points given as z + i x and y into columns x0 y0 z0 x1 ... of a feature array."""
     points = columns.reshape(*columns.shape[:-1], -1, 3)
-    points[..., 0], points[..., 1], points[..., 2] = plane.imag, height, plane.real
+    points[..., 0] = plane.imag
+    points[..., 1] = height
+    points[..., 2] = plane.real

@@ -69,14 +69,16 @@ def encode_h3d(
     step = np.diff(plane, axis=-1)
     rise = np.diff(points[1], axis=-1)
 
-    lead, frames = world.shape[:-3], world.shape[-3] - 1
+    lead = world.shape[:-3]
+    frames = world.shape[-3] - 1
     rows = np.zeros((layout.dim, *lead, frames), dtype=np.float32)
     rows[layout.slice("root_yaw_velocity")] = np.arcsin(np.sin(-0.5 * np.diff(angle, axis=-1)))
     # The published code turns the root's step by the heading of the frame that it leads to, and all other
     # steps by that of the frame that they start from.
     root = rows[layout.slice("root_xz_velocity")]
     seen = step[0] * unturn[..., 1:]
-    root[0], root[1] = seen.imag, seen.real
+    root[0] = seen.imag
+    root[1] = seen.real
     rows[layout.slice("root_height")] = points[1, :1, ..., :-1]
 
     local = (plane[1:, ..., :-1] - plane[:1, ..., :-1]) * unturn[..., :-1]
@@ -163,4 +165,6 @@ def _about_y(angle: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _put(rows: NDArray[np.float32], plane: NDArray[np.complex128], height: NDArray[np.float64]) -> None:
     """Write points given as z + i x and y, [J, ..., T], into rows x0 y0 z0 x1 ... of a [D, ..., T] array."""
-    rows[0::3], rows[1::3], rows[2::3] = plane.imag, height, plane.real
+    rows[0::3] = plane.imag
+    rows[1::3] = height
+    rows[2::3] = plane.real

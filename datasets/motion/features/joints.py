@@ -42,7 +42,8 @@ def local_joints_of(joints: NDArray[np.floating], fps: float) -> NDArray[np.floa
     out = np.array(joints, dtype=np.float64)
     turned = ground(out)
     turned = (turned - turned[..., :1]) * np.exp(-1j * heading(out, fps))[..., None]
-    out[..., 2], out[..., 0] = turned.real, turned.imag
+    out[..., 2] = turned.real
+    out[..., 0] = turned.imag
     out[..., 1] -= out[..., :1, 1]
     return out
 

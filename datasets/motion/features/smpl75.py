@@ -63,12 +63,16 @@ def joints24_of(columns: NDArray[np.floating]) -> NDArray[np.float64]:
 
 @cache
 def _neutral24() -> BodyModel:
-    body, whole = Skeleton.named("smpl22"), Skeleton.named("smplx52")
-    names, parents, rest = body.joints, body.parents, body.rest
+    body = Skeleton.named("smpl22")
+    whole = Skeleton.named("smplx52")
+    names = body.joints
+    parents = body.parents
+    rest = body.rest
     for side in ("left", "right"):
         knuckles = [whole.index(f"{side}_{finger}1") for finger in ("index", "middle", "ring", "pinky")]
         x, y, z = whole.offsets[knuckles].mean(axis=0).tolist()
-        names, parents = (*names, f"{side}_hand"), (*parents, body.index(f"{side}_wrist"))
+        names = (*names, f"{side}_hand")
+        parents = (*parents, body.index(f"{side}_wrist"))
         rest = (*rest, (x, y, z))
     named = Skeleton("smpl24", names, parents, rest)
     return replace(

@@ -56,7 +56,8 @@ def present_joints(present: Tensor, layout: MotionLayout) -> Tensor:
 
 def _turned(x: Tensor, z: Tensor, angle: Tensor) -> tuple[Tensor, Tensor]:
     """Points of the ground turned to the left by `angle`."""
-    cos, sin = angle.cos(), angle.sin()
+    cos = angle.cos()
+    sin = angle.sin()
     return z * sin + x * cos, z * cos - x * sin
 
 
@@ -81,7 +82,8 @@ def torch_smpl_joints(local: Tensor, trans: Tensor) -> Tensor:
     metres: the neutral skeleton, in the source's axes.
     """
     body = BodyModel.neutral("smpl22")
-    parents, rest = body.skeleton.parents, body.rest_joints()
+    parents = body.skeleton.parents
+    rest = body.rest_joints()
     offsets = torch.as_tensor(body.skeleton.bones(rest)).to(local)
     world = {0: local[..., 0, :, :]}
     joints = {0: torch.as_tensor(rest[0]).to(local) + trans}

@@ -17,14 +17,20 @@ Hold = tuple[float, Vec | None, float, Vec | None]
 
 def play(track: Track, side: int, holds: Sequence[Hold]) -> None:
     """Move one arm through keys on great circles around the shoulder, easing from key to key."""
-    arm, t = track.arms[side], track.t
-    rest, rest_bend, rest_reach = unit(arm.direction.mean(0)), unit(arm.bend.mean(0)), float(arm.reach.mean())
+    arm = track.arms[side]
+    t = track.t
+    rest = unit(arm.direction.mean(0))
+    rest_bend = unit(arm.bend.mean(0))
+    rest_reach = float(arm.reach.mean())
     at = np.array([h[0] for h in holds])
     to = unit(np.array([rest if h[1] is None else h[1] for h in holds], dtype=np.float64))
     bend = unit(np.array([rest_bend if h[3] is None else h[3] for h in holds], dtype=np.float64))
     reach = np.array([rest_reach if h[1] is None else h[2] for h in holds])
     order = np.argsort(at, kind="stable")
-    at, to, bend, reach = at[order], to[order], bend[order], reach[order]
+    at = at[order]
+    to = to[order]
+    bend = bend[order]
+    reach = reach[order]
     index = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(at) - 2)
     weight = ease((t - at[index]) / np.maximum(at[index + 1] - at[index], 1e-6))
     noise = arm.direction - arm.direction.mean(0)
@@ -46,7 +52,8 @@ def slerp(a: Array, b: Array, weight: Array) -> Array:
     """Great-circle interpolation of unit vectors a, b [T, 3] by weight [T]."""
     angle = np.arccos(np.clip((a * b).sum(-1), -0.9999, 0.9999))
     sine = np.sin(angle)
-    first, second = np.sin((1 - weight) * angle) / sine, np.sin(weight * angle) / sine
+    first = np.sin((1 - weight) * angle) / sine
+    second = np.sin(weight * angle) / sine
     return unit(first[:, None] * a + second[:, None] * b)
 
 
@@ -74,7 +81,8 @@ def punch(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     # The chest turns away from the striking arm: straight ahead is outwards of the chest.
     strike = (rng.uniform(0.2, 0.36), rng.uniform(-0.08, 0.16), 1.0)
     mine: list[Hold] = [(begin - 0.5, None, 0.0, None), (begin - 0.05, guard, near, GUARD_BEND)]
-    times, effort = [0.0], [0.0]
+    times = [0.0]
+    effort = [0.0]
     for k in range(count):
         a = begin + k * period
         mine += [
@@ -112,7 +120,8 @@ def wave(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     stays = rng.random() < 0.4 and not span.returns
     down = seconds + 5 if stays else seconds - up - rng.uniform(0.02, 0.15)
     rate = rng.uniform(1.4, 2.3)
-    high, wide = rng.uniform(0.5, 1.0), rng.uniform(0.35, 0.6)
+    high = rng.uniform(0.5, 1.0)
+    wide = rng.uniform(0.35, 0.6)
     amplitude = rng.uniform(0.3, 0.45)
     for side in (0, 1):
         if truth.side not in (("left", "right")[side], "both"):
@@ -140,7 +149,8 @@ def clap(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     period = min(period, (seconds - 1.2) / count)
     begin = rng.uniform(0.55, max(0.56, seconds - count * period - 0.6))
     track = Track.standing(seconds, fps, rng)
-    height, front = rng.uniform(-0.12, 0.08), rng.uniform(0.27, 0.34)
+    height = rng.uniform(-0.12, 0.08)
+    front = rng.uniform(0.27, 0.34)
     open_to = to_point(rng.uniform(0.17, 0.24), height, front)
     shut = to_point(0.03, height, front + 0.02)
     bend: Vec = (0.0, 1.0, 0.35)
@@ -234,21 +244,24 @@ def reach(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     reached = rng.uniform(0.95, 0.98)
     via: list[Hold] = []
     if truth.direction == "forward":
-        to, bend = (rng.uniform(-0.2, 0.0), rng.uniform(-0.15, 0.12), 1.0), (0.0, 1.0, 0.0)
+        to = (rng.uniform(-0.2, 0.0), rng.uniform(-0.15, 0.12), 1.0)
+        bend = (0.0, 1.0, 0.0)
         track.spine[:, 0] += body * rng.uniform(0.12, 0.25) * go
         track.pelvis[:, 0] += body * 0.1 * go
         track.spine[:, 1] -= body * sign * 0.35 * go
         track.root[:, 2] += body * 0.03 * go
     elif truth.direction == "up":
         # Up and forward, as to a shelf: on the toes, eyes on the hand. Raising an arm goes straight overhead.
-        to, bend = (rng.uniform(-0.1, 0.1), 1.0, rng.uniform(0.6, 0.85)), (-0.6, 0.8, 0.0)
+        to = (rng.uniform(-0.1, 0.1), 1.0, rng.uniform(0.6, 0.85))
+        bend = (-0.6, 0.8, 0.0)
         track.foot_pitch += body * rng.uniform(0.25, 0.45) * go
         track.root[:, 1] += body * 0.06 * go
         track.head[:, 0] -= 0.4 * go
         track.spine[:, 2] += body * sign * 0.1 * go
         via = [(begin + 0.5 * out, (0.1, -0.1, 1.0), 0.85, (0.0, 1.0, 0.2))]
     elif truth.direction == "down":
-        to, bend = (rng.uniform(-0.05, 0.1), rng.uniform(-0.35, -0.1), 1.0), (0.0, 0.6, 0.4)
+        to = (rng.uniform(-0.05, 0.1), rng.uniform(-0.35, -0.1), 1.0)
+        bend = (0.0, 0.6, 0.4)
         deep = rng.uniform(0.9, 1.1)
         track.root[:, 1] -= 0.4 * deep * go
         track.root[:, 2] -= 0.16 * go
@@ -258,7 +271,8 @@ def reach(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
         track.head[:, 0] -= 0.2 * go
         track.knee_out += 0.12 * go
     else:
-        to, bend = (1.0, rng.uniform(-0.1, 0.2), rng.uniform(0.0, 0.15)), (0.0, 0.3, 1.0)
+        to = (1.0, rng.uniform(-0.1, 0.2), rng.uniform(0.0, 0.15))
+        bend = (0.0, 0.3, 1.0)
         track.spine[:, 2] -= body * sign * rng.uniform(0.12, 0.25) * go
         track.head[:, 1] += sign * 0.5 * go
         track.root[:, 0] += body * sign * 0.05 * go

@@ -65,7 +65,8 @@ def lie(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track
 def crawl(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Track:
     """Crawl forward on hands and knees; each hand moves with the knee of the other side."""
     track = Track.standing(span.pick(rng), fps, rng, width=rng.uniform(-0.01, 0.03))
-    stride, period = rng.uniform(0.2, 0.3), rng.uniform(0.95, 1.3)
+    stride = rng.uniform(0.2, 0.3)
+    period = rng.uniform(0.95, 1.3)
     phase = track.t / period + rng.uniform(0, 1)
     speed = 2 * stride / period
     track.root[:] = 0.0
@@ -75,7 +76,8 @@ def crawl(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     track.head[:, 0] -= rng.uniform(0.9, 1.2)
     sway = np.sin(2 * np.pi * (phase + 0.1))
     track.spine[:, 1] += 0.05 * sway
-    knee, ankle = 0.055, 0.05
+    knee = 0.055
+    ankle = 0.05
     hips = [track._pelvis_rotation() @ OFFSETS[1 + side] for side in (0, 1)]
     ahead = np.stack([_planted(phase + 0.5 * side) for side in (0, 1)]) * stride
     # Both thighs lean by the same angle at all times, so that both knees can be on the floor.

@@ -19,10 +19,14 @@ def jump(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
 
     A hop is lower, and the leg of the other side stays up from before the first to after the last.
     """
-    count, hops = truth.count or 1, truth.action == "hop"
+    count = truth.count or 1
+    hops = truth.action == "hop"
     height = rng.uniform(0.14, 0.3) * (0.8 if count >= 3 else 1.0) * (0.5 if hops else 1.0)
     flight = 2 * math.sqrt(2 * height / GRAVITY)
-    dip, rise, absorb, rest = 0.32, 0.2, 0.2, 0.34
+    dip = 0.32
+    rise = 0.2
+    absorb = 0.2
+    rest = 0.34
     period = dip + rise + flight + absorb + rest
     seconds = span.pick(rng, at_least=count * period + 0.5, at_most=count * period + 2.2)
     still = 0.95 if hops else 0.35
@@ -32,19 +36,25 @@ def jump(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     early = 0.45 if hops else 0.15
     begin = rng.uniform(early, max(early + 0.01, seconds - count * period - early))
     track = Track.standing(seconds, fps, rng)
-    t, low = track.t, -rng.uniform(0.2, 0.28) * (0.5 if hops else 1.0)
-    top, land = 0.045, -0.08 if hops else -0.16
+    t = track.t
+    low = -rng.uniform(0.2, 0.28) * (0.5 if hops else 1.0)
+    top = 0.045
+    land = -0.08 if hops else -0.16
     speed = math.sqrt(2 * GRAVITY * height)
     y = np.zeros(len(t))
     air = np.zeros(len(t))
-    pitch, crouch, travel = np.zeros(len(t)), np.zeros(len(t)), np.zeros(len(t))
+    pitch = np.zeros(len(t))
+    crouch = np.zeros(len(t))
+    travel = np.zeros(len(t))
     swing: list[tuple[float, Vec]] = []
     back, front = (-0.4, (0.25, -0.4, 0.9)) if hops else (-0.75, (0.25, 0.35, 1.0))
     leap = rng.uniform(0.25, 0.5) if truth.direction == "forward" else 0.0
     for k in range(count):
         a = begin + k * period
-        b, c = a + dip, a + dip + rise
-        d, e = c + flight, c + flight + absorb
+        b = a + dip
+        c = a + dip + rise
+        d = c + flight
+        e = c + flight + absorb
         y += low * ease((t - a) / dip) * (t < b)
         y += _hermite(t, b, c, low, top, 0.0, speed)
         inside = (t >= c) & (t < d)
@@ -95,7 +105,8 @@ def squat(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     count = truth.count or 1
     low, high = {"slowly": (1.1, 1.4), None: (0.65, 0.8), "quickly": (0.36, 0.46)}[truth.speed or None]
     down = rng.uniform(low, high)
-    pause, gap = rng.uniform(0.05, 0.25) * down / 0.6, rng.uniform(0.05, 0.25)
+    pause = rng.uniform(0.05, 0.25) * down / 0.6
+    gap = rng.uniform(0.05, 0.25)
     period = 2 * down + pause + gap
     seconds = span.pick(rng, at_least=count * period + 0.3, at_most=count * period + 1.6)
     period = min(period, (seconds - 0.2) / count)
@@ -107,7 +118,8 @@ def squat(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Tra
     for k in range(count):
         at = begin + k * period
         bent += _bump(track.t, at, down * squeeze, pause * squeeze)
-    back, pitch = rng.uniform(0.1, 0.15), rng.uniform(0.5, 0.7)
+    back = rng.uniform(0.1, 0.15)
+    pitch = rng.uniform(0.5, 0.7)
     track.root[:, 1] -= depth * bent
     track.root[:, 2] -= back * bent
     track.pelvis[:, 0] += 0.6 * pitch * bent
@@ -169,10 +181,14 @@ def kick(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     begin = rng.uniform(0.3, max(0.31, seconds - count * unit_time - 0.2))
     track = Track.standing(seconds, fps, rng, width=rng.uniform(-0.02, 0.02))
     rest = track.ball[leg, 0].copy()
-    height, far = rng.uniform(0.6, 0.95), rng.uniform(0.68, 0.8)
+    height = rng.uniform(0.6, 0.95)
+    far = rng.uniform(0.68, 0.8)
     chamber = rest + np.array([-0.02 * sign, 0.38, 0.06])
     end = np.array([rest[0] - 0.04 * sign, height, BALL[1] + far])
-    times, places, pitches, effort = [0.0], [rest], [0.0], [0.0]
+    times = [0.0]
+    places = [rest]
+    pitches = [0.0]
+    effort = [0.0]
     for k in range(count):
         a = begin + k * unit_time
         times += [a, a + 0.34 * unit_time, a + 0.52 * unit_time, a + 0.6 * unit_time]
@@ -198,9 +214,11 @@ def kick(truth: Truth, span: Span, fps: float, rng: np.random.Generator) -> Trac
     guard = rng.random() < 0.6
     for side in (0, 1):
         wide = (0.45, -0.5, 0.65 if side != leg else -0.2)
-        there, pose = begin + 0.4 * unit_time, (wide, 0.85, (0.0, 0.5, 1.0))
+        there = begin + 0.4 * unit_time
+        pose = (wide, 0.85, (0.0, 0.5, 1.0))
         if guard:
-            there, pose = begin - 0.05, ((-0.05, 0.0, 0.85), 0.6, (-0.4, 1.0, 0.2))
+            there = begin - 0.05
+            pose = ((-0.05, 0.0, 0.85), 0.6, (-0.4, 1.0, 0.2))
         hold(track, side, (max(begin - 0.5, -0.2), there, finish - 0.15, finish + 0.5), *pose)
     track.lower_to_reach()
     return track

@@ -238,7 +238,8 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
 
     The swing is the left foot's lead over the right along the heading, in units of one step length.
     """
-    t, fps = track.t, track.fps
+    t = track.t
+    fps = track.fps
     lift = np.zeros((2, len(t)))
     for foot in (0, 1):
         mine = [s for s in steps if s.foot == foot]
@@ -246,8 +247,10 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
         start_yaw = toe_out if foot == 0 else -toe_out
         xz = np.tile(start_xz, (len(t), 1))
         yaw = np.full(len(t), start_yaw)
-        before, before_yaw = np.asarray(start_xz), start_yaw
-        times, values = [-1e3], [0.0]
+        before = np.asarray(start_xz)
+        before_yaw = start_yaw
+        times = [-1e3]
+        values = [0.0]
         for step in mine:
             span = step.end - step.start
             # Gentler than `ease`, so that the foot lags less behind a fast body.
@@ -255,7 +258,8 @@ def apply_steps(track: Track, steps: Sequence[Step], stride: Stride, toe_out: fl
             s = s * s * (3.0 - 2.0 * s)
             xz += s[:, None] * (np.asarray(step.xz) - before)
             yaw += s * (step.yaw - before_yaw)
-            before, before_yaw = np.asarray(step.xz), step.yaw
+            before = np.asarray(step.xz)
+            before_yaw = step.yaw
             phase = np.clip((t - step.start) / span, 0.0, 1.0)
             lift[foot] += step.height * np.sin(np.pi * phase**0.85) ** 1.5
             roll = min(0.22, 0.45 * span)
@@ -301,9 +305,12 @@ def swing_body(track: Track, lead: Array, stride: Stride, moving: Array, amount:
         arm = track.arms[side]
         angle = sign * swing * stride.arm_swing + moving * (0.06 + 0.25 * folded)
         turned = rot_y(np.zeros_like(angle))
-        cos, sin = np.cos(angle), np.sin(angle)
-        turned[:, 1, 1], turned[:, 2, 2] = cos, cos
-        turned[:, 1, 2], turned[:, 2, 1] = sin, -sin
+        cos = np.cos(angle)
+        sin = np.sin(angle)
+        turned[:, 1, 1] = cos
+        turned[:, 2, 2] = cos
+        turned[:, 1, 2] = sin
+        turned[:, 2, 1] = -sin
         arm.direction = (turned @ arm.direction[..., None])[..., 0]
         arm.bend = (turned @ arm.bend[..., None])[..., 0]
         fold = moving * (arm.reach - stride.elbow) + 0.03 * np.maximum(sign * swing, 0.0) * (1 - folded)
@@ -316,7 +323,8 @@ def swing_body(track: Track, lead: Array, stride: Stride, moving: Array, amount:
 def stand_height(track: Track, stride: Stride, steps: Sequence[Step]) -> None:
     """Root height: standing, the bounce of a run, and as low as the legs need."""
     if stride.bounce > 0:
-        first, last = steps[0].start, steps[-1].end
+        first = steps[0].start
+        last = steps[-1].end
         phase = (track.t - first) / stride.step_seconds - (stride.swing_share - 1.0) * 0.5
         inside = ease((track.t - first) / 0.3) * ease((last - track.t) / 0.3)
         track.root[:, 1] += inside * stride.bounce * (np.cos(2 * np.pi * phase) - 1.0)

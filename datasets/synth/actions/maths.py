@@ -32,7 +32,8 @@ def _axis(angle: ArrayLike, i: int, j: int) -> Array:
     a = np.asarray(angle, dtype=np.float64)
     out = np.zeros((*a.shape, 3, 3))
     out[..., range(3), range(3)] = 1.0
-    c, s = np.cos(a), np.sin(a)
+    c = np.cos(a)
+    s = np.sin(a)
     out[..., i, i] = c
     out[..., j, j] = c
     out[..., i, j] = -s
@@ -47,8 +48,12 @@ def unit(v: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Cross product [..., 3]; several times faster than `np.cross` on short arrays."""
-    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
-    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    ax = a[..., 0]
+    ay = a[..., 1]
+    az = a[..., 2]
+    bx = b[..., 0]
+    by = b[..., 1]
+    bz = b[..., 2]
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 

@@ -67,7 +67,8 @@ class Track:
 
     def __init__(self, t: Array, fps: float) -> None:
         n = len(t)
-        self.t, self.fps = t, fps
+        self.t = t
+        self.fps = fps
         self.root: Array = np.tile([0.0, STAND - 0.008, 0.0], (n, 1))
         self.yaw: Array = np.zeros(n)
         self.pelvis: Array = np.zeros((n, 3))  # pitch, yaw, roll
@@ -75,9 +76,11 @@ class Track:
         self.head: Array = np.zeros((n, 3))
         self.ball: Array = np.zeros((2, n, 3))
         self.ball[:, :, 2] = BALL[1]
-        self.ball[0, :, 0], self.ball[1, :, 0] = BALL[0], -BALL[0]
+        self.ball[0, :, 0] = BALL[0]
+        self.ball[1, :, 0] = -BALL[0]
         self.foot_yaw: Array = np.zeros((2, n))
-        self.foot_yaw[0], self.foot_yaw[1] = 0.1, -0.1
+        self.foot_yaw[0] = 0.1
+        self.foot_yaw[1] = -0.1
         self.foot_pitch: Array = np.zeros((2, n))
         self.knee_out: Array = np.zeros((2, n))
         self.arms = (hanging_arm(n), hanging_arm(n))
@@ -223,15 +226,19 @@ def joined(first: Track, second: Track) -> Track:
     after the other into new places."""
     fps = first.fps
     shared = round(OVERLAP * fps)
-    start, frames = len(first.t) - shared, len(first.t) - shared + len(second.t)
+    start = len(first.t) - shared
+    frames = len(first.t) - shared + len(second.t)
     out = Track(np.arange(frames) / fps, fps)
     turn = float(first.yaw[-1])
-    cos, sin = np.cos(turn), np.sin(turn)
+    cos = np.cos(turn)
+    sin = np.sin(turn)
 
     def placed(xyz: Array) -> Array:
-        x, z = xyz[..., 0] - old[0], xyz[..., 2] - old[1]
+        x = xyz[..., 0] - old[0]
+        z = xyz[..., 2] - old[1]
         moved = xyz.copy()
-        moved[..., 0], moved[..., 2] = cos * x + sin * z + new[0], cos * z - sin * x + new[1]
+        moved[..., 0] = cos * x + sin * z + new[0]
+        moved[..., 2] = cos * z - sin * x + new[1]
         return moved
 
     new = first.ball[:, -1].mean(0)[[0, 2]]

@@ -113,7 +113,8 @@ class Song:
         times, known = self._grid
         at = np.asarray(numbers, dtype=np.float64)
         inside = np.interp(at, known, times)
-        before, after = np.minimum(at - known[0], 0.0), np.maximum(at - known[-1], 0.0)
+        before = np.minimum(at - known[0], 0.0)
+        after = np.maximum(at - known[-1], 0.0)
         return np.asarray(inside + (before + after) * self.beat)
 
     def beat_number(self, start: float) -> int:

@@ -63,7 +63,8 @@ def equalize(sound: Array, rate: int, decibels: tuple[float, ...]) -> Array:
 
 def _harmony(out: Array, song: Song, degree: int, kind: int, begin: float, rate: int) -> None:
     """Bass, chord and, in section B, an upper voice of one bar that begins at `begin` seconds."""
-    genre, sixteenth = song.style, song.beat / 4
+    genre = song.style
+    sixteenth = song.beat / 4
     root = 55.0 * 2 ** ((song.key + genre.semitones(degree)) / 12)
     for place, (step, gap, level) in enumerate(_notes(genre.bass)):
         # Octaves in turn are what makes a disco bass.

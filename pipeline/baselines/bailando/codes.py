@@ -206,7 +206,8 @@ class DanceVq(nn.Module):
             for k, (name, half) in enumerate(self.halves.items())
         }
         joints = made["up"].new_empty(*made["up"].shape[:2], self.joints, 3)
-        joints[:, :, self.upper], joints[:, :, self.lower] = made["up"], made["down"]
+        joints[:, :, self.upper] = made["up"]
+        joints[:, :, self.lower] = made["down"]
         steps = self.steps(codes[..., 1])
         way = torch.cat([torch.zeros_like(steps[:, :1]), running_sum(steps[:, :-1], 1)], dim=1)
         # What the lower half says of its root is an error: it was 0.

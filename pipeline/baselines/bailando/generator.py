@@ -44,7 +44,8 @@ class BailandoGenerator(DanceGenerator):
         """Dances that begin with the seed motions' codes, or with a kept code by their seed."""
         lengths = request.lengths("Bailando")
         count = max(lengths) // self.unit_frames
-        device, gpt = device_of(self.gpt), self.gpt
+        device = device_of(self.gpt)
+        gpt = self.gpt
         if request.seed_motions is None:
             first = gpt.kept[[seed % len(gpt.kept) for seed in request.seeds]][:, None]
         else:

@@ -68,11 +68,13 @@ class DanceVqModule(AlternatingModule):
         root_start: int,
     ) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.root_optim, self.root_start = root_optim, root_start
+        self.root_optim = root_optim
+        self.root_start = root_start
 
     def optimizer_groups(self) -> list[OptimizerGroup]:
         """The codes, then the root."""
-        net, start = self.net, self.root_start
+        net = self.net
+        start = self.root_start
         return [
             OptimizerGroup("codes", (net.up, net.down), self.optim_config, end_step=start),
             OptimizerGroup("root", (net.root,), self.root_optim, start_step=start),
@@ -84,7 +86,9 @@ class DanceVqModule(AlternatingModule):
         return self._root(joints) if group == "root" else self._codes(joints)
 
     def _codes(self, joints: Tensor) -> dict[str, Tensor]:
-        config, losses, metrics = self.net.config, [], dict[str, Tensor]()
+        config = self.net.config
+        losses = []
+        metrics = dict[str, Tensor]()
         for name, out in self.net(joints).items():
             weights = config.velocity_weight, config.acceleration_weight
             error = moving_error(out.reconstruction, out.input, *weights)
@@ -113,9 +117,11 @@ class CrossGptModule(StageModule):
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Losses of "motion" [B, T, 3 N] in metres and "conditions"; rows without music do not count."""
         codes, music, heard = codes_of(self.net, self.vq.module, batch)
-        logits, true = self.net(codes[:, :-1], music[:, 1:]), codes[:, 1:]
+        logits = self.net(codes[:, :-1], music[:, 1:])
+        true = codes[:, 1:]
         counts = heard[:, None].expand(true.shape[:2])
-        each, hits = code_errors(logits, true), (logits.argmax(-1) == true).float()
+        each = code_errors(logits, true)
+        hits = (logits.argmax(-1) == true).float()
         loss = masked_mean(each.sum(2), counts)
         found = {f"accuracy_{name}": masked_mean(hits[..., k], counts) for k, name in enumerate(HALVES)}
         return {"loss": loss, **found}
@@ -158,12 +164,17 @@ class ActorCriticModule(AlternatingModule):
         reward: RewardConfig,
     ) -> None:
         super().__init__(net, optim, seed=seed, max_steps=max_steps)
-        self.vq, self.fps, self.config = Frozen(vq), fps, reward
+        self.vq = Frozen(vq)
+        self.fps = fps
+        self.config = reward
 
     def optimizer_groups(self) -> list[OptimizerGroup]:
         """The actor, then the critic."""
-        net, actor, critic = self.net, self.config.actor_steps, self.config.critic_steps
-        both, last = actor + critic, (net.gpt.head, net.gpt.out)
+        net = self.net
+        actor = self.config.actor_steps
+        critic = self.config.critic_steps
+        both = actor + critic
+        last = (net.gpt.head, net.gpt.out)
         return [
             _InTurns("actor", last, self.optim_config, run=actor, period=both),
             _InTurns("critic", (net.critic,), self.optim_config, offset=actor, run=critic, period=both),
@@ -192,7 +203,9 @@ class ActorCriticModule(AlternatingModule):
         of the codes between the first and the last; "heard" bool [B], who has music; and the codes that the
         actor learns, "counts" bool [B, L - 2].
         """
-        gpt, frames, size = self.net.gpt, self.vq.module.config.code_frames, self.net.gpt.config.context + 1
+        gpt = self.net.gpt
+        frames = self.vq.module.config.code_frames
+        size = self.net.gpt.config.context + 1
         true, music, heard = codes_of(gpt, self.vq.module, batch)
         danced = gpt.dance(true[:, :1], music, self.config.temperature)
         # Each row's window begins anywhere in its clip, so that states far from true codes are trained too.

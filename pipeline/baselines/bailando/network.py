@@ -45,7 +45,9 @@ class CrossGpt(nn.Module):
 
     def __init__(self, config: CrossGptConfig, num_codes: int, music_dim: int, kept: int = 8) -> None:
         super().__init__()
-        self.config, self.num_codes, self.music_dim = config, num_codes, music_dim
+        self.config = config
+        self.num_codes = num_codes
+        self.music_dim = music_dim
         dim = config.dim
         self.codes = nn.ModuleList(nn.Embedding(num_codes, dim) for _ in range(2))
         self.music = nn.Linear(music_dim, dim)
@@ -68,7 +70,8 @@ class CrossGpt(nn.Module):
 
     def states(self, codes: Tensor, music: Tensor) -> Tensor:
         """Return the states that actor and critic share, [B, 3 L, D] in the order music, upper, lower."""
-        size, context = codes.shape[1], self.config.context
+        size = codes.shape[1]
+        context = self.config.context
         blocks = [self.music(music), *(embed(codes[..., k]) for k, embed in enumerate(self.codes))]
         places = self.positions.view(3, context, -1)[:, :size].flatten(0, 1)
         x = self.dropout(torch.cat(blocks, dim=1) + places)

@@ -145,7 +145,8 @@ class DanceGptStage(TrainedStage[C, I, G]):
         return release_of_gpt(net)
 
     def example(self, config: C, net: G, inputs: I, batch: int) -> Example:
-        gpt, vq = gpt_in(net), inputs.dance_vq
+        gpt = gpt_in(net)
+        vq = inputs.dance_vq
         frames = window_of(gpt, vq)["max_frames"]
         music = MODALITIES["audio"].example(batch, frames, gpt.music_dim)
         tensors = {"motion": torch.zeros(batch, frames, 3 * vq.joints), "conditions": {"audio": music}}
@@ -154,7 +155,8 @@ class DanceGptStage(TrainedStage[C, I, G]):
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
         songs = getattr(stage.config, "reward_songs", "train")
         note = "" if songs == "train" else "rewarded on the songs of the test split"
-        layout, gpt = load_facts(stage.folder).layout.layout(), gpt_in(self.load(stage, given, device))
+        layout = load_facts(stage.folder).layout.layout()
+        gpt = gpt_in(self.load(stage, given, device))
         return BailandoGenerator(layout, given, gpt, given["dance_vq"], note)
 
 
@@ -178,8 +180,10 @@ class CrossGptStage(DanceGptStage[CrossGptStageConfig, CrossGptInputs, CrossGpt]
 
     def prepare(self, config: CrossGptStageConfig, net: CrossGpt, inputs: CrossGptInputs) -> None:
         """First codes of training dances."""
-        dataset, frames = inputs.data.split("train"), inputs.dance_vq.config.code_frames
-        clips, crops = spread_dances(dataset, config.kept, frames), JointCrops(dataset)
+        dataset = inputs.data.split("train")
+        frames = inputs.dance_vq.config.code_frames
+        clips = spread_dances(dataset, config.kept, frames)
+        crops = JointCrops(dataset)
         starts = torch.zeros(len(clips), frames, crops.width)
         for row, clip in enumerate(clips):
             crops.fill(starts[row].numpy(), clip, 0, frames)
@@ -256,7 +260,9 @@ class ActorCriticStage(DanceGptStage[ActorCriticStageConfig, ActorCriticInputs, 
     def batches(
         self, config: ActorCriticStageConfig, net: ActorCritic, inputs: ActorCriticInputs, seed: int, log: Log
     ) -> Batches:
-        data, audio, fps = inputs.data, inputs.audio, inputs.data.layout.fps
+        data = inputs.data
+        audio = inputs.audio
+        fps = inputs.data.layout.fps
         songs = data.held_out(prefer="test") if config.reward_songs == "test" else None
         found = clip_batches(
             data, JointCrops, {"audio": audio}, seed,
@@ -292,7 +298,8 @@ def gpt_in(net: CrossGpt | ActorCritic) -> CrossGpt:
 
 def window_of(gpt: CrossGpt, vq: DanceVq, contexts: int = 1) -> dict[str, int]:
     """Lengths of a training window: the context and one code more, or up to so many contexts."""
-    context, frames = gpt.config.context, vq.config.code_frames
+    context = gpt.config.context
+    frames = vq.config.code_frames
     return {"max_frames": (contexts * context + 1) * frames, "min_frames": (context + 1) * frames}
 
 

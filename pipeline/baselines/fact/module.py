@@ -21,17 +21,20 @@ class FactModule(StageModule):
         "motion" [B, T, C] normalised, "length" [B], "present" bool [B, C] (optional: all) and
         "conditions" with "audio". Rows without music, or too short, count for nothing.
         """
-        net, config = self.net, self.net.config
+        net = self.net
+        config = self.net.config
         features, heard, _ = batch["conditions"]["audio"]
         end = config.clip_frames
         motion = net.columns.read(batch["motion"][:, :end])
         # Music that ends too early goes on as silence.
         lacking = max(0, config.music_frames - features.shape[1])
         music = read_music(functional.pad(features[:, : config.music_frames], (0, 0, 0, lacking)))
-        before, after = motion[:, : config.motion_frames], motion[:, config.motion_frames :]
+        before = motion[:, : config.motion_frames]
+        after = motion[:, config.motion_frames :]
         counts = (heard.any(1) & (batch["length"] >= end))[:, None].expand(-1, config.predicted_frames)
         present = None if net.columns.matrices else batch.get("present")
-        made, still = net(before, music).float(), before[:, -1:].expand_as(after)
+        made = net(before, music).float()
+        still = before[:, -1:].expand_as(after)
         loss, of_still = (
             masked_mean(functional.mse_loss(one, after, reduction="none"), counts, present)
             for one in (made, still)

@@ -30,7 +30,8 @@ from motionloom.models.layers.transformer import Block, StackConfig, Transformer
 
 Columns = Literal["features", "matrices"]
 
-_PUBLISHED, _BASELINE = 438, 35
+_PUBLISHED = 438
+_BASELINE = 35
 _MFCC, _CHROMA, _ONSET, _BEAT = slice(0, 20), slice(40, 52), slice(52, 53), slice(53, 54)
 _ZEROS = 6
 
@@ -43,7 +44,8 @@ class MotionColumns(nn.Module):
 
     def __init__(self, kind: Columns, layout: MotionLayout, part: Part) -> None:
         super().__init__()
-        self.matrices, self.dim = kind == "matrices", len(layout.part(part))
+        self.matrices = kind == "matrices"
+        self.dim = len(layout.part(part))
         if not self.matrices:
             return
         if not layout.has("pose") or part not in ("all", "bodyhand", "body"):
@@ -166,7 +168,8 @@ class Fact(nn.Module):
         super().__init__()
         self.config = config
         self.columns = MotionColumns(config.columns, layout, part)
-        width, dim = config.dim, self.columns.dim
+        width = config.dim
+        dim = self.columns.dim
         self.motion_in = nn.Linear(dim, width)
         self.music_in = nn.Linear(music_width(music_dim), width)
         self.motion_positions = nn.Parameter(0.02 * torch.randn(config.motion_frames, width))
@@ -192,7 +195,8 @@ class Fact(nn.Module):
         Each further frame is the first that is predicted from the T0 before it, so that each costs the same.
         After the end of the music there is its mean, which is 0.
         """
-        size, window = self.config.motion_frames, self.config.music_frames
+        size = self.config.motion_frames
+        window = self.config.music_frames
         heard = read_music(music)
         heard = nn.functional.pad(heard, (0, 0, 0, max(0, frames + window - heard.shape[1])))
         made = begun.new_empty(len(begun), max(frames, size), self.columns.dim)

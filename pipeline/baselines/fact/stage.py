@@ -44,8 +44,10 @@ class FactGenerator(DanceGenerator):
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """Features in their own units; without seed motions each goes on from a kept one, by its seed."""
         lengths = request.lengths("FACT")
-        columns, stats = self.layout.part(self.part), self.given["stats"]
-        mean, std = stats.mean[columns], stats.std[columns]
+        columns = self.layout.part(self.part)
+        stats = self.given["stats"]
+        mean = stats.mean[columns]
+        std = stats.std[columns]
         if request.seed_motions is None:
             begun = self.net.kept[[seed % len(self.net.kept) for seed in request.seeds]]
         else:
@@ -96,15 +98,18 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
         return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: FactInputs) -> Fact:
-        config, layout = FactConfig.parse(facts.config, facts.where), facts.layout.layout()
+        config = FactConfig.parse(facts.config, facts.where)
+        layout = facts.layout.layout()
         sizes = {name: facts.fact(name, int) for name in ("music_dim", "kept")}
         return Fact(config, layout, part_of(facts), **sizes)
 
     def prepare(self, config: FactStageConfig, net: Fact, inputs: FactInputs) -> None:
         """Statistics for matrices, and starts of training dances."""
-        stats, columns = inputs.stats, inputs.data.layout.part(config.part)
+        stats = inputs.stats
+        columns = inputs.data.layout.part(config.part)
         net.columns.learn(torch.from_numpy(stats.mean[columns]), torch.from_numpy(stats.std[columns]))
-        dataset, frames = inputs.data.split("train"), config.net.motion_frames
+        dataset = inputs.data.split("train")
+        frames = config.net.motion_frames
         for row, clip in enumerate(spread_dances(dataset, config.kept, config.net.clip_frames)):
             start = stats.normalize(dataset.motion(clip)[:frames])[:, columns]
             net.kept[row] = torch.from_numpy(start)
@@ -118,7 +123,8 @@ class FactStage(TrainedStage[FactStageConfig, FactInputs, Fact]):
         )
 
     def example(self, config: FactStageConfig, net: Fact, inputs: FactInputs, batch: int) -> Example:
-        frames, width = config.net.window_frames, len(inputs.data.layout.part(config.part))
+        frames = config.net.window_frames
+        width = len(inputs.data.layout.part(config.part))
         music = MODALITIES["audio"].example(batch, frames, inputs.audio.dim)
         note = f"{config.net.motion_frames} frames of motion + {config.net.music_frames} of music"
         return Example(motion_example(batch, frames, width, conditions={"audio": music}), note)

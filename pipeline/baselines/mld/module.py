@@ -28,7 +28,9 @@ class MotionVaeModule(JointsModule):
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Loss of "motion" [B, T, D], "length" [B], optional "present"; latents are means in evaluation."""
-        motion, present, config = batch["motion"], batch.get("present"), self.loss_config
+        motion = batch["motion"]
+        present = batch.get("present")
+        config = self.loss_config
         mask = length_mask(batch["length"], motion.shape[1])
         mu, logvar = self.net.encode(mask_missing(motion, present), mask)
         rebuilt = self.net.decode(drawn(mu, logvar) if self.training else mu, mask)

@@ -57,7 +57,8 @@ def sample_latents(
     guidance: float = 7.5,
 ) -> Tensor:
     """Latents [n, K, C] for text vectors [n, E], one seed each (`sample_guided`)."""
-    sizes, how = [net.latent_tokens] * len(text), {"sampler": sampler, "steps": steps, "guidance": guidance}
+    sizes = [net.latent_tokens] * len(text)
+    how = {"sampler": sampler, "steps": steps, "guidance": guidance}
     return torch.stack(sample_guided(net, net, text, sizes, net.config.dim, seeds=seeds, **how))  # type: ignore[arg-type]
 
 
@@ -207,7 +208,8 @@ class LatentDiffusionStage(CaptionStage[LatentDiffusionStageConfig, LatentDiffus
         return ModelFacts.of(self.name, config.net, inputs.data.layout, extra)
 
     def network(self, facts: ModelFacts, inputs: LatentDiffusionInputs) -> LatentDenoiser:
-        config, vae = LatentDiffusionConfig.parse(facts.config, facts.where), inputs.motion_vae
+        config = LatentDiffusionConfig.parse(facts.config, facts.where)
+        vae = inputs.motion_vae
         tokens, text_dim = (facts.fact(key, int) for key in ("latent_tokens", "text_dim"))
         here = (vae.net.config.latent_tokens, vae.net.config.dim)
         if (tokens, config.dim) != here:
@@ -274,7 +276,8 @@ def _in_u(name: str, half: int, *, memory: bool) -> str:
     if not name.startswith("blocks."):
         return name
     _, number, inner = name.split(".", 2)
-    index, tensor = int(number), name_in_torch(inner, memory=memory)
+    index = int(number)
+    tensor = name_in_torch(inner, memory=memory)
     if index == half:
         return f"middle_block.{tensor}"
     return f"{'input' if index < half else 'output'}_blocks.{index % (half + 1)}.{tensor}"

@@ -29,7 +29,9 @@ class MotionClipModule(JointsModule):
         """Loss of one batch: "motion" [B, T, D], "length" [B], "conditions" with "text", "present" bool
         [B, D] (optional: all). Means of squared errors over real frames, and of 1 - cosine over clips.
         """
-        net, config, present = self.net, self.loss_config, batch.get("present")
+        net = self.net
+        config = self.loss_config
+        present = batch.get("present")
         motion = net.coordinates(batch["motion"], present)
         mask = length_mask(batch["length"], motion.shape[1])
         z = net.encode(motion, mask)

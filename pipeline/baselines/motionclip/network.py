@@ -37,7 +37,8 @@ class SixD(nn.Module):
 
     def __init__(self, layout: MotionLayout) -> None:
         super().__init__()
-        self.trans, self.pose = layout.slice("trans"), layout.slice("pose")
+        self.trans = layout.slice("trans")
+        self.pose = layout.slice("pose")
         self.register_buffer("mean", torch.zeros(layout.dim))
         self.register_buffer("std", torch.ones(layout.dim))
 
@@ -64,7 +65,8 @@ class SixD(nn.Module):
         local, trans = self._parts(coordinates)
         turns: Tensor = roma.rotmat_to_rotvec(local).flatten(-2)
         values = turns.new_empty(*turns.shape[:-1], len(self.mean))
-        values[..., self.pose], values[..., self.trans] = turns, trans
+        values[..., self.pose] = turns
+        values[..., self.trans] = trans
         return (values - self.mean) / self.std
 
     def joints(self, coordinates: Tensor) -> Tensor:

@@ -105,7 +105,8 @@ class MotionClipStage(CaptionStage[MotionClipStageConfig, CaptionInputs, MotionC
         return joint_loss_settings(inputs.data.layout, config.part, inputs.stats, config.loss)
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
-        facts, layout = load_facts(stage.folder), given["stats"].layout
+        facts = load_facts(stage.folder)
+        layout = given["stats"].layout
         net = self.load(stage, given, device)
         return TextAsLatent(layout, "bodyhand", given, net, facts.fact("max_frames", int))
 

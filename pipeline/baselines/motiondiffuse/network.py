@@ -151,7 +151,8 @@ class MotionDiffuse(nn.Module):
         self.config = config
         self.motion_dim = motion_dim
         self.max_frames = max_frames
-        dim, caption = config.dim, config.caption
+        dim = config.dim
+        caption = config.caption
         self.positions = nn.Parameter(torch.randn(max_frames, dim) * dim**-0.5)
         self.tokens = nn.Linear(text_dim, caption.dim)
         self.reader = Transformer(caption, caption.layers, norm="post")

@@ -104,7 +104,8 @@ class MotionDiffuseStage(CaptionStage[MotionDiffuseStageConfig, CaptionInputs, M
         )
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
-        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
+        net = self.load(stage, given, device)
+        part = part_of(load_facts(stage.folder))
         return MotionDiffuseMotion(given["stats"].layout, part, given, net)
 
 

@@ -46,7 +46,8 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
         beam: Unfinished sentences that are kept, at least `count`; the wider, the surer that no likelier one
             is missed.
     """
-    batch, beam = len(reading.mask), max(beam, count)
+    batch = len(reading.mask)
+    beam = max(beam, count)
     device = reading.mask.device
     rows = torch.arange(batch, device=device)
     reading = reading.take(rows.repeat_interleave(beam))
@@ -64,7 +65,8 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
         total = (scores[..., None] + words).flatten(1)
         # Twice the beam: as many as `beam` of the best may end here, and `beam` must go on.
         best, at = total.topk(min(2 * beam, total.shape[1]), dim=1)
-        origin, word = at // words.shape[-1], at % words.shape[-1]
+        origin = at // words.shape[-1]
+        word = at % words.shape[-1]
         for row in range(batch):
             for score, one, ended in zip(
                 best[row].tolist(), origin[row].tolist(), (word[row] == END).tolist(), strict=True
@@ -79,7 +81,8 @@ def likeliest(net: Captioner, reading: Reading, count: int, beam: int) -> list[l
         pairs = zip(done, scores[:, 0].tolist(), strict=True)
         if all(len(found) == count and found[-1].log_probability >= left for found, left in pairs):
             break
-        origin, word = origin.gather(1, kept), word.gather(1, kept)
+        origin = origin.gather(1, kept)
+        word = word.gather(1, kept)
         said = torch.cat([said.gather(1, origin[..., None].expand(-1, -1, step)), word[..., None]], dim=2)
         reading = reading.take((rows[:, None] * beam + origin).flatten())
         last = word.flatten()
@@ -136,7 +139,8 @@ class TokenCaptioner:
     def _batch(
         self, motions: Sequence[NDArray[np.float32]], count: int, bits: Sequence[int]
     ) -> list[list[Sentence]]:
-        net, device = self.net, device_of(self.net)
+        net = self.net
+        device = device_of(self.net)
         codes = self.tokenizer.encode([motion[: self.max_frames] for motion in motions], bits)
         closed = torch.tensor([len(motion) <= self.max_frames for motion in motions], device=device)
         tokens = interleave(codes.codes, net.pattern, ends=net.num_codes, groups=codes.groups, closed=closed)
@@ -172,7 +176,9 @@ class Seq2SeqGenerator(OfTokens):
 
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
         """Lengths that are no whole groups are made of one group more, and cut."""
-        text, device, sampling = request.text("this model"), device_of(self.net), request.sampling
+        text = request.text("this model")
+        device = device_of(self.net)
+        sampling = request.sampling
         codes = draw_tokens(
             self.net,
             text.features.to(device),

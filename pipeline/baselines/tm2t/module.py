@@ -78,8 +78,12 @@ class CaptionerModule(StageModule):
         """Loss of {"tokens" int64 [B, L] padded with -1, "kinds" int64 [B, L], "text" int64 [B, W], the words
         of `Vocabulary.encode`, "known" bool [B, L] (optional: all)}.
         """
-        net, tokens, kinds, words = self.net, batch["tokens"], batch["kinds"], batch["text"]
-        visible, known = tokens >= 0, batch.get("known")
+        net = self.net
+        tokens = batch["tokens"]
+        kinds = batch["kinds"]
+        words = batch["text"]
+        visible = tokens >= 0
+        known = batch.get("known")
         if self.training and self.loss_config.hide:
             size = len(net.pattern)
             groups = group_counts(tokens, kinds, net.ends, size)
@@ -89,7 +93,8 @@ class CaptionerModule(StageModule):
             read = (kinds != net.names.index("hand")) | ~handless[:, None]
             known = read if known is None else known & read
         logits = net(tokens, kinds, words, visible, known)
-        each, counted = word_errors(logits, words), words != PAD
+        each = word_errors(logits, words)
+        counted = words != PAD
         right = (logits.argmax(-1) == words).float()
         ce = masked_mean(each, counted)
         return {
@@ -130,7 +135,10 @@ class Seq2SeqModule(StageModule):
         "mask" bool [B, S], "known" bool [B, L] (optional: all)}, and of "said" int64 [B, W], the caption as
         the captioner's vocabulary has it, for inverse alignment.
         """
-        net, tokens, kinds, known = self.net, batch["tokens"], batch["kinds"], batch.get("known")
+        net = self.net
+        tokens = batch["tokens"]
+        kinds = batch["kinds"]
+        known = batch.get("known")
         rows = torch.rand(len(tokens), device=tokens.device) < (self.forced if self.training else 1.0)
 
         def read(at: int, logits: Tensor) -> Tensor:
@@ -147,7 +155,8 @@ class Seq2SeqModule(StageModule):
         for kind, name in enumerate(net.names):
             values[f"accuracy_{name}"] = accuracy(logits, tokens, kinds, kind, known)
         if self.captioner is not None:
-            errors, said = self._inverse(batch, self.captioner.module), batch["said"]
+            errors = self._inverse(batch, self.captioner.module)
+            said = batch["said"]
             inverse = summed_or_mean(errors, said != PAD, self, summed=self.loss_config.summed)
             values["inverse"] = inverse
             values["loss"] = values["loss"] + self.loss_config.inverse_weight * inverse
@@ -155,9 +164,13 @@ class Seq2SeqModule(StageModule):
 
     def _inverse(self, batch: Batch, captioner: Captioner) -> Tensor:
         """The captioner's errors [B, W] at the words, of tokens that the model draws by itself."""
-        net, tokens, kinds, known = self.net, batch["tokens"], batch["kinds"], batch.get("known")
+        net = self.net
+        tokens = batch["tokens"]
+        kinds = batch["kinds"]
+        known = batch.get("known")
         # End where the clip ends; before it, any code.
-        legal, drawn = net.legal(tokens, kinds), list[Tensor]()
+        legal = net.legal(tokens, kinds)
+        drawn = list[Tensor]()
         end = tokens == net.ends[kinds]
         code = torch.arange(net.vocabulary, device=tokens.device) < net.ends[kinds][..., None]
         legal = torch.where(end[..., None], legal & ~code, legal & code)
@@ -201,7 +214,8 @@ class RankNorm(nn.Module):
 
     def __init__(self, channels: int, momentum: float = 0.1) -> None:
         super().__init__()
-        self.scale, self.shift = nn.Parameter(torch.ones(channels)), nn.Parameter(torch.zeros(channels))
+        self.scale = nn.Parameter(torch.ones(channels))
+        self.shift = nn.Parameter(torch.zeros(channels))
         self.momentum = momentum
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("var", torch.ones(channels))
@@ -209,7 +223,8 @@ class RankNorm(nn.Module):
     def forward(self, x: Tensor, there: Tensor) -> Tensor:
         """The same of x; padding, where `there` [B, 1, T] is 0, counts for nothing."""
         x = x.to(torch.promote_types(x.dtype, torch.float32))
-        mean, var = self.mean.to(x), self.var.to(x)
+        mean = self.mean.to(x)
+        var = self.var.to(x)
         if self.training:
             count = sum_over_ranks(there.sum().to(x))
             mean = sum_over_ranks_with_grad((x * there).sum((0, 2))) / count
@@ -234,7 +249,8 @@ class Critic(nn.Module):
         self.out = nn.Conv1d(width // 2, 1, 3, padding=1)
 
     def forward(self, motion: Tensor, length: Tensor) -> tuple[Tensor, Tensor]:
-        x, there = motion.transpose(1, 2), length_mask(length, motion.shape[1])[:, None]
+        x = motion.transpose(1, 2)
+        there = length_mask(length, motion.shape[1])[:, None]
         for down, norm in zip(self.down, self.norms, strict=True):
             there = there[..., ::2]
             # Behind a clip there are zeros again, as behind one that fills its window.

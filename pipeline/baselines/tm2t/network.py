@@ -98,9 +98,11 @@ class Attention(nn.Module):
     def __init__(self, config: CaptionerConfig) -> None:
         super().__init__()
         dim = config.dim
-        self.heads, self.rate = config.heads, config.attention_dropout
+        self.heads = config.heads
+        self.rate = config.attention_dropout
         self.query, self.key, self.value, self.out = (nn.Linear(dim, dim) for _ in range(4))
-        self.dropout, self.norm = nn.Dropout(config.dropout), LayerNorm(dim, eps=EPS)
+        self.dropout = nn.Dropout(config.dropout)
+        self.norm = LayerNorm(dim, eps=EPS)
 
     def read(self, x: Tensor) -> KeysValues:
         """Keys and values of x [B, S, D]."""
@@ -129,8 +131,10 @@ class Feed(nn.Module):
 
     def __init__(self, config: CaptionerConfig) -> None:
         super().__init__()
-        self.enter, self.leave = nn.Linear(config.dim, config.ff), nn.Linear(config.ff, config.dim)
-        self.dropout, self.norm = nn.Dropout(config.dropout), LayerNorm(config.dim, eps=EPS)
+        self.enter = nn.Linear(config.dim, config.ff)
+        self.leave = nn.Linear(config.ff, config.dim)
+        self.dropout = nn.Dropout(config.dropout)
+        self.norm = LayerNorm(config.dim, eps=EPS)
 
     def forward(self, x: Tensor) -> Tensor:
         out: Tensor = self.norm(x + self.dropout(self.leave(functional.relu(self.enter(x)))))
@@ -142,7 +146,8 @@ class EncoderLayer(nn.Module):
 
     def __init__(self, config: CaptionerConfig) -> None:
         super().__init__()
-        self.own, self.feed = Attention(config), Feed(config)
+        self.own = Attention(config)
+        self.feed = Feed(config)
 
     def forward(self, x: Tensor, mask: Tensor) -> Tensor:
         out: Tensor = self.feed(self.own(x, self.own.read(x), mask))
@@ -154,7 +159,9 @@ class DecoderLayer(nn.Module):
 
     def __init__(self, config: CaptionerConfig) -> None:
         super().__init__()
-        self.own, self.other, self.feed = Attention(config), Attention(config), Feed(config)
+        self.own = Attention(config)
+        self.other = Attention(config)
+        self.feed = Feed(config)
 
 
 @dataclass
@@ -187,7 +194,8 @@ class Captioner(TokenNetwork):
         self, config: CaptionerConfig, streams: Sequence[Stream], pattern: Sequence[str], words: int
     ) -> None:
         super().__init__(streams, pattern)
-        self.config, self.words = config, words
+        self.config = config
+        self.words = words
         self.max_groups = self._groups_within(config.block_size - 1, "block_size")
         """Longest clip in groups."""
         self.embeddings = self._tables(config.dim)
@@ -256,7 +264,8 @@ class Captioner(TokenNetwork):
         x = self._enter(self.word_table(words[:, None]), reading.length)
         for at, layer in enumerate(self.decoder):
             assert isinstance(layer, DecoderLayer)
-            pair, before = layer.own.read(x), reading.words[at]
+            pair = layer.own.read(x)
+            before = reading.words[at]
             if before is not None:
                 pair = torch.cat([before[0], pair[0]], dim=2), torch.cat([before[1], pair[1]], dim=2)
             reading.words[at] = pair

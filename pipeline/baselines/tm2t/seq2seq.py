@@ -85,15 +85,18 @@ class Seq2Seq(TokenNetwork):
         self, config: Seq2SeqConfig, streams: Sequence[Stream], pattern: Sequence[str], text_dim: int
     ) -> None:
         super().__init__(streams, pattern)
-        self.config, self.text_dim = config, text_dim
+        self.config = config
+        self.text_dim = text_dim
         self.max_groups = self._groups_within(config.max_tokens, "max_tokens")
         """Longest motion in groups."""
-        hidden, dim = config.reader, config.dim
+        hidden = config.reader
+        dim = config.dim
         self.text_in = nn.Linear(text_dim, hidden)
         self.reader, self.back = (nn.GRU(hidden, hidden, batch_first=True) for _ in range(2))
         self.first = nn.Parameter(torch.randn(2, 1, hidden))
         self.begin = nn.Linear(2 * hidden, dim)
-        self.query, self.value = nn.Linear(dim, dim), nn.Linear(2 * hidden, dim)
+        self.query = nn.Linear(dim, dim)
+        self.value = nn.Linear(2 * hidden, dim)
         self.key = nn.Linear(2 * hidden, dim, bias=False)
         self.fuse = nn.Sequential(nn.Linear(2 * dim, dim), LayerNorm(dim), nn.LeakyReLU(0.2))
         self.cell = nn.GRUCell(dim, dim)
@@ -134,7 +137,8 @@ class Seq2Seq(TokenNetwork):
             legal: Bool [B, L, V], what may be drawn.
         """
         read, state = self.read(text, mask)
-        x, out = self.start.expand(len(text), -1), []
+        x = self.start.expand(len(text), -1)
+        out = []
         for at in range(kinds.shape[1]):
             state = self.step(x, state, read)
             here = slice(at, at + 1)
@@ -153,11 +157,14 @@ def draw_tokens(
     net: Seq2Seq, text: Tensor, mask: Tensor, groups: Tensor | None, seeds: Sequence[int], how: Drawing
 ) -> Codes:
     """Tokens for captions [B, S, E], of `groups` [B] or until End; rows depend on their own seed alone."""
-    batch, device, size = len(text), text.device, len(net.pattern)
+    batch = len(text)
+    device = text.device
+    size = len(net.pattern)
     limit = requested_groups(groups, batch, most=net.max_groups, limit=net.max_groups, device=device)
     most = int(limit.max()) if batch else 0
     uniform = uniform_numbers(seeds, most * size, device)
-    start, before = torch.zeros(batch, 0, dtype=torch.int64, device=device), torch.zeros_like(limit)
+    start = torch.zeros(batch, 0, dtype=torch.int64, device=device)
+    before = torch.zeros_like(limit)
     first = net.start.expand(batch, 1, -1)
     rows = Rows(
         net, start, before, limit, first=first, uniform=uniform, free=groups is None, how=how, scale=None

@@ -113,7 +113,8 @@ class CaptionerStage(TrainedStage[CaptionerStageConfig, CaptionerInputs, Caption
     ) -> Example:
         longest = config.net.max_words
         words = torch.ones(batch, longest + 1, dtype=torch.int64)
-        tensors, frames = token_example(net, batch), net.max_groups * inputs.tokenizer.net.group_frames
+        tensors = token_example(net, batch)
+        frames = net.max_groups * inputs.tokenizer.net.group_frames
         count = tensors["tokens"].shape[1]
         return Example(tensors | {"text": words}, f"{count} tokens for {frames} frames, {longest} words")
 
@@ -198,7 +199,8 @@ class Seq2SeqStage(TrainedStage[Seq2SeqStageConfig, Seq2SeqInputs, Seq2Seq]):
     def batches(
         self, config: Seq2SeqStageConfig, net: Seq2Seq, inputs: Seq2SeqInputs, seed: int, log: Log
     ) -> Batches:
-        judge, text = _captioner(config, net, inputs), inputs.text.cache
+        judge = _captioner(config, net, inputs)
+        text = inputs.text.cache
 
         def numbers(clips: GptClips) -> dict[str, Tensor]:
             return _unlike(clips, torch.arange(len(clips.texts))[:, None])
@@ -231,7 +233,8 @@ def _clips(
     """Return what opens the captioned clips of a split with their tokens."""
 
     def clips_of(split: str) -> GptClips:
-        dataset, store = inputs.data.split(split), inputs.tokens.open(split)
+        dataset = inputs.data.split(split)
+        store = inputs.tokens.open(split)
         return gpt_clips(dataset, store, inputs.tokenizer.net, face=False, min_frames=config.min_frames)
 
     return clips_of

@@ -65,7 +65,9 @@ class Filling:
         overlap: int,
         guidance: float = 1.0,
     ) -> None:
-        self.net, self.known, self.recovery = net, known, recovery
+        self.net = net
+        self.known = known
+        self.recovery = recovery
         self.guidance = guidance
         frames = len(known.motion)
         self.size = min(window, frames)
@@ -84,7 +86,8 @@ class Filling:
 
     def __call__(self, seeds: Sequence[int], sampler: Sampler, steps: int) -> Tensor:
         """Return motions [n, T, D], normalised, one for each seed; known values are kept to the bit."""
-        known, schedule = self.known, self.net.config.schedule
+        known = self.known
+        schedule = self.net.config.schedule
         noise = [torch.Generator().manual_seed(seed) for seed in seeds]
         x = torch.stack([torch.randn(known.motion.shape, generator=one) for one in noise]).to(known.motion)
         with evaluating(self.net):
@@ -109,7 +112,8 @@ class Filling:
         rows = windows.flatten(0, 1)
         mask = torch.ones(rows.shape[:2], dtype=torch.bool, device=x.device)
         at = step.to(x.device).expand(len(rows))
-        text, observed = self.text.expand(len(rows), -1), self.observed.repeat(count, 1, 1)
+        text = self.text.expand(len(rows), -1)
+        observed = self.observed.repeat(count, 1, 1)
         conditioned = mask.new_full((len(rows),), self.conditioned)
         found = self.net(rows, at, text, mask, conditioned, observed)
         if self.guidance != 1.0 and self.conditioned:
@@ -168,7 +172,8 @@ class Filling:
         gaps in which they are carried, and the matrices [T, T] that spread the error at known frames over
         other free ones and that smooth the result.
         """
-        known, like = self.known.mask, self.known.motion
+        known = self.known.mask
+        like = self.known.motion
         one = torch.eye(len(known), dtype=torch.float64)
         bends = one.diff(n=2, dim=0)
         bending = bends.T @ bends
@@ -201,13 +206,16 @@ def _carried(predicted: Tensor, known: Tensor, gap: slice, legs: Tensor) -> Tens
     the shifts had to be: a Wiener filter, whose noise they are. So gaps of people unlike those of training
     are bridged rather by straight lines. Of columns of `legs`, bool [D], all is taken: half a step glides.
     """
-    before, after = known[:, gap.start - 1, None], known[:, gap.stop, None]
-    first, last = 2 * before - known[:, gap.start - 2, None], 2 * after - known[:, gap.stop + 1, None]
+    before = known[:, gap.start - 1, None]
+    after = known[:, gap.stop, None]
+    first = 2 * before - known[:, gap.start - 2, None]
+    last = 2 * after - known[:, gap.stop + 1, None]
     share = torch.linspace(0, 1, predicted.shape[1] + 2).to(known)[1:-1, None]
     shift = torch.lerp(first - predicted[:, :1], last - predicted[:, -1:], share)
     line = torch.lerp(before, after, share)
     added = predicted + shift - line
-    signal, noise = added.square().mean(1, keepdim=True), shift.square().mean(1, keepdim=True)
+    signal = added.square().mean(1, keepdim=True)
+    noise = shift.square().mean(1, keepdim=True)
     return line + added * torch.where(legs, 1.0, signal / (signal + noise).clamp(min=1e-12))
 
 
@@ -219,12 +227,15 @@ _DECAY = 3.0**-4
 
 def _places_of_window(places: Places, inside: slice) -> Places:
     """Return the places of a window, relative to its first known one."""
-    heading, place = places.heading[:, inside], places.place[:, inside]
-    heading_known, place_known = places.heading_known[:, inside], places.place_known[:, inside]
+    heading = places.heading[:, inside]
+    place = places.place[:, inside]
+    heading_known = places.heading_known[:, inside]
+    place_known = places.place_known[:, inside]
     both = heading_known & place_known
     first = (both if bool(both.any()) else place_known).byte().argmax(1)
     heading_known = heading_known.clone()
     heading_known[0, first] |= place_known[0, first]
-    angle, origin = heading[0, first], place[0, first]
+    angle = heading[0, first]
+    origin = place[0, first]
     relative = turned_back(place - origin, angle)
     return Places(first, heading - angle, relative, heading_known, place_known)

@@ -54,7 +54,8 @@ class Recovery:
         """Which columns are steps to the next frame, bool [D]."""
         self.legs = torch.from_numpy(legs[columns])
         """Which columns pose the legs or lead the root along the floor, bool [D]."""
-        self.mean, self.std = torch.from_numpy(mean[columns]), torch.from_numpy(std[columns])
+        self.mean = torch.from_numpy(mean[columns])
+        self.std = torch.from_numpy(std[columns])
 
     def way(self, features: Tensor, anchor: Tensor) -> tuple[Tensor, Tensor]:
         """Heading in radians [B, T], and z and x of the root in metres [B, T, 2], of normalised features
@@ -70,8 +71,10 @@ class Recovery:
 
 def turned_back(place: Tensor, heading: Tensor) -> Tensor:
     """Points (z, x) [..., 2] as a figure of that heading [...] sees them."""
-    cosine, sine = heading.cos(), heading.sin()
-    z, x = place[..., 0], place[..., 1]
+    cosine = heading.cos()
+    sine = heading.sin()
+    z = place[..., 0]
+    x = place[..., 1]
     return torch.stack([z * cosine + x * sine, x * cosine - z * sine], dim=-1)
 
 
@@ -91,7 +94,8 @@ class Places(NamedTuple):
 
     def columns(self) -> Tensor:
         """[B, T, 6], zero where nothing is known."""
-        turned, stood = self.heading_known[..., None], self.place_known[..., None]
+        turned = self.heading_known[..., None]
+        stood = self.place_known[..., None]
         facing = torch.stack([self.heading.cos(), self.heading.sin()], dim=-1)
         return torch.cat([self.place * stood, facing * turned, stood, turned], dim=-1)
 
@@ -113,7 +117,8 @@ def _piece_and_step(layout: MotionLayout, columns: NDArray[np.int64]) -> tuple[T
 
 
 def _of_pieces(pieces: Tensor, of: Tensor, steps: Tensor) -> Tensor:
-    of, steps = of.to(pieces.device), steps.to(pieces.device)
+    of = of.to(pieces.device)
+    steps = steps.to(pieces.device)
     # A step is known where both its frames are; a clip's last frame repeats the step before.
     following = torch.cat([pieces[:, 1:], pieces[:, -1:]], dim=1)
     both = pieces & following
@@ -158,7 +163,8 @@ class Observations:
 
     def _draw(self, length: Tensor, frames: int) -> tuple[Tensor, Tensor]:
         """Known pieces bool [B, T, P], and frames whose place is known beside them bool [B, T]."""
-        count, device = len(length), length.device
+        count = len(length)
+        device = length.device
         at = torch.arange(frames, device=device)
         inside = at < length[:, None]
 
@@ -177,7 +183,8 @@ class Observations:
         whole = torch.where(chance(0.75, 1), ends, single)
         # Parts of the figure in all frames or in those of the gap.
         some = torch.rand(count, len(PIECES), device=device) < torch.rand(count, 1, device=device)
-        by_frame, by_part = chance(0.75), chance(0.4)
+        by_frame = chance(0.75)
+        by_part = chance(0.4)
         pieces = (whole & by_frame[:, None])[..., None] | (some & by_part[:, None])[:, None]
         path = torch.where(chance(0.5, 1), torch.ones_like(single), single) & chance(0.25)[:, None]
         shown = inside & chance(self.share)[:, None]

@@ -83,7 +83,8 @@ def shown(motion: MotionData | ShownMotion, options: FigureOptions | None = None
         return motion
     if motion.figure is not None:
         return ShownMotion(motion, motion.figure)
-    options, layout = options or FigureOptions(), motion.layout
+    options = options or FigureOptions()
+    layout = motion.layout
     figure = fit_rigid(motion.joints, layout.skeleton, rotations=rotations_of(motion.features, layout))
     if not options.plant_feet:
         return ShownMotion(motion, figure)

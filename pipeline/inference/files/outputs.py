@@ -56,7 +56,8 @@ def write_motions(
     below. `figure` says how the shown figure follows the generated joints, and `say` is given a line on each
     motion that it is far from.
     """
-    folder, motions = Path(folder), list(motions)
+    folder = Path(folder)
+    motions = list(motions)
     require_folder(folder)
     require_formats(formats)
     options = figure or FigureOptions()
@@ -159,7 +160,8 @@ def page_title(captions: Sequence[str], sounds: Sequence[str] = (), script: Path
     """The script, or the words and the music where all motions have the same, else how many there are."""
     if script is not None:
         return f"Script {script.name}"
-    words, music = list(dict.fromkeys(filter(None, captions))), list(dict.fromkeys(sounds))
+    words = list(dict.fromkeys(filter(None, captions)))
+    music = list(dict.fromkeys(sounds))
     if len(words) > 1 or len(music) > 1:
         return f"{len(captions)} motions"
     return ", to ".join(words + music) or "Motion"

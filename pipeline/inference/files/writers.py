@@ -110,7 +110,8 @@ def write_npz(path: Path, outputs: Outputs) -> None:
     from motionloom.datasets.base.files import atomic_file
 
     [clip] = outputs.clips
-    figure, motion = clip.shown, clip.shown.motion
+    figure = clip.shown
+    motion = clip.shown.motion
     facts = {
         "caption": motion.caption,
         "face_caption": motion.face_caption,

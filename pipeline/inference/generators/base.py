@@ -66,7 +66,8 @@ class WholeMotion(StageGenerator):
 
     @torch.no_grad()
     def generate(self, request: GenerationRequest) -> list[NDArray[np.float32]]:
-        columns, stats = self.layout.part(self.part), self.given["stats"]
+        columns = self.layout.part(self.part)
+        stats = self.given["stats"]
         made = (
             torch.as_tensor(one).cpu().numpy() for one in self.normalised(request, request.lengths(self.who))
         )

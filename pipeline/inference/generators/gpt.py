@@ -63,7 +63,9 @@ class GptGenerator(OfTokens):
         """Lengths that are no whole groups are made of one group more, and cut. Of several candidates the
         one nearest to its text is kept.
         """
-        prior, reranker, count = self.prior(request), self.reranker, request.sampling.candidates
+        prior = self.prior(request)
+        reranker = self.reranker
+        count = request.sampling.candidates
         if reranker is None or count == 1:
             return self._drawn(prior, request.frames, request.seeds, request.sampling)
         out: list[NDArray[np.float32]] = []
@@ -71,7 +73,8 @@ class GptGenerator(OfTokens):
         for start in range(0, len(prior), at_once):
             rows = slice(start, start + at_once)
             frames = None if request.frames is None else repeated(request.frames[rows], count)
-            texts, seeds = prior[rows], candidate_seeds(request.seeds[rows], count)
+            texts = prior[rows]
+            seeds = candidate_seeds(request.seeds[rows], count)
             drawn = self._drawn(texts.repeat_interleave(count, dim=0), frames, seeds, request.sampling)
             out += nearest_candidates(reranker, texts, drawn)
         return out

@@ -39,7 +39,8 @@ def blend_to_idle(
     """
     if not any(idle):
         return motion
-    columns, out = layout.part(part), []
+    columns = layout.part(part)
+    out = []
     pose, posed, held = (values[columns] for values in _standing(layout))
     level = float(idle[0])
     place: NDArray[np.float32] | None = None
@@ -88,7 +89,8 @@ def _standing(layout: MotionLayout) -> tuple[NDArray[np.float32], NDArray[np.boo
         return frame, np.ones(layout.dim, dtype=bool), np.zeros(layout.dim, dtype=bool)
     out = np.zeros(layout.dim, dtype=np.float32)
     posed, held = np.zeros((2, layout.dim), dtype=bool)
-    pose, body = turns[1:].ravel(), 3 * (BODY_JOINTS - 1)
+    pose = turns[1:].ravel()
+    body = 3 * (BODY_JOINTS - 1)
     held[layout.slice("trans")] = True
     if layout.has("pose"):
         first = layout.slice("pose").start
@@ -98,5 +100,6 @@ def _standing(layout: MotionLayout) -> tuple[NDArray[np.float32], NDArray[np.boo
         held[layout.slice("root_orient")] = True
         fields = [(layout.slice("pose_body"), pose[:body]), (layout.slice("pose_hand"), pose[body:])]
     for columns, values in fields:
-        out[columns], posed[columns] = values, True
+        out[columns] = values
+        posed[columns] = True
     return out, posed, held

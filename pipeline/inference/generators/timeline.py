@@ -45,7 +45,8 @@ class TokenTimeline:
     @torch.no_grad()
     def tokens(self, stretches: Sequence[Stretch], seeds: Sequence[int], sampling: SamplingConfig) -> Codes:
         """Codes of all stretches, one after another; B rows, a seed each."""
-        utt, count = self.net.utt, len(seeds)
+        utt = self.net.utt
+        count = len(seeds)
         device = next(self.net.parameters()).device
         empty = torch.zeros(count, 0, dtype=torch.int64, device=device)
         made = Codes(dict.fromkeys(utt.names, empty), torch.zeros(count, dtype=torch.int64, device=device))
@@ -69,7 +70,9 @@ class TokenTimeline:
         sampling: SamplingConfig,
     ) -> Codes:
         """The timeline extended by `wanted` [B] groups."""
-        made, done, turn = before, torch.zeros_like(wanted), 0
+        made = before
+        done = torch.zeros_like(wanted)
+        turn = 0
         while bool((done < wanted).any()):
             rows = torch.nonzero(done < wanted)[:, 0]
             here = _rows(made, rows)

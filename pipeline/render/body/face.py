@@ -136,7 +136,8 @@ class ArkitBases:
             raise UserError(
                 f"the source basis has {count} values, but the expressions are {list(values.shape)}"
             )
-        shapes, source = self.arkit.reshape(len(ARKIT), -1), self.source.reshape(count, -1)
+        shapes = self.arkit.reshape(len(ARKIT), -1)
+        source = self.source.reshape(count, -1)
         gram = shapes @ shapes.T
         wanted = np.asarray(values, np.float64) @ (source @ shapes.T)
         return bounded_least_squares(gram, wanted)

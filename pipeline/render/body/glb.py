@@ -28,9 +28,13 @@ from motionloom.datasets.motion.skeleton import Skeleton
 from motionloom.pipeline.render.body.face import ARKIT, EXPRESSIONS
 from motionloom.pipeline.render.body.mesh import FIRST_OF_HEAD, Body, body_for, colours
 
-_FLOAT, _SHORT, _BYTE = 5126, 5123, 5121
-_VERTICES, _INDICES = 34962, 34963
-_NEAREST, _CLAMP = 9728, 33071
+_FLOAT = 5126
+_SHORT = 5123
+_BYTE = 5121
+_VERTICES = 34962
+_INDICES = 34963
+_NEAREST = 9728
+_CLAMP = 33071
 _STRIP = 16
 """Columns of the colours' picture: one a swatch."""
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
@@ -87,7 +91,8 @@ class _Scene:
 
         self.gltf = GLTF2(asset=Asset(version="2.0", generator="motionloom"), scene=0)
         self.blob = bytearray()
-        skeleton, count = body.skeleton, len(body.skeleton)
+        skeleton = body.skeleton
+        count = len(body.skeleton)
         self.lift = np.array([0.0, -float(body.vertices[:, 1].min()), 0.0])
         """From the body, whose pelvis is the origin, to one that stands on the floor at rest."""
         # Joints are nodes 0..N-1, in the skeleton's order.
@@ -161,7 +166,8 @@ class _Scene:
         if expressions:
             moves = body.shapes
             at_rest = [not move.any() for move in moves.values()]
-            still, zero = len(self.gltf.accessors), [0.0, 0.0, 0.0]
+            still = len(self.gltf.accessors)
+            zero = [0.0, 0.0, 0.0]
             if any(at_rest):  # shapes that move nothing share one accessor of zeros, which takes no room
                 count = int(chosen.sum())
                 self.gltf.accessors.append(
@@ -240,7 +246,8 @@ class _Scene:
 
 def _merged(joints: NDArray[np.int64], shares: Values) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Joints and shares [V, 4] where no joint is named twice, as stiff hands have it; shares sum to 1."""
-    joints, shares = joints.copy(), shares.astype(np.float32)
+    joints = joints.copy()
+    shares = shares.astype(np.float32)
     for k in range(1, 4):
         for first in range(k):
             same = joints[:, k] == joints[:, first]
@@ -279,7 +286,8 @@ def read_glb(path: Path) -> tuple[RigidMotion, float, str]:
             if accessor.componentType != _FLOAT:
                 raise ValueError("an animation of whole numbers")
             view = gltf.bufferViews[accessor.bufferView]
-            start, width = (view.byteOffset or 0) + (accessor.byteOffset or 0), _WIDTHS[accessor.type]
+            start = (view.byteOffset or 0) + (accessor.byteOffset or 0)
+            width = _WIDTHS[accessor.type]
             flat = np.frombuffer(blob, "<f4", accessor.count * width, start)
             if not np.isfinite(flat).all():
                 raise ValueError("numbers that are not finite")

@@ -69,7 +69,8 @@ def colours() -> NDArray[np.uint8]:
 def neutral_body(name: str = "smplx52") -> Body:
     """The body on `smplx52` or `smpl22`, whose hands are stiff."""
     raw = {key.removeprefix("near_"): value for key, value in asset().items() if key.startswith("near_")}
-    skeleton, whole = Skeleton.named(name), Skeleton.named("smplx52")
+    skeleton = Skeleton.named(name)
+    whole = Skeleton.named("smplx52")
     moves = np.zeros((len(raw["shapes"]), len(raw["places"]), 3))
     moves[:, raw["moving"].astype(np.int64)] = raw["moves"].swapaxes(0, 1) * raw["move_step"].astype(float)
     normals = raw["normals"].astype(np.float64)
@@ -126,7 +127,8 @@ def stretches(known: Skeleton, skeleton: Skeleton) -> Floats:
 
     Bones are stretched along themselves; across them counts the figure's size, for fingers their hand's.
     """
-    old, new = known.offsets, skeleton.offsets
+    old = known.offsets
+    new = skeleton.offsets
     parents = np.asarray(skeleton.parents)
     size = figure_size(known, skeleton)
     stretch = np.empty((len(skeleton), 3, 3))
@@ -136,7 +138,8 @@ def stretches(known: Skeleton, skeleton: Skeleton) -> Floats:
         if not len(ends):
             stretch[joint] = girth * np.eye(3)
             continue
-        before, after = old[ends], new[ends]
+        before = old[ends]
+        after = new[ends]
         # Least squares for the bones that begin here; the regulariser gives girth across them.
         firm = 0.02 * np.square(before).sum() / len(ends)
         stretch[joint] = np.linalg.solve(
@@ -147,7 +150,8 @@ def stretches(known: Skeleton, skeleton: Skeleton) -> Floats:
 
 def figure_size(known: Skeleton, skeleton: Skeleton) -> float:
     """Sum of all bone lengths over that of `known`."""
-    old, new = known.offsets, skeleton.offsets
+    old = known.offsets
+    new = skeleton.offsets
     return float(np.linalg.norm(new, axis=-1).sum() / np.linalg.norm(old, axis=-1).sum())
 
 
@@ -177,7 +181,9 @@ class Posing:
 def posing_of(joints: NDArray[np.floating], skeleton: Skeleton, figure: RigidMotion | None = None) -> Posing:
     """The body's pose at joints [T, N, 3] in metres; `figure` has their rotations, where they are known."""
     if figure is not None:
-        own, local, root = figure.skeleton, figure.rotations, figure.root
+        own = figure.skeleton
+        local = figure.rotations
+        root = figure.root
     else:
         own = skeleton.with_lengths_of(np.asarray(joints, np.float64))
         local = share_twist(joints_to_rotations(joints, own), own)

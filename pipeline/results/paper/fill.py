@@ -48,7 +48,9 @@ class Evaluation:
 
 def evaluations_of(run: Path, label: str, measures: Iterable[Measure]) -> list[Evaluation]:
     """All that a run has of `measures`, in the recipe's order; a `UserError` where it has none."""
-    stages, wanted, out = finished_records(run), tuple(measures), list[Evaluation]()
+    stages = finished_records(run)
+    wanted = tuple(measures)
+    out = list[Evaluation]()
     for stage in stages.values():
         if stage.kind in wanted and (stage.folder / FILE_NAME).is_file():
             require_consistent(run, [stage.name])
@@ -178,7 +180,8 @@ class _Filling:
     def _ours(self, row: Row, name: str, group: Sequence[tuple[Evaluation, StageRecord]]) -> FilledRow:
         """A row of our models: in each column the figure of the first evaluation that has measured it."""
         assert row.ours is not None
-        cells, models = list[Cell | None](), dict.fromkeys([name] if name else [])
+        cells = list[Cell | None]()
+        models = dict.fromkeys([name] if name else [])
         for column in self.table.columns:
             cell = None
             for one, model in group:

@@ -167,7 +167,8 @@ def _shared(things: Iterable[tuple[str, T]]) -> list[tuple[str, list[T]]]:
 
 def _titles(columns: Iterable[Column]) -> str:
     """Names of columns, the group's once: "R-Precision (32) Top1, Top2"."""
-    out, group = [], ""
+    out = []
+    group = ""
     for column in columns:
         out.append(column.name if column.group == group else column.title)
         group = column.group

@@ -41,7 +41,8 @@ def is_named(data_set: str, data: str) -> bool:
 
 def data_set_of(file: FigureFile, stage: StageRecord | None, known: Iterable[DataSet]) -> str:
     """The data set of a table that a run's data are: by name, else the first that has hands as they have."""
-    data, known = data_of(stage), list(known)
+    data = data_of(stage)
+    known = list(known)
     named = [one.name for one in known if is_named(one.name, data)]
     hands = file.of("reconstruction.mpjpe_hand") is not None
     return (named or [one.name for one in known if one.hands == hands] or [""])[0]
@@ -51,7 +52,8 @@ def differences(
     file: FigureFile, stage: StageRecord | None, table: PaperTable, shown: Sequence[Shown]
 ) -> list[Difference]:
     """Differences of the shown figures from the paper's protocol, and facts that it does not state."""
-    paper, data = table.measured, data_of(stage)
+    paper = table.measured
+    data = data_of(stage)
     # What, our value, the paper's, in the order in which they are told; unset ones of ours are left out.
     told: list[tuple[str, object, object]] = []
     if not any(is_named(name.split(" for ")[0], data) for name in paper.data.split(", ")):
@@ -85,7 +87,8 @@ def differences(
 
 def _repeats(figure: Figure) -> str | None:
     """Number of draws of motion, as the papers state it."""
-    repeats, decodings = figure.protocol.get("repeats"), decodings_of(figure.protocol)
+    repeats = figure.protocol.get("repeats")
+    decodings = decodings_of(figure.protocol)
     if repeats is None or decodings == 1:
         return None if repeats is None else str(repeats)
     return f"{repeats} of tokens, {decodings} of motion for each"

@@ -108,7 +108,8 @@ def _job(plan: LaunchPlan, group: Group, options: ClusterOptions, before: set[st
 
 
 def _pod(plan: LaunchPlan, group: Group, options: ClusterOptions) -> dict[str, Any]:
-    machines, mounts = group.machines, yaml.safe_load(_MOUNTS)
+    machines = group.machines
+    mounts = yaml.safe_load(_MOUNTS)
     pod: dict[str, Any] = yaml.safe_load(_POD)
     image, claim = options.require_given("image", "volume")
     pod["volumes"][0]["persistentVolumeClaim"] = {"claimName": claim}

@@ -191,7 +191,8 @@ def _jobs(recipe: Recipe, options: ClusterOptions, nodes: int, gpus: int) -> lis
         above[stage.name] = {*own, *(name for source in own for name in above[source])}
         direct = {place[name] for name in own}
         before = direct.union(*(jobs[at].before for at in direct))
-        trains, shares = stage.kind.trains, stage.kind.shares
+        trains = stage.kind.trains
+        shares = stage.kind.shares
         new = _Job(
             light=not (trains or shares),
             gpu=gpus > 0
@@ -215,7 +216,8 @@ def _jobs(recipe: Recipe, options: ClusterOptions, nodes: int, gpus: int) -> lis
             if fits:
                 break
         else:
-            at, job = len(jobs), new
+            at = len(jobs)
+            job = new
             jobs.append(job)
         job.stages.append(stage)
         place[stage.name] = at

@@ -27,7 +27,8 @@ def pipeline(plan: LaunchPlan, options: ClusterOptions) -> str:
 
 
 def _task(plan: LaunchPlan, group: Group, options: ClusterOptions) -> dict[str, Any]:
-    machines, nodes = group.machines, group.machines.nodes * group.parts
+    machines = group.machines
+    nodes = group.machines.nodes * group.parts
     if options.bucket and nodes > 1:  # machines would see each other's files too late
         raise UserError(f"group {group.name} needs {nodes} machines, and a bucket serves one: give a volume")
     resources: dict[str, Any] = {

@@ -143,7 +143,8 @@ def _planned(
     plan: LaunchPlan, options: ClusterOptions, dry_run: bool, console: Console
 ) -> list[PlannedStage]:
     """What is to be made in a run folder; refuses what its run would refuse, and time limits too short."""
-    run, rows = Path(plan.out), list[PlannedStage]()
+    run = Path(plan.out)
+    rows = list[PlannedStage]()
     require_folder(run)
     try:
         rows = make_plan(plan.recipe, run, go_on=plan.go_on)
@@ -164,7 +165,8 @@ def _planned(
 def _what_is_missing(plan: LaunchPlan, planned: Sequence[PlannedStage]) -> LaunchPlan:
     """The plan with those parts alone that an earlier launch has not finished."""
     begun = {row.stage.name for row in planned if row.action == "resume"}
-    run, groups = Path(plan.out), list[Group]()
+    run = Path(plan.out)
+    groups = list[Group]()
     for group in plan.groups:
         if group.parts > 1 and begun.issuperset(group.stages):
             left = [missing_parts(stage_folder(run, name) / SHARDS, group.parts) for name in group.stages]
@@ -196,7 +198,8 @@ def slurm_scripts(
 
     An array of more parts than the cluster allows is several, each of which counts from 1.
     """
-    rows, most = len(plans), _most_jobs()
+    rows = len(plans)
+    most = _most_jobs()
     if rows > most:
         raise UserError(f"--sweep has {rows} rows and an array of this cluster at most {most}; launch fewer")
     scripts = []
@@ -343,7 +346,8 @@ def _directive(name: str, value: str | None) -> str:
 
 
 def _command(plan: LaunchPlan, group: Group, options: ClusterOptions, recipe: Path) -> Sequence[str]:
-    command, machines = plan.command(group, str(recipe), PROGRAM), group.machines
+    command = plan.command(group, str(recipe), PROGRAM)
+    machines = group.machines
     if machines.nodes * machines.processes == 1:
         return command
     task_options = [f"--nodes={machines.nodes}", f"--ntasks-per-node={machines.processes}"]

@@ -20,7 +20,8 @@ from motionloom.pipeline.store.data import SHARDS
 
 def _stage_config(kind: type[AnyConverter]) -> type[StageConfig]:
     """A class that stands in this module, so that worker processes of a conversion can unpickle it."""
-    name, bases = f"{kind.__name__}StageConfig", (kind.config_class, StageConfig)
+    name = f"{kind.__name__}StageConfig"
+    bases = (kind.config_class, StageConfig)
     stage_config = type(name, bases, {"__doc__": kind.summary, "__module__": __name__})
     globals()[name] = stage_config
     return stage_config
@@ -45,7 +46,8 @@ class ConvertStage(DataStage):
     def convert(self, context: StageContext) -> None:
         """Convert the source into the stage's folder."""
         out = context.folder / SHARDS
-        workers, part = context.hardware.convert_workers, context.hardware.part
+        workers = context.hardware.convert_workers
+        part = context.hardware.part
         shown = not context.console.quiet
         conversion = prepare(context.config, kind=self.converter, out=out, workers=workers, progress=shown)
         manifest = run_conversion(

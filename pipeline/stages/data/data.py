@@ -44,7 +44,8 @@ class DataStage(FunctionStage):
         """The layout, as the config says or as existing shards are."""
         if isinstance(config, ShardsStageConfig):
             return DataPreview(config.found_layout())
-        name, fps = getattr(config, "layout", None), getattr(config, "fps", None)
+        name = getattr(config, "layout", None)
+        fps = getattr(config, "fps", None)
         if name is None:
             raise UserError(
                 f"the layout of the data is not known; set the layout of a stage of kind {self.name} to see "
@@ -134,7 +135,8 @@ def run_synth(context: StageContext) -> None:
 def run_shards(context: StageContext) -> None:
     """Point at existing shards, after checking them."""
     config: ShardsStageConfig = context.config
-    (manifest, _), place = config.manifest(), config.place
+    (manifest, _) = config.manifest()
+    place = config.place
     if config.verify and not is_url(place):
         problems = check(Path(place))
         if problems:

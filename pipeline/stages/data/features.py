@@ -53,7 +53,9 @@ class FeaturesStage(StageKind[FeaturesConfig]):
 
     def __init__(self, modality: Modality) -> None:
         assert modality.width is not None
-        self.name, self.modality, self.width = modality.name, modality, modality.width
+        self.name = modality.name
+        self.modality = modality
+        self.width = modality.width
         self.summary = f"statistics of {modality.name} features"
         self.file = f"{modality.name}.safetensors"
 

@@ -128,7 +128,8 @@ class TextStage(StageKind[TextConfig]):
         from motionloom.pipeline.store.data import captions_of
 
         keep_place(context.config.encoder, context.folder)
-        data, actions = context.given["data"], set[str]()
+        data = context.given["data"]
+        actions = set[str]()
         said = defaultdict[tuple[Split, bool], set[str]](set)
         for split in data.splits:
             dataset = data.split(split)

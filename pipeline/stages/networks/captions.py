@@ -62,7 +62,8 @@ class CaptionStage(TrainedStage[C, I, N]):
         return clip_batches(inputs.data, inputs.stats, {"text": inputs.text.cache}, seed, clips=clips)
 
     def example(self, config: C, net: N, inputs: I, batch: int) -> Example:
-        frames, width = config.max_frames, inputs.text.dim
+        frames = config.max_frames
+        width = inputs.text.dim
         dim = len(part_columns(inputs.data.layout, config.part))
         conditions = {"text": MODALITIES["text"].example(batch, frames, width)}
         similarity = torch.empty(batch, width)
@@ -90,7 +91,8 @@ def joint_loss_settings(
     layout: MotionLayout, part: Part, stats: FeatureStats | None, loss: Config
 ) -> dict[str, object]:
     """Return what a `JointsModule` takes of one part's columns; a dry run has no statistics."""
-    columns, known = part_columns(layout, part), stats or FeatureStats.unit(layout)
+    columns = part_columns(layout, part)
+    known = stats or FeatureStats.unit(layout)
     return {"layout": layout, "mean": known.mean[columns], "std": known.std[columns], "loss": loss}
 
 

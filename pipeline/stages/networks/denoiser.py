@@ -52,5 +52,6 @@ class DenoiserStage(CaptionStage[D, CaptionInputs, T]):
         return self.denoiser(config, facts.fact("motion_dim", int), facts.fact("text_dim", int))
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
-        net, part = self.load(stage, given, device), part_of(load_facts(stage.folder))
+        net = self.load(stage, given, device)
+        part = part_of(load_facts(stage.folder))
         return DiffusionMotion(given["stats"].layout, part, given, net)

@@ -67,7 +67,8 @@ class DmdStage(TrainedStage[DmdStageConfig, DmdInputs, Dmd]):
         return {"tokenizer": inputs.tokenizer.net}
 
     def batches(self, config: DmdStageConfig, net: Dmd, inputs: DmdInputs, seed: int, log: Log) -> Batches:
-        columns, window = inputs.tokenizer.columns, config.window
+        columns = inputs.tokenizer.columns
+        window = config.window
         return window_batches(
             config, inputs, columns, seed, batch_size=32, max_frames=window, min_frames=GROUP_FRAMES
         )

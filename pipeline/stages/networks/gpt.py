@@ -139,7 +139,9 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
     ) -> Batches:
         from motionloom.pipeline.store.tokens import gpt_clips
 
-        data, text, tokenizer = inputs.data, inputs.text.cache, inputs.tokenizer.net
+        data = inputs.data
+        text = inputs.text.cache
+        tokenizer = inputs.tokenizer.net
         # TMA's text latents are the prior, or the target of L_align, or both.
         tma = inputs.tma if config.prior == "tma" or config.aligned else None
 
@@ -157,7 +159,8 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
             # All captions are embedded once, before the first batch.
             latents = tma.embed_captions(clips.texts, text) if tma is not None else None
             if config.prior == "tma" and latents is not None:
-                prior, latents = latents, None
+                prior = latents
+                latents = None
             else:
                 prior = torch.as_tensor(text.sentence(clips.texts))
             similarity = torch.as_tensor(text.similarity(clips.texts))
@@ -176,7 +179,9 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
         """The longest sequences; samples that are judged are so many more rows."""
         if config.aligned_on_samples:
             batch *= 1 + config.loss.samples
-        tokenizer, groups, ends = inputs.tokenizer.net, net.max_groups, len(net.names)
+        tokenizer = inputs.tokenizer.net
+        groups = net.max_groups
+        ends = len(net.names)
         tensors = token_example(net, batch)
         length = tensors["tokens"].shape[1]
         tensors["text"] = torch.empty(batch, net.text_dim)
@@ -199,7 +204,8 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
 
 def require_own_text(stage: Stage, others: Mapping[str, Stage]) -> None:
     """A TMA must be given captions by the encoder that it was trained on."""
-    tma, own = others.get(stage.inputs.get("tma", "")), stage.inputs.get("text", "")
+    tma = others.get(stage.inputs.get("tma", ""))
+    own = stage.inputs.get("text", "")
     other = tma.inputs.get("text", "") if tma is not None else own
     if not same_encoder(own, other, others):
         raise UserError(

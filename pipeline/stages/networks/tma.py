@@ -102,7 +102,8 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
         return ModelFacts.of(self.name, config.net, layout, extra)
 
     def network(self, facts: ModelFacts, inputs: TmaInputs) -> Tma:
-        layout, part = facts.layout.layout(), part_of(facts)
+        layout = facts.layout.layout()
+        part = part_of(facts)
         if not layout.has_part(part):
             raise UserError(f"{facts.where}: layout {layout.name} has no {part} columns; run the stage again")
         config = TmaConfig.parse(facts.config, facts.where)
@@ -113,11 +114,13 @@ class TmaStage(CaptionStage[TmaStageConfig, TmaInputs, Tma]):
         if inputs.start is not None:
             net.load_state_dict(inputs.start.net.state_dict())
         elif net.basis is not None:
-            columns, stats = part_columns(inputs.data.layout, config.part), inputs.stats
+            columns = part_columns(inputs.data.layout, config.part)
+            stats = inputs.stats
             net.basis.learn(stats.mean[columns], stats.std[columns])
 
     def loaded(self, net: Tma, facts: ModelFacts, inputs: TmaInputs) -> LoadedTma:
-        frames, part = facts.fact("max_frames", int), part_of(facts)
+        frames = facts.fact("max_frames", int)
+        part = part_of(facts)
         return LoadedTma(net, facts.layout.layout(), frames, part, inputs)
 
     def generator(self, stage: CompletedStage, given: Inputs, device: torch.device) -> MotionGenerator:
@@ -138,7 +141,8 @@ class VaeMotion(WholeMotion):
         """The latent is drawn from the text's Gaussian; temperature scales its width. Of a network that
         writes every n-th frame, those between are on the straight line.
         """
-        device, net = self.tma.device, self.tma.net
+        device = self.tma.device
+        net = self.tma.net
         text = request.text(self.who)
         mu, logvar = net.encode_text(text.features.to(device), text.mask.to(device))
         draws = [torch.Generator().manual_seed(seed) for seed in request.seeds]

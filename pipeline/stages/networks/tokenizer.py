@@ -98,7 +98,9 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
     exports = ("stats",)
 
     def __init__(self, name: str, summary: str, config: type[TokenizerStageConfig]) -> None:
-        self.name, self.summary, self.config = name, summary, config
+        self.name = name
+        self.summary = summary
+        self.config = config
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """A tokenizer that it starts from must be the same network over equally normalised motion."""
@@ -119,7 +121,8 @@ class TokenizerStage(TrainedStage[TokenizerStageConfig, TokenizerInputs, Tokeniz
         if inputs.start is not None:
             net.load_state_dict(inputs.start.net.state_dict())
             return
-        columns, stats = net.columns.numpy(), inputs.stats
+        columns = net.columns.numpy()
+        stats = inputs.stats
         net.basis.learn(stats.mean[columns], stats.std[columns])
 
     def batches(
@@ -147,8 +150,10 @@ def window_batches(
     from motionloom.datasets.loading.batches import WindowBatches
     from motionloom.datasets.loading.condition_batches import EvalBatches
 
-    data, stats = inputs.data, inputs.stats
-    dataset, window = data.split("train"), config.window
+    data = inputs.data
+    stats = inputs.stats
+    dataset = data.split("train")
+    window = config.window
 
     def train(batch: int, share: Share) -> Dataset[object]:
         return WindowBatches(

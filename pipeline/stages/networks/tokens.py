@@ -74,7 +74,8 @@ class TokensStage(StageKind[TokensConfig]):
 
         for encoded in self._splits(context):
             sizes = [len(items) for items in encoded.batches]
-            split, total = encoded.dataset.split, context.units.mine(sizes)
+            split = encoded.dataset.split
+            total = context.units.mine(sizes)
             with Meter(f"tokens {split}", total, console=context.console) as meter:
                 context.units.make(
                     split,
@@ -85,7 +86,8 @@ class TokensStage(StageKind[TokensConfig]):
 
     def run(self, context: StageContext) -> None:
         for encoded in self._splits(context):
-            split, count = encoded.dataset.split, len(encoded.dataset)
+            split = encoded.dataset.split
+            count = len(encoded.dataset)
             store = encoded.store(context.units.read(split, len(encoded.batches)))
             store.save(context.folder / f"tokens-{split}.safetensors")
             whole = store.whole_clips()
@@ -133,7 +135,9 @@ class EncodedSplit:
     def __init__(
         self, tokenizer: Tokenizer, dataset: ClipDataset, stats: FeatureStats, batch_frames: int
     ) -> None:
-        self.tokenizer, self.dataset, self.stats = tokenizer, dataset, stats
+        self.tokenizer = tokenizer
+        self.dataset = dataset
+        self.stats = stats
         unit = tokenizer.group_frames
         self.groups = np.maximum(np.asarray(dataset.frames) // unit, 1)
         self.batches = _by_length(self.groups, batch_frames // unit)
@@ -142,7 +146,8 @@ class EncodedSplit:
 
     def codes(self, batch: int) -> Arrays:
         """Codes int64 [B, G * per_group] of one batch, by stream."""
-        items, device = self.batches[batch], device_of(self.tokenizer)
+        items = self.batches[batch]
+        device = device_of(self.tokenizer)
         motion, length = padded(self.tokenizer, self.dataset, self.stats, items)
         mask = torch.from_numpy(self._present[self.dataset.present[items]])
         found = self.tokenizer.encode(motion.to(device), length.to(device), mask.to(device))
@@ -158,7 +163,8 @@ class EncodedSplit:
         for items, found in zip(self.batches, codes, strict=True):
             for row, item in enumerate(items.tolist()):
                 for name, n in per_group.items():
-                    begin, count = int(starts[item]) * n, int(self.groups[item]) * n
+                    begin = int(starts[item]) * n
+                    count = int(self.groups[item]) * n
                     flat[name][begin : begin + count] = torch.from_numpy(found[name][row, :count])
         whole = np.asarray(self._present.all(axis=1))
         return TokenStore(flat, starts, per_group, whole[self.dataset.present])
@@ -217,7 +223,8 @@ def padded(
 
     Columns that a clip does not hold are as stored: the tokenizer is told which ones.
     """
-    unit, columns = tokenizer.group_frames, tokenizer.columns.cpu().numpy()
+    unit = tokenizer.group_frames
+    columns = tokenizer.columns.cpu().numpy()
     lengths = [max(int(dataset.frames[i]) // unit, 1) * unit for i in items]
     motion = torch.zeros(len(items), max(lengths), len(columns))
     for row, (item, length) in enumerate(zip(items.tolist(), lengths, strict=True)):

@@ -38,7 +38,8 @@ class UdeStage(StageKind[UdeConfig]):
 
     def check(self, stage: Stage, others: Mapping[str, Stage]) -> None:
         """Both halves must speak of the same tokens, and the context must leave room in a window."""
-        utt, dmd = others.get(stage.inputs.get("utt", "")), others.get(stage.inputs.get("dmd", ""))
+        utt = others.get(stage.inputs.get("utt", ""))
+        dmd = others.get(stage.inputs.get("dmd", ""))
         if utt is None:
             return
         if dmd is not None and utt.inputs.get("tokenizer") != dmd.inputs.get("tokenizer"):

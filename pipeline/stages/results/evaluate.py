@@ -92,7 +92,8 @@ class _Evaluation(EvaluationUnits):
 
     def measured(self) -> FigureFile:
         """All figures, each beside its reference baselines; `cases.safetensors` is written beside them."""
-        context, split = self.context, self.dataset.split
+        context = self.context
+        split = self.dataset.split
         figures = self.reconstruction()
         if not self.truths and not figures:
             raise UserError(
@@ -165,7 +166,8 @@ class _Evaluation(EvaluationUnits):
 
     def by_judges(self, made: Sequence[Arrays]) -> list[Figure]:
         """Figures by the latents of each judge."""
-        config, out = self.config, list[Figure]()
+        config = self.config
+        out = list[Figure]()
         for role, judge in self.performed_by.items():
             truths = judge.judged(self.truths)
             others = judge.judged(self.others)

@@ -41,7 +41,10 @@ class _CaptionEvaluation(Evaluation):
 
     def measured(self) -> FigureFile:
         """Figures of the captioner's sentences, of another person's and of captions that need none."""
-        context, config, given, dataset = self.context, self.config, self.context.given, self.dataset
+        context = self.context
+        config = self.config
+        given = self.context.given
+        dataset = self.dataset
         captioner = context.stage_cache.captioner(context.inputs[CAPTIONER])
         chosen = [(clip, truth_of(dataset, clip)) for clip in spread(dataset, config.clips)]
         chosen = [(clip, truth) for clip, truth in chosen if len(truth.features) >= captioner.min_frames]

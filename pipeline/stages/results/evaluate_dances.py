@@ -138,7 +138,9 @@ class _DanceEvaluation(Evaluation):
     @cached_property
     def protocol(self) -> dict[str, Fact]:
         """Return the settings behind the figures, but for the seed."""
-        config, clips, maker = self.config, self.clips, self.bundle.generator
+        config = self.config
+        clips = self.clips
+        maker = self.bundle.generator
         return {
             "split": self.dataset.split,
             "clips": len(clips),
@@ -169,7 +171,8 @@ class _DanceEvaluation(Evaluation):
 
     def baselines(self) -> dict[str, list[list[Joints]]]:
         """Dances that need no model, once or several times."""
-        clips, pool = self.clips, self._dances(self.train, self.config.pool, unit=1)
+        clips = self.clips
+        pool = self._dances(self.train, self.config.pool, unit=1)
         real = [clip.joints for clip in clips]
         rng = np.random.default_rng([self.context.seed, 17])
         out = {

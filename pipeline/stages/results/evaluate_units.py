@@ -161,7 +161,8 @@ class EvaluationUnits(Evaluation):
             for judge in self.performed_by.values():
                 # Captions that it cannot read are refused before anything is made.
                 judge.texts(judge.judged(self.truths))
-        slices, pieces = self.slices, self.performances
+        slices = self.slices
+        pieces = self.performances
         self.make(
             "reconstructed",
             "reconstructing",
@@ -198,7 +199,8 @@ class EvaluationUnits(Evaluation):
         bodies = [reconstruct_truth(tokenizer, truth) for truth in truths]
         pairs = list(zip(truths, bodies, strict=True))
         out = as_table([clip_errors(tokenizer, self._nearest, truth, body) for truth, body in pairs], JOINTS)
-        fps, layout = self.dataset.layout.fps, tokenizer.layout
+        fps = self.dataset.layout.fps
+        layout = tokenizer.layout
         shown = [Performance(joints_of(body, layout), t.joints, fps, t.face, t.truth) for t, body in pairs]
         out |= as_table([measure_clip(metrics_of("captions"), one) for one in shown], CLIP)
         out[DISTANCES] = np.stack([joint_distances(one.joints, one.recorded) for one in shown])
@@ -225,7 +227,8 @@ class EvaluationUnits(Evaluation):
     def perform(self, draw: int, piece: slice) -> Arrays:
         """Motions for the captions of some clips, as latents and by whether they do what is said."""
         assert self.bundle is not None
-        truths, fps = self.truths[piece], self.dataset.layout.fps
+        truths = self.truths[piece]
+        fps = self.dataset.layout.fps
         recorded = self.config.lengths == "recorded"
         seed, noise_seed = self.seeds(draw, piece.start)
         request = Request.of(
@@ -247,7 +250,8 @@ class EvaluationUnits(Evaluation):
         if draw == 0:
             out |= as_shown(made_for)
         for role, judge in self.performed_by.items():
-            faces, pairs = judge.of_faces, zip(truths, motions, strict=True)
+            faces = judge.of_faces
+            pairs = zip(truths, motions, strict=True)
             shown = [
                 (t, m.face if faces else m.features) for t, m in pairs if t.face is not None or not faces
             ]

@@ -86,7 +86,8 @@ class Evaluation:
     """One evaluation; the clips are the same in every process."""
 
     def __init__(self, context: StageContext) -> None:
-        self.context, self.config = context, context.config
+        self.context = context
+        self.config = context.config
         data = context.given["data"]
         self.dataset: ClipDataset = data.held_out(prefer="test")
         self.train: ClipDataset = data.split("train")
@@ -151,7 +152,8 @@ class Evaluation:
         slices = even_slices(len(motions), _REFERENCE)
 
         def features(number: int) -> Arrays:
-            layout, some = self.dataset.layout, motions[slices[number]]
+            layout = self.dataset.layout
+            some = motions[slices[number]]
             bodies = (np.asarray(data.motion(k))[:, layout.part("bodyhand")] for data, k in some)
             return dict(all_features((joints_of(x, layout) for x in bodies), layout.fps))
 

@@ -65,7 +65,8 @@ class GenerateStage(StageKind):
         from motionloom.pipeline.inference.files.outputs import page_note, write_motions
 
         config: GenerateConfig = context.config
-        (said, notes), danced = _performed(context), _danced(context)
+        (said, notes) = _performed(context)
+        danced = _danced(context)
         if not said and not danced:
             raise UserError(
                 f"stage '{context.name}': nothing to generate from: no held-out clip has a caption or music "
@@ -95,7 +96,9 @@ def _performed(context: StageContext) -> tuple[list[GeneratedMotion], list[list[
     """Motions for the captions of the config, or of held-out clips, and what each does not show."""
     config: GenerateConfig = context.config
     bundle = bundle_driven_by("text", context.every("generators"), context.stage_cache)
-    seconds, seed, sampling = config.seconds, context.seed, config.sampling
+    seconds = config.seconds
+    seed = context.seed
+    sampling = config.sampling
     if bundle is None:
         if config.captions:
             raise UserError(

@@ -82,11 +82,14 @@ class ReportStage(StageKind):
         """Write `report.html`; of an unfinished run, what there is of it."""
         state = None if context.again is None else run_state(context.again)
         partial = state is not None and bool(state.unfinished)
-        said, danced, subtitle = [], [], "of a run that has not finished its data"
+        said = []
+        danced = []
+        subtitle = "of a run that has not finished its data"
         if "data" in context.inputs:
             dataset = context.given["data"].held_out(prefer="test")
             subtitle = f"{len(dataset)} clips of the {dataset.split} split were never trained on"
-            said, danced = _captioned(context, dataset), _danced(context, dataset)
+            said = _captioned(context, dataset)
+            danced = _danced(context, dataset)
             if not said and not danced and not partial:
                 raise UserError(
                     f"{dataset.where}: no clip of split '{dataset.split}' has a caption or its sound to be "
@@ -181,9 +184,11 @@ def _danced(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
     if not config.dances or not with_music(dataset).any():
         return []
     bundle = _bundle(context, "audio")
-    unit, longest = GROUP_FRAMES, config.dance_seconds
+    unit = GROUP_FRAMES
+    longest = config.dance_seconds
     if bundle is not None:
-        unit, longest = math.lcm(unit, bundle.generator.unit_frames), min(longest, bundle.max_seconds)
+        unit = math.lcm(unit, bundle.generator.unit_frames)
+        longest = min(longest, bundle.max_seconds)
     clips = dances_of(dataset, config.dances, unit=unit, seconds=longest)
     if bundle is not None:
         clips = [clip for clip in clips if len(clip.joints) > seed_frames(bundle)]
@@ -193,7 +198,8 @@ def _danced(context: StageContext, dataset: ClipDataset) -> list[ViewerMotion]:
     out = []
     for number, (clip, motion) in enumerate(zip(clips, made, strict=True), start=1):
         truth = truth_at(dataset, clip.index, len(clip.joints))
-        words, group = f"dance to {clip.title}", f"dance {number}"
+        words = f"dance to {clip.title}"
+        group = f"dance {number}"
         out += _rows(context, truth, motion, words, group, clip.score())
     return out
 
@@ -202,12 +208,14 @@ def _rows(
     context: StageContext, truth: Truth, made: GeneratedMotion | None, words: str, group: str, score: Score
 ) -> list[ViewerMotion]:
     """A clip, what the tokenizer keeps of it, and what was made instead."""
-    tokenizer, face_tokenizer = context.given.get("tokenizer"), context.given.get("face_tokenizer")
+    tokenizer = context.given.get("tokenizer")
+    face_tokenizer = context.given.get("face_tokenizer")
     layout = context.given["data"].layout
     face = None if truth.face is None else synthetic_face_controls(truth.face)
     rows = [("recorded", truth.joints, face)]
     if tokenizer is not None:
-        again, kept = face, reconstruct_all(tokenizer, truth)
+        again = face
+        kept = reconstruct_all(tokenizer, truth)
         if truth.face is not None and face_tokenizer is not None:
             again = synthetic_face_controls(face_tokenizer.reconstruct(truth.face))
         elif truth.face is not None and np.isin(layout.part("face"), tokenizer.columns).all():

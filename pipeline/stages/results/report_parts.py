@@ -57,7 +57,8 @@ def draw_showings(page: Page, heading: str, shown: Sequence[Showing], *kinds: ty
         elif isinstance(thing, Clips):
             page.add_subheading(thing.title).add_viewer(thing.motions)
         elif isinstance(thing, Bars):
-            uses, ends = {thing.y_label: thing.values}, (0, len(thing.values))
+            uses = {thing.y_label: thing.values}
+            ends = (0, len(thing.values))
             page.add_histogram(uses, ends, thing.title, thing.x_label, thing.y_label)
 
 
@@ -102,10 +103,12 @@ def _draw_samples(page: Page, stage: CompletedStage) -> None:
     rows = read_rows(folder / SAMPLE_FIGURES)
     for name in sorted({key.partition("/")[2] for row in rows for key in row if "/" in key}):
         page.add_plot(log_lines(rows, name, "samples", splits=("drawn", "recorded")), f"{stage.name}: {name}")
-    step, motions = int(rows[-1]["step"]) if rows else 0, []
+    step = int(rows[-1]["step"]) if rows else 0
+    motions = []
     for path in sorted(folder.glob(f"step={step:08d}/*.npz")):
         with NpzFile(path) as stored:
-            facts, joints = parse_json(str(stored.array("metadata")), str(path)), stored.numbers("joints")
+            facts = parse_json(str(stored.array("metadata")), str(path))
+            joints = stored.numbers("joints")
         parents = Skeleton.named(facts["skeleton"]).parents
         motions.append(ViewerMotion(joints, facts["fps"], parents, f"step {step:,}", facts["caption"]))
     if motions:
@@ -215,7 +218,8 @@ def _data(page: Page, data: Data) -> None:
             continue
         clips = data.split(split)
         minutes = float(clips.frames.sum()) / clips.layout.fps / 60
-        said, music = int(clips.has("texts.json").sum()), int(clips.has("audio.flac").sum())
+        said = int(clips.has("texts.json").sum())
+        music = int(clips.has("audio.flac").sum())
         rows.append([split, f"{len(clips):,}", f"{minutes:,.1f}", f"{said:,}", f"{music:,}"])
     layout = data.layout
     page.add_table(

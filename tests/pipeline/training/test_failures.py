@@ -255,7 +255,8 @@ def test_every_stage_runs_on_a_second_device(
     watch = Watch()
     monkeypatch.chdir(tmp_path)
     Path("others.yaml").write_text(OTHERS)
-    monkeypatch.setattr(execution, "strategy_of", lambda *_: SingleDeviceStrategy(SECOND, Anywhere()))
+    monkeypatch.setattr(execution, "strategy_of", lambda *_: SingleDeviceStrategy(SECOND))
+    monkeypatch.setattr(Hardware, "lightning_accelerator", lambda self: Anywhere())
     monkeypatch.setattr(Hardware, "device", lambda self: SECOND)
     watch.follow(monkeypatch)
     with second_device(watch):
