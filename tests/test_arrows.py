@@ -47,8 +47,12 @@ def imports(path: Path) -> set[str]:
             base = node.module or ""
             names.update(f"{base}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            # A module named in a text is imported by it, or is nobody's business.
-            names |= {node.value.partition(":")[0]} if MODULE.fullmatch(node.value) else set()
+            # A module named in a text is imported by it; a group of entry points is none.
+            named = node.value.partition(":")[0]
+            there = MODULE.fullmatch(node.value) and (
+                file_of(named).exists() or file_of(named).with_suffix("").is_dir()
+            )
+            names |= {named} if there else set()
     return names
 
 

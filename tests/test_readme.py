@@ -25,6 +25,7 @@ from motionloom.datasets.convert.registry import converters
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.pipeline.cli.main import app
 from motionloom.pipeline.contract.stage import stage_kinds
+from motionloom.pipeline.inference.files.writers import WRITERS
 from motionloom.pipeline.inference.script import Script
 from motionloom.pipeline.inference.shipped_models import shipped_models
 from motionloom.pipeline.runs.cluster.launch import launch_recipe
@@ -264,7 +265,7 @@ for module in (
 ):
     import_module(f"motionloom.pipeline.{module}")
 SETTINGS = {"face", "seed_motion", "seed", "kind", "extends", "start"}.union(
-    *(kind.model_fields for kind in configs(Config))
+    *(kind.model_fields for kind in configs(Config)), *(writer.options for writer in WRITERS.values())
 )
 
 
