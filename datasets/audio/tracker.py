@@ -59,8 +59,7 @@ NO_BEAT = 0.15
 """Confidence below which hardly a beat is heard: white noise has 0.07 to 0.14, three real songs 0.25, 0.45
 and 0.85. No test for music: a bare drum or a quiet stretch of a song may have less, speech up to 0.25."""
 UNSURE = 0.4
-"""Confidence below which the beats may be wrong: so are five of ten of the charted songs whose beats are wrong,
-and four of 39 others."""
+"""Confidence below which the beats may be wrong."""
 _tracked: WeakKeyDictionary[Sound, Beats] = WeakKeyDictionary()
 
 

@@ -10,8 +10,8 @@ from typing import ClassVar
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.records import Caption
 from motionloom.datasets.base.register import register
+from motionloom.datasets.convert.bvh.config import BvhConfig
 from motionloom.datasets.convert.bvh.convert import Bvh
-from motionloom.datasets.convert.bvh.plan import BvhConfig
 from motionloom.datasets.convert.bvh.read import READERS
 from motionloom.datasets.convert.captions.options import Listing, list_clips
 from motionloom.datasets.convert.captions.read import CaptionRow
@@ -70,7 +70,7 @@ class GlbConfig(BvhConfig):
             for path, words in self.found.items()
             if path in paths and words
         ]
-        return list_clips(paths, rows, read_split_files(self.splits)[0] if self.splits else None, [])
+        return list_clips(paths, rows, read_split_files(self.splits) if self.splits else None, [])
 
 
 class Glb(Bvh):
