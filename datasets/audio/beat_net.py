@@ -2,7 +2,7 @@
 
 Row t is centred at t / 60 s. Dilated convolutions see some eight seconds to both sides of a row. The weights
 in this package (`beats.safetensors`) were trained on songs with known beats, played by a band of General MIDI
-instruments, and on excerpts of freedoom's MIDI files; that training is no longer part of the package.
+instruments, and on excerpts of freedoom's MIDI files, by an earlier form of the recipe `ude-beats`.
 
 Gain and equaliser of a recording are taken out before the network: power becomes decibels, of which each
 band's mean over the piece is subtracted. Spectra need no librosa, whose import takes seconds.
