@@ -26,7 +26,7 @@ def fuzz() -> Any:
 
 def test_what_is_not_in_the_table_is_told(fuzz: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     assert fuzz.missing() == []
-    monkeypatch.setitem(CONVERTERS, "toy", object)  # type: ignore[arg-type]
+    monkeypatch.setitem(CONVERTERS._things, "toy", object)  # type: ignore[arg-type]
     requests = sys.modules["fuzzing.requests"]
     monkeypatch.setattr(requests, "ROUTES", [one for one in requests.ROUTES if one != "/api/edit"])
     monkeypatch.delitem(fuzz.READERS, "checkpoint")
