@@ -44,6 +44,7 @@ def draw_samples(run: Path, stage: str) -> Path:
     with run_at(run, f"{stage}:{NEWEST}") as folder:
         artifact = Artifact.find(stage_folder(folder, stage))
         bundle = Bundle.from_run(folder)
+        terms = bundle.terms  # of stages that are found while their folder is there
         assert artifact is not None and artifact.step is not None
         data = next(one for one in bundle.main.upstream() if one.gives("data"))
         clips = bundle.stage_cache.get(data).held_out()
@@ -73,7 +74,7 @@ def draw_samples(run: Path, stage: str) -> Path:
     place = stage_folder(run, stage) / SAMPLES
     out = place / f"step={artifact.step:08d}"
     title = f"{stage} at step {artifact.step:,}"
-    note = page_note(len(made), run.resolve().name, 0, terms=bundle.terms)
+    note = page_note(len(made), run.resolve().name, 0, terms=terms)
     write_motions(out, made, default_formats(), title=title, note=note)
     with open_own(place / SAMPLE_FIGURES, "ab") as file:
         file.write(json.dumps(row).encode() + b"\n")

@@ -253,7 +253,7 @@ def test_dances_of_a_run_are_evaluated(run: tuple[Path, str]) -> None:
         key = f"beat_align.{name}"
         worse = (value(key, row) for row in {*answers, MODEL})
         assert value(key, RECORDED) > max(worse), "nothing was learned in two steps"
-    assert "FID" in said and RECORDED in said
+    assert "movement.fid_k" in said and RECORDED in said
     # Captioned clips and dances without captions beside each other, no TMA in the run.
     captions = FigureFile.read(folder / "stages/evaluate/metrics.json")
     assert not any(one.name.startswith("tma.") for one in captions.figures)
