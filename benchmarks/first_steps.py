@@ -1,4 +1,4 @@
-"""What first steps cost beside a bare `import torch`: opening a model, help, errors, a first motion.
+"""Cost of first steps beside a bare `import torch`: opening a model, help, errors, a first motion.
 
     python benchmarks/first_steps.py
 
@@ -68,7 +68,7 @@ def seconds(program: str) -> float:
 
 
 def said(program: str, *words: str) -> str:
-    """What a program prints."""
+    """Return the standard output of a program."""
     words = (sys.executable, "-P", "-c", program, *words)
     return subprocess.run(words, capture_output=True, text=True, check=True).stdout
 

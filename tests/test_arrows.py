@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import re
 import sys
 from collections.abc import Mapping, Set
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from types import ModuleType
 
 import pytest
+from house_script import FENCE, house
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("configs", "datasets", "models", "pipeline")
@@ -20,15 +19,6 @@ RECORDS = tuple(f"motionloom.datasets.base.{name}" for name in ("errors", "json_
 BOTTOM = ("motionloom.datasets.motion", *RECORDS, "motionloom.datasets.conditions")
 BELOW = ("motionloom.datasets.base.files", "motionloom.datasets.base.randomness")
 """What the bottom layer itself may use: files of the standard library and numpy alone."""
-FENCE = (
-    "pipeline/baselines",
-    "pipeline/curation",
-    "pipeline/editing",
-    "pipeline/rigs",
-    "pipeline/songs",
-    "datasets/convert/sets",
-)
-"""Folders of what neither paper needs: nothing imports them, and each may be removed."""
 BOTTOM_LIBRARIES = {"numpy", "torch", "roma", "scipy", "pydantic", "pydantic_core", "motionloom"}
 
 
@@ -223,21 +213,9 @@ def test_first_party_imports_name_the_package(folder: str) -> None:
             assert name.split(".")[0] not in FOLDERS, f"{path} imports {name}; write motionloom.{name}"
 
 
-def test_the_house_stays_small(house: ModuleType) -> None:
+def test_the_house_stays_small() -> None:
     """Every figure is within its limit in docs/architecture.md."""
     most, figures = house.limits(), house.figures()
     over = {name: (value, most.get(name)) for name, value in figures.items() if value > most.get(name, 0)}
     assert not over, "what came pays with what it replaces"
     assert figures.keys() == most.keys()
-    assert house.FENCE == FENCE
-
-
-@pytest.fixture(scope="module")
-def house() -> ModuleType:
-    """`benchmarks/house.py`, which is in no package."""
-    path = ROOT / "benchmarks" / "house.py"
-    spec = importlib.util.spec_from_file_location("house", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module

@@ -1,4 +1,4 @@
-"""What stands behind the fence may be removed: the core imports, plans and generates without it."""
+"""Each folder behind the fence may be removed: the core imports, plans and generates without it."""
 
 from __future__ import annotations
 
@@ -6,17 +6,10 @@ import shutil
 from pathlib import Path
 
 import pytest
+from house_script import FENCE
 from own_package import python
 
 ROOT = Path(__file__).resolve().parents[1]
-FENCE = (
-    "pipeline/baselines",
-    "pipeline/curation",
-    "pipeline/editing",
-    "pipeline/rigs",
-    "pipeline/songs",
-    "datasets/convert/sets",
-)
 
 USE = """
 import pkgutil, sys

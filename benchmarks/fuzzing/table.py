@@ -1,4 +1,4 @@
-"""What a reader is, and the table of all of them: files of motion, of data sets and of models, sources of
+"""Readers, and the table of all of them: files of motion, of data sets and of models, sources of
 converters, requests to the server.
 
 A reader stands here with genuine contents (seeds), a mutator for each, and the call that reads. `missing()`

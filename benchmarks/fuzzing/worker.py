@@ -41,7 +41,7 @@ _ROW = struct.Struct("<qqqqqddd")
 
 @dataclass
 class Count:
-    """What came of the inputs of a reader."""
+    """Answers to the inputs of a reader, counted."""
 
     inputs: int = 0
     refused: int = 0
@@ -114,7 +114,7 @@ class Worker:
     def _child(
         self, seeds: list[Seed], read: Read, first: int, count: int, seconds: float
     ) -> tuple[Count, bool]:
-        """What a child has counted, and whether an input ended it."""
+        """The counts of a child, and whether an input ended it."""
         shared = self._shared
         notes = tempfile.TemporaryFile()  # noqa: SIM115 - open in the child, too
         shared[: _ROW.size] = _ROW.pack(0, 0, 0, 0, 0, 0.0, 0.0, 0.0)

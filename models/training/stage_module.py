@@ -281,12 +281,19 @@ class StageModule(L.LightningModule, ABC):
         self.record(values, batch)
         return values["loss"]
 
-    @contextmanager
-    def reading(self, batch: Batch) -> Iterator[None]:
-        """Context in which losses read a batch: `UserError` where it lacks a key, or the first is wrong."""
-        if self._trainer is not None and self.training not in self._seen:
+    def on_before_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        """Return the batch; `UserError` where the first of a training or validation is wrong.
+
+        It is looked at before it lies on a GPU, which would be waited for.
+        """
+        if self.training not in self._seen:
             self._seen.add(self.training)
             require_batch(batch, self.net)
+        return batch
+
+    @contextmanager
+    def reading(self, batch: Batch) -> Iterator[None]:
+        """Context in which losses read a batch: `UserError` where it lacks a key."""
         try:
             yield
         except KeyError as error:

@@ -80,6 +80,7 @@ def quiet_libraries() -> None:
         ".*LeafSpec.*",
         ".*ckpt_path.*",
         ".*dirpath has changed.*",
+        ".*`on_before_batch_transfer`.*",  # ours looks at a batch on the host, whoever loads it
         ".*`srun` command is available.*",  # said of every process that srun did not start
     ):
         warnings.filterwarnings("ignore", message)
