@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,12 @@ def clips_in(path: Path) -> dict[str, str]:
     return out
 
 
+@lru_cache(maxsize=4)
+def _rig(path: Path, changed: int, size: int) -> Rig:
+    """The character of a file as it was then, which the clips of one file share: a file may have hundreds."""
+    return Rig.read(path)
+
+
 def _animations(gltf: Gltf) -> list[dict[str, Any]]:
     """The animations of a file; `UserError` where they are none."""
     found = gltf.json.get("animations") or []
@@ -55,7 +62,11 @@ def _animations(gltf: Gltf) -> list[dict[str, Any]]:
 
 def read_animation(path: Path, label: str) -> bytes:
     """A clip's BVH text, on our joints, in centimetres."""
-    rig = Rig.read(path.parent)
+    try:
+        about = path.parent.stat()
+    except OSError as error:
+        raise UserError(f"{label}: cannot be read ({error.strerror})") from None
+    rig = _rig(path.parent, about.st_mtime_ns, about.st_size)
     number = int(re.match(r"\d+", path.name)[0]) if re.match(r"\d+", path.name) else -1  # type: ignore[index]
     animations = _animations(rig.gltf)
     if not 0 <= number < len(animations):
