@@ -2,4 +2,5 @@
 
 from motionloom.pipeline.cli.main import main
 
-main()
+if __name__ == "__main__":  # a tool that imports every module, to list or document them, starts no command
+    main()
