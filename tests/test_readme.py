@@ -109,7 +109,7 @@ def test_command_is_real(where: str, words: list[str]) -> None:
     if program == "motionloom":
         given = parsed(words)
         recipe = str(given.get("recipe", ""))
-        if recipe in ("finetune", "humantomato-captions"):
+        if recipe == "finetune":
             need_weights(read_yaml(shipped_recipes()[recipe])["start"])
         if given["command"] == "run" and not recipe.endswith(".yaml"):
             load_recipe(recipe, given["sets"] or ())

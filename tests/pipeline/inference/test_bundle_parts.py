@@ -31,7 +31,7 @@ def pretend(recipe: Recipe, run: Path, stages: tuple[str, ...] | None = None) ->
 
 
 # Those that start from a model of the package need its weights: test_finetune.py.
-@pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune", "humantomato-captions"}))
+@pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune"}))
 def test_finished_generators_are_found(name: str, tmp_path: Path) -> None:
     recipe = load_recipe(name)
     pretend(recipe, tmp_path)

@@ -43,7 +43,7 @@ def config(recipe: Recipe, stage: str) -> Any:
 
 
 # Those that start from a model of the package need its weights: test_finetune.py.
-@pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune", "humantomato-captions"}))
+@pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune"}))
 def test_shipped_recipes_load_and_reload(name: str, load: Any) -> None:
     recipe, path = load_recipe(name), shipped_recipes()[name]
     assert recipe.description and load(recipe.to_yaml()) == recipe

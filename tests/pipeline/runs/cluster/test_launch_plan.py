@@ -31,7 +31,7 @@ def stages(plan: LaunchPlan) -> list[tuple[str, ...]]:
 
 
 # Those that start from a model of the package need its weights: test_finetune.py.
-@pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune", "humantomato-captions"}))
+@pytest.mark.parametrize("name", sorted({*shipped_recipes()} - {"finetune"}))
 def test_groups_select_their_stages_and_trainings_take_all_gpus(name: str) -> None:
     plan = plan_of(name)
     done: set[str] = set()
