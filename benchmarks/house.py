@@ -36,6 +36,7 @@ FENCE = (
     "pipeline/curation",
     "pipeline/editing",
     "pipeline/rigs",
+    "pipeline/serve",
     "pipeline/songs",
     "datasets/convert/sets",
 )
