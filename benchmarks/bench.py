@@ -32,11 +32,13 @@ from motionloom.datasets.base.files import write_json
 from motionloom.pipeline.contract.stage import KINDS, stage_kinds
 from motionloom.pipeline.evaluation.estimate import estimate
 from motionloom.pipeline.evaluation.truth import Truth
+from motionloom.pipeline.inference.shipped_models import CARD_FIGURES
 from motionloom.pipeline.runs.api import run_recipe
 from motionloom.pipeline.runs.plan import Selection
 from motionloom.pipeline.store.yaml import dump_yaml
 
 HERE = Path(__file__).resolve().parent
+WEIGHTS = "model.safetensors"
 RECORDS = HERE / "records"
 SEEDS = (7, 8, 9)
 """Seeds of a full table; a row of fewer says how many."""
@@ -157,6 +159,41 @@ def report(
         path.write_text(json.dumps(facts | record, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         print(path)
     print(f"{title}\n\n{table_of(record)}")
+
+
+def making(run: Path) -> Record:
+    """How the weights of a finished run were made: day, versions, hours, steps and sums, for a model's card.
+
+    Hours are of the stages' wall time, each as its run noted it, on as many processes as `hardware` says.
+    """
+    stages = sorted((run / "stages").glob("*/artifact.json"))
+    times = [json.loads(path.with_name("timing.json").read_text()) for path in stages]
+    facts = [json.loads(path.read_text(encoding="utf-8")) for path in stages]
+    return {
+        "day": f"{datetime.fromtimestamp(max(path.stat().st_mtime for path in stages), UTC):%Y-%m-%d}",
+        "versions": {package: version(package) for package in ("torch", "numpy")},
+        "hardware": max(times, key=lambda one: float(one["seconds"]))["hardware"],
+        "hours": round(sum(one["seconds"] for one in times) / 3600, 1),
+        "steps": {
+            fact["stage"]: fact["config"]["train"]["steps"] for fact in facts if "train" in fact["config"]
+        },
+        "sha256": {
+            fact["stage"]: fact["outputs"][WEIGHTS]["sha256"] for fact in facts if WEIGHTS in fact["outputs"]
+        },
+    }
+
+
+def made_by(made: Mapping[str, Any]) -> str:
+    """A card's sentence on how its weights were made; empty where nobody noted it."""
+    if not made:
+        return ""
+    steps = ", ".join(f"{name} {count:,}" for name, count in made["steps"].items())
+    used = ", ".join(f"{name} {number}" for name, number in made["versions"].items())
+    return (
+        f"Made by that on {made['day']} in {made['hours']:g} hours on {made['hardware']}, {used}. "
+        f"Steps: {steps}. "
+        f"`{CARD_FIGURES}` has the sha256 of each network as it was trained, before `--half`.\n"
+    )
 
 
 def table_of(record: Record) -> str:

@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from bench import Column, arguments, command_line, kept, report
+from bench import Column, arguments, command_line, kept, made_by, making, report
 from model_card import test_clips, truth_from
 from numpy.typing import NDArray
 from results import page, read_records
@@ -247,15 +247,27 @@ def training_of(config: SynthConfig, count: int) -> list[Joints]:
     return [truth_from(make_sample(train[k], config), config).joints for k in chosen]
 
 
-def write_card(model: Path, title: str, description: str, config: SynthConfig) -> None:
-    """The card of the shipped model: tables of the records, size and sums of these weights."""
+def write_card(model: Path, title: str, description: str, config: SynthConfig, run: Path | None) -> None:
+    """The card of the shipped model: tables of the records, size, and how the run made these weights."""
     records = read_records()
     size = sum(path.stat().st_size for path in model.rglob("*") if path.is_file()) / 1e6
     text = page(CARD.read_text(encoding="utf-8"), records)
     text = re.sub(r"[\d.]+ MB", f"{size:.1f} MB", text)
+    noted = (
+        json.loads((model / CARD_FIGURES).read_text(encoding="utf-8"))
+        if (model / CARD_FIGURES).is_file()
+        else {}
+    )
+    made = making(run) if run else noted.get("made", {})
+    text = text.rpartition("```\n")[0] + "```\n" + (f"\n{made_by(made)}" if made else "")
     (model / "README.md").write_text(text, encoding="utf-8")
     actions = ", ".join(name for name in config.action_names if name != "then")
-    facts = {"name": title, "description": f"{description}; it knows {actions}", "recipe": RECIPE}
+    facts = {
+        "name": title,
+        "description": f"{description}; it knows {actions}",
+        "recipe": RECIPE,
+        "made": made,
+    }
     (model / CARD_FIGURES).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
@@ -265,6 +277,9 @@ def main() -> None:
     parser.add_argument("models", type=Path, nargs="+", help="exported folders, or models of the package")
     parser.add_argument("--real", type=Path, help="folder of BVH files, in place of synthetic test clips")
     parser.add_argument("--clips", type=int, default=60, help="synthetic test clips")
+    parser.add_argument(
+        "--run", type=Path, help="the run of the first model, whose days and steps the card notes"
+    )
     parser.add_argument("--card", action="store_true", help="write the model's card from its records")
     args = arguments(parser)
     models = [MotionModel(path, "cpu") for path in args.models]
@@ -285,7 +300,7 @@ def main() -> None:
     kind = "recorded clips" if args.real else "synthetic test clips"
     report(f"Gaps in {kind}, filled; {recipe.name}", COLUMNS, rows, args.record)
     if args.card:
-        write_card(model_folder(args.models[0]), args.models[0].name, recipe.description, config)
+        write_card(model_folder(args.models[0]), args.models[0].name, recipe.description, config, args.run)
 
 
 if __name__ == "__main__":

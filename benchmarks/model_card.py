@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench import Shares, judge, markdown, shown
+from bench import Shares, judge, made_by, making, markdown, shown
 from results import read_records
 from rich.console import Console
 from rich.table import Table
@@ -182,6 +182,9 @@ def main() -> None:
     )
     parser.add_argument("model", type=Path, help="an exported folder, or the name of a model of the package")
     parser.add_argument("--write", action="store_true", help="write the card into the model's folder")
+    parser.add_argument(
+        "--run", type=Path, help="the run that it was exported from, whose days and steps the card notes"
+    )
     parser.add_argument("--recipe", help=f"what it was made by; default: as the card says, or {RECIPE}")
     parser.add_argument(
         "--set", action="append", help="a setting of the recipe, as for `run`; default: as the card says"
@@ -240,6 +243,7 @@ def main() -> None:
         "sampling": sampling.model_dump(mode="json", exclude_unset=True),
         "seed": seed,
         "faults": before.get("faults", ""),
+        "made": making(args.run) if args.run else before.get("made", {}),
         "right": shares,
         "single draws": single,
         "unknown": {
@@ -367,7 +371,9 @@ def card_of(
         f"{strange[FAMILIAR]} of the usual unknown.",
         commands=f"motionloom run {recipe_file}{settings}\n"
         f"motionloom export runs/{recipe.name} -o {figures['name']} --half{options}\n"
-        f"python benchmarks/model_card.py {figures['name']} --recipe {recipe_file}{settings} --write",
+        f"python benchmarks/model_card.py {figures['name']} --recipe {recipe_file}{settings} "
+        f"--run runs/{recipe.name} --write",
+        made=made_by(figures["made"]),
         recipe_seed=recipe.seed,
     )
 
