@@ -84,10 +84,10 @@ class Prompt:
         from motionloom.datasets.audio.given_beats import in_words
         from motionloom.datasets.audio.tracker import NO_BEAT, UNSURE, track
 
-        confidence = track(self.sound.piece or self.sound).confidence
-        if confidence < NO_BEAT:
+        beats = track(self.sound.piece or self.sound)
+        if beats.pulse < NO_BEAT:
             return "hardly a beat is heard in the sound"
-        return f"the beat may be wrong: {in_words(self.sound)}; --beats says it" * (confidence < UNSURE)
+        return f"the beat may be wrong: {in_words(self.sound)}; --beats says it" * (beats.confidence < UNSURE)
 
     @property
     def words(self) -> str:

@@ -247,9 +247,9 @@ def test_beats_of_a_metronome_are_found_and_counted(genre: str, bpm: int) -> Non
 def test_noise_and_silence_have_hardly_a_beat() -> None:
     samples = np.random.default_rng(0).standard_normal(10 * RATE).astype(np.float32)
     noise, silence = Sound(np.clip(0.2 * samples, -1, 1), RATE), Sound(np.zeros_like(samples), RATE)
-    assert tracker.track(noise).confidence < tracker.NO_BEAT
+    assert tracker.track(noise).pulse < tracker.NO_BEAT
     music = even_song("house", 124)
-    assert tracker.track(silence).confidence < 0.1 and tracker.track(music).confidence > 0.5
+    assert tracker.track(silence).pulse < 0.1 and tracker.track(music).confidence > tracker.UNSURE
     assert not Prompt(sound=music.slice(3.0, 7.0)).remark and Prompt(sound=noise).remark
     assert Prompt(sound=silence).idle and not Prompt(sound=noise).idle
     assert Prompt("waves", sound=silence).remark and not Prompt("waves").remark
