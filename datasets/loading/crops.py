@@ -1,9 +1,9 @@
 """Copying pieces of clips into one normalised, zero-padded batch array: the loader's inner loop.
 
-A window is subtracted and scaled while it is in the processor's cache, straight from the mapped tar into its
-place in the batch: no intermediate array, no tensor per sample. It is treated as one long row (mean and scale
-repeated per frame), which halves the time of broadcasting over rows. A process that trains on a small data
-set keeps the normalised clips and only copies; loader workers, which are many, read them anew.
+A window is subtracted and scaled while it is in the processor's cache, straight from what was read of the tar
+into its place in the batch: no tensor per sample. It is treated as one long row (mean and scale repeated per
+frame), which halves the time of broadcasting over rows. A process that trains on a small data set keeps the
+normalised clips and only copies; loader workers, which are many, read them anew.
 
 Columns of a part that a clip does not hold (hands, face) come out as 0, the mean, whatever the file stores.
 """
@@ -138,7 +138,7 @@ class Crops:
 
     def _read(self, out: NDArray[np.float32], clip: int, start: int) -> None:
         """Normalised frames of a clip from `start` on, `out` [T, C]."""
-        frames = self.dataset.motion(clip)[start : start + len(out)]
+        frames = self.dataset.motion(clip, start, start + len(out))
         for source, place in self._runs:
             out[:, place] = frames[:, source]
         row = out.reshape(-1)  # a view: it is contiguous

@@ -40,7 +40,7 @@ class JointCrops(Crops):
 
     def _read(self, out: NDArray[np.float32], clip: int, start: int) -> None:
         """Joints of a clip's frames from `start` on, `out` [T, 3 N]."""
-        joints = joints_of_dance(self.dataset.motion(clip)[: start + len(out)], self.dataset.layout)
+        joints = joints_of_dance(self.dataset.motion(clip, 0, start + len(out)), self.dataset.layout)
         out[:] = joints[start:].reshape(len(out), -1)
 
 

@@ -61,9 +61,9 @@ class MixedDataset:
     def has(self, member: str) -> NDArray[np.bool_]:
         return np.concatenate([dataset.has(member) for dataset in self._datasets])
 
-    def motion(self, i: int) -> NDArray[np.float32]:
+    def motion(self, i: int, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
         dataset, own = self._find(i)
-        return dataset.motion(own)
+        return dataset.motion(own, first, end)
 
     def meta(self, i: int) -> ClipMeta:
         dataset, own = self._find(i)

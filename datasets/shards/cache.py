@@ -3,7 +3,7 @@
 Names hold a checksum of the content (or of the manifest that decides it), so a file is never out of date. One
 process downloads a file while the others that want it wait; it appears by a rename, whole or not at all.
 Locks are the kernel's (`flock`), so a killed process leaves none. The least recently used file is deleted
-first; a process that has it mapped keeps its content.
+first; a process that has it open keeps its content.
 
 fsspec's `filecache` would not do: there a file appears before its checksum can be compared, the size is not
 limited, and processes that want the same file each download it.

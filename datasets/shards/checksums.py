@@ -1,6 +1,6 @@
 """Shards of a folder compared with the sha256 of their manifest.
 
-The indexed reader maps files and reads single clips, so a flipped bit would be trained on unnoticed. Whole
+The indexed reader reads single clips, so a flipped bit would be trained on unnoticed. Whole
 files are compared before they are read, at the speed of the disk; size, times and inode show later changes.
 """
 

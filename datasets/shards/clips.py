@@ -60,8 +60,8 @@ class ClipDataset(Protocol):
         """Return which clips hold a member such as `texts.json`, [n]."""
         ...
 
-    def motion(self, i: int) -> NDArray[np.float32]:
-        """Features of clip `i`, [T, D]."""
+    def motion(self, i: int, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
+        """Features of clip `i`, [T, D], or of its frames `first .. end` alone."""
         ...
 
     def meta(self, i: int) -> ClipMeta: ...

@@ -3,20 +3,22 @@
 Clips that the manifest excludes (`motionloom data clean`) are skipped and have no number.
 
 Opening reads `manifest.json` and the split's arrays of `index.npz`, and, in a folder, looks at the sizes of
-the shard files; no shard is opened before one of its clips is asked for. A motion is then a view into the
-memory-mapped tar (of the folder, or of the local cache of a server's shards), so the page cache is the only
-cache and every loader process shares it.
+the shard files; no shard is opened before one of its clips is asked for. What is asked for, and no more, is
+then read from the tar (of the folder, or of the local cache of a server's shards) by one `pread`, so the page
+cache is the only cache and every loader process shares it. To map a tar takes more calls than to read from it,
+and a process that reads mapped bytes of a file that was cut short dies.
 """
 
 from __future__ import annotations
 
 import hashlib
 import io
-import mmap
+import os
 import re
+import resource
 from bisect import bisect_right
 from collections import OrderedDict
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import accumulate
 from pathlib import Path
 from typing import ClassVar
@@ -48,12 +50,29 @@ from motionloom.datasets.shards.sample import MEMBERS, captions_from_json, meta_
 from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store
 from motionloom.datasets.shards.tar import npy_from_bytes
 
-_MOTION = MEMBERS.index("motion.npy")
 _SHARD_NAME = re.compile(r"[A-Za-z0-9_-]+-(?:train|val|test)-(\d{6,})\.tar")
 
-OPEN_SHARDS = 256
-"""Shards mapped at a time in one process, of all data sets; the least recently used is unmapped. Each takes a
-file descriptor, of which a process has 1,024 as a rule."""
+_SPARE = 512
+"""Descriptors of a process that are not for shards: sockets, logs, loaders."""
+_MOST = 2**16
+"""Descriptors that are asked for at most: for 16 million clips in shards of 256."""
+
+
+@cache
+def open_shards() -> int:
+    """Shards that this process holds open at a time, of all data sets: as many as the system lets it, once its
+    own limit of descriptors (1,024 as a rule) is raised to the one that the system sets.
+    """
+    own, hard = (
+        _MOST if limit == resource.RLIM_INFINITY else limit
+        for limit in resource.getrlimit(resource.RLIMIT_NOFILE)
+    )
+    wanted = max(own, min(hard, _MOST))
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    except (OSError, ValueError):  # macOS says "without a limit" and gives 10,240
+        wanted = own
+    return max(wanted - _SPARE, wanted // 2)
 
 
 def load_manifest(root: Path) -> Manifest:
@@ -88,55 +107,55 @@ def manifest_layout(manifest: Manifest) -> MotionLayout:
     return MotionLayout.named(manifest.layout, fps=manifest.fps, family=manifest.family)
 
 
-class MappedShards:
-    """Files of this machine, memory-mapped: the page cache is the only cache and all processes share it."""
+class _Descriptor:
+    """An open file; closed when nobody reads it any more, so that another thread may let go of it."""
 
-    _recent: ClassVar[OrderedDict[tuple[ReferenceType[MappedShards], int], None]] = OrderedDict()
-    """Data set and number of each shard that is mapped, in the order of their use."""
+    def __init__(self, number: int) -> None:
+        self.number = number
 
-    def __init__(self, store: Store, shards: list[ShardInfo], index: SplitIndex, room: int = 0) -> None:
-        self.maps: OrderedDict[int, mmap.mmap] = OrderedDict()
+    def __del__(self) -> None:
+        os.close(self.number)
+
+
+class OpenShards:
+    """Reads pieces of files of this machine, of which the least recently used are closed."""
+
+    _recent: ClassVar[OrderedDict[tuple[ReferenceType[OpenShards], int], None]] = OrderedDict()
+    """Data set and number of each shard that is open, in the order of their use."""
+
+    def __init__(self, store: Store, shards: list[ShardInfo], room: int = 0) -> None:
+        self.files: OrderedDict[int, _Descriptor] = OrderedDict()
         self._self = ref(self)
         self._store = store
         self._shards = shards
-        self._offsets = index.offsets
-        self._most = OPEN_SHARDS
-        if room:  # a deleted file takes disk space while it is mapped: at most an eighth of the cache may
-            self._most = max(1, min(OPEN_SHARDS, room // (8 * max(shard.bytes for shard in shards))))
+        self._most = open_shards()
+        if room:  # a deleted file takes disk space while it is open: at most an eighth of the cache may
+            self._most = max(1, min(self._most, room // (8 * max(shard.bytes for shard in shards))))
 
-    def member(self, shard: int, clip: int, column: int) -> tuple[mmap.mmap, int]:
-        """Return (buffer, offset of the member in it). Views keep an unmapped shard alive."""
-        mapped = self.maps.pop(shard, None) or self._map(shard)
+    def read(self, shard: int, start: int, size: int) -> bytes:
+        """Return `size` bytes of a shard from `start` on; `UserError` if it is shorter or cannot be read."""
+        info = self._shards[shard]
+        file = self.files.pop(shard, None) or _Descriptor(self._store.open_shard(info))
         self._recent.pop((self._self, shard), None)
         # Back as the one used last.
-        self.maps[shard] = mapped
+        self.files[shard] = file
         self._recent[self._self, shard] = None
-        while len(self.maps) > self._most:
-            self._recent.pop((self._self, self.maps.popitem(last=False)[0]), None)
-        while len(self._recent) > OPEN_SHARDS:
+        while len(self.files) > self._most:
+            self._recent.pop((self._self, self.files.popitem(last=False)[0]), None)
+        while len(self._recent) > open_shards():
             (other, number), _ = self._recent.popitem(last=False)
             if (owner := other()) is not None:
-                owner.maps.pop(number, None)
-        return mapped, int(self._offsets[clip, column])
-
-    def clear(self) -> None:
-        """Unmap all."""
-        while self.maps:
-            self._recent.pop((self._self, self.maps.popitem()[0]), None)
-
-    def _map(self, shard: int) -> mmap.mmap:
-        info = self._shards[shard]
-        where = self._store.where(info.name)
-        with self._store.open_shard(info) as file:
-            try:
-                mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            except (OSError, ValueError) as error:
-                raise UserError(f"{where}: cannot be read ({error})") from None
-        if len(mapped) != info.bytes:
+                owner.files.pop(number, None)
+        try:
+            found = os.pread(file.number, size, start)
+        except OSError as error:
+            raise UserError(f"{self._store.where(info.name)}: cannot be read ({error.strerror})") from None
+        if len(found) != size:
             raise UserError(
-                f"{where}: {len(mapped)} bytes, the manifest says {info.bytes}: truncated while in use"
+                f"{self._store.where(info.name)}: ends before byte {start + size} of the manifest's "
+                f"{info.bytes}: truncated while in use"
             )
-        return mapped
+        return found
 
 
 class ShardDataset:
@@ -172,7 +191,7 @@ class ShardDataset:
             kept = [self._index.id(row) not in manifest.excluded for row in self._rows.tolist()]
             self._rows = self._rows[np.array(kept, dtype=np.bool_)]
         room = 0 if isinstance(store, LocalStore) else reading.cache.limit
-        self._access = MappedShards(store, self._shards, self._index, room)
+        self._access = OpenShards(store, self._shards, room)
 
     @staticmethod
     def open(
@@ -218,16 +237,16 @@ class ShardDataset:
     def has(self, member: str) -> NDArray[np.bool_]:
         return np.asarray(self._index.sizes[self._rows, MEMBERS.index(member)] > 0, dtype=np.bool_)
 
-    def motion(self, i: int) -> NDArray[np.float32]:
-        """Features of clip `i`, [T, D]: a read-only view of the stored bytes (a copy if float16)."""
+    def motion(self, i: int, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
+        """Features of clip `i`, [T, D], read-only unless float16 is stored; or of its frames `first .. end`."""
         index = self._index
         row = self._row(i)
-        buffer, start = self._access.member(self._shard_of(row), row, _MOTION)
-        start += int(index.data[row]) - int(index.offsets[row, _MOTION])
-        shape = (int(index.frames[row]), self.layout.dim)
-        if index.itemsize[row] == 4:
-            return np.ndarray(shape, np.float32, buffer, start)
-        return np.ndarray(shape, np.float16, buffer, start).astype(np.float32)
+        first, end, _ = slice(first, end).indices(int(index.frames[row]))
+        width = self.layout.dim * int(index.itemsize[row])
+        start = int(index.data[row]) + first * width
+        raw = self._access.read(self._shard_of(row), start, max(end - first, 0) * width)
+        kind = np.float32 if index.itemsize[row] == 4 else np.float16
+        return np.frombuffer(raw, kind).reshape(-1, self.layout.dim).astype(np.float32, copy=False)
 
     def meta(self, i: int) -> ClipMeta:
         return meta_from_json(self._member(i, "meta.json"), self._where(i, "meta.json"))
@@ -254,10 +273,6 @@ class ShardDataset:
             raise UserError(f"{self._where(i, 'audio.flac')}: not readable sound ({error})") from None
         return signal, int(rate)
 
-    def unmap(self) -> None:
-        """Unmap the shards, to free memory after all clips were read once."""
-        self._access.clear()
-
     def _captions(self, i: int, member: str) -> list[Caption]:
         raw = self._member(i, member)
         return captions_from_json(raw, self._where(i, member)) if raw else []
@@ -282,8 +297,7 @@ class ShardDataset:
         size = int(self._index.sizes[row, column])
         if size == 0:
             return b""
-        buffer, start = self._access.member(self._shard_of(row), row, column)
-        return buffer[start : start + size]
+        return self._access.read(self._shard_of(row), int(self._index.offsets[row, column]), size)
 
     def _row(self, i: int) -> int:
         """Return the row of clip `i` in the index, which counts excluded clips too."""

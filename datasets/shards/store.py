@@ -90,11 +90,21 @@ class LocalStore:
 
     def open_index(self, digest: str) -> BinaryIO:
         """`index.npz` of the manifest with that sha256, seekable."""
-        return self._open(INDEX_FILE)
+        try:
+            return open_plain(self.root / INDEX_FILE, self.where(INDEX_FILE))
+        except FileNotFoundError:
+            raise MissingFileError(f"{self.where(INDEX_FILE)}: no such file") from None
+        except OSError as error:
+            raise UserError(f"{self.where(INDEX_FILE)}: cannot be read ({error})") from None
 
-    def open_shard(self, shard: ShardInfo) -> BinaryIO:
-        """A whole shard, buffered, from its beginning."""
-        return self._open(shard.name)
+    def open_shard(self, shard: ShardInfo) -> int:
+        """A descriptor of a shard, to be closed by the caller. A pipe is not waited for."""
+        try:
+            return os.open(self.root / shard.name, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        except FileNotFoundError:
+            raise MissingFileError(f"{self.where(shard.name)}: no such file") from None
+        except OSError as error:
+            raise UserError(f"{self.where(shard.name)}: cannot be read ({error})") from None
 
     def digest(self, name: str) -> str | None:
         """sha256 of a stored file; None if it is missing."""
@@ -111,14 +121,6 @@ class LocalStore:
     def remove(self, name: str) -> None:
         """Delete a stored file."""
         (self.root / name).unlink()
-
-    def _open(self, name: str) -> BinaryIO:
-        try:
-            return open_plain(self.root / name, self.where(name))
-        except FileNotFoundError:
-            raise MissingFileError(f"{self.where(name)}: no such file") from None
-        except OSError as error:
-            raise UserError(f"{self.where(name)}: cannot be read ({error})") from None
 
 
 class RemoteStore:
@@ -152,9 +154,12 @@ class RemoteStore:
 
         return self.cache.get(f"{digest}.index.npz", 0, fetch)
 
-    def open_shard(self, shard: ShardInfo) -> BinaryIO:
-        """Open a shard in the cache, where it was compared with the manifest's sha256 when it arrived."""
-        return self.cache.get(f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path))
+    def open_shard(self, shard: ShardInfo) -> int:
+        """The same in the cache, where it was compared with the manifest's sha256 when it arrived."""
+        with self.cache.get(
+            f"{shard.sha256}.tar", shard.bytes, lambda path: self._fetch(shard, path)
+        ) as file:
+            return os.dup(file.fileno())
 
     def digest(self, name: str) -> str | None:
         """The same, from the file's bytes or the hub's record."""

@@ -222,9 +222,6 @@ def _embedded(
                 present.append(held)
             yield unit(np.asarray(embed_motions(tma, motions, present))).astype(np.float16)
             meter.advance(len(motions))
-            del motion, motions
-            for dataset in splits.values():
-                dataset.unmap()
 
 
 def _stored(path: Path, made_from: str, shape: tuple[int, int]) -> Vectors | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
@@ -47,17 +48,33 @@ def test_every_member_comes_back(made: ModuleType, root: Path) -> None:
                 assert sound[1] == 8000
 
 
-def test_few_shards_stay_open_and_views_survive(
-    made: ModuleType, root: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("room", "opens"), [(3, 11), (100, 10)])
+def test_a_shard_is_opened_once_where_descriptors_suffice(
+    made: ModuleType, root: Path, monkeypatch: pytest.MonkeyPatch, room: int, opens: int
 ) -> None:
-    monkeypatch.setattr(reader, "OPEN_SHARDS", 3)
+    """Two data sets of five shards each, then one shard again; three descriptors serve both."""
+    monkeypatch.setattr(reader, "open_shards", lambda: room)
     dataset, other = (ShardDataset.open(root, "train") for _ in range(2))
-    views = [some.motion(i) for i in range(36) for some in (dataset, other)][::2]
-    assert len(dataset._access.maps) + len(other._access.maps) == 3, "a process has so many descriptors"
-    dataset.unmap()
-    assert len([other.motion(i) for i in range(36)]) == 36 and len(other._access.maps) == 3
-    for i, view in enumerate(views):
-        np.testing.assert_array_equal(view, made.clip_motion(int(dataset.ids[i].rpartition("-")[2])))
+    opened: list[str] = []
+    monkeypatch.setattr(os, "open", lambda path, *a, real=os.open: [opened.append(path), real(path, *a)][1])
+    for some, count in ((dataset, 36), (other, 36), (dataset, 4)):
+        for i in range(count):
+            want = made.clip_motion(int(some.ids[i].rpartition("-")[2]))
+            np.testing.assert_array_equal(some.motion(i), want)
+            np.testing.assert_array_equal(some.motion(i, 3, 19), want[3:19])
+    assert len(opened) == opens and len(dataset._access.files) + len(other._access.files) == min(room, 10)
+
+
+def test_a_shard_that_is_cut_short_or_replaced_while_in_use_is_named(root: Path) -> None:
+    dataset = ShardDataset.open(root, "train")
+    dataset.motion(0)
+    paths = sorted(root.glob("made-train-*.tar"))
+    os.truncate(paths[0], 512)
+    paths[1].unlink()
+    os.mkfifo(paths[1])
+    for clip in (0, 8):
+        with pytest.raises(UserError, match=rf"{paths[clip // 8].name}: "):
+            dataset.motion(clip)
 
 
 def test_damage_is_named(root: Path) -> None:
