@@ -143,7 +143,7 @@ def decoders(args: argparse.Namespace) -> None:
     own = tokenizer.decode(codes.codes, codes.groups.tolist())
     others = {
         "the tokenizer's own decoder": [joints_of(x, tokenizer.layout) for x in own],
-        "nearest training clip": [nearest.motion(truth.features)[1] for truth in truths],
+        "nearest training clip": [joints for _, joints in nearest.motions(truths)],
     }
     for title, joints in others.items():
         cells = {key: [value] for key, value in decoder_figures(joints, truths).items()}

@@ -5,8 +5,8 @@ Clips that the manifest excludes (`motionloom data clean`) are skipped and have 
 Opening reads `manifest.json` and the split's arrays of `index.npz`, and, in a folder, looks at the sizes of
 the shard files; no shard is opened before one of its clips is asked for. What is asked for, and no more, is
 then read from the tar (of the folder, or of the local cache of a server's shards) by one `pread`, so the page
-cache is the only cache and every loader process shares it. To map a tar takes more calls than to read from it,
-and a process that reads mapped bytes of a file that was cut short dies.
+cache is the only cache and every loader process shares it. To map a tar takes more calls than to read from
+it, and a process that reads mapped bytes of a file that was cut short dies.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from motionloom.datasets.base.register import discover
 from motionloom.datasets.motion.layout import MotionLayout
 from motionloom.datasets.shards.checksums import LocalShard, require_intact
 from motionloom.datasets.shards.clips import ClipDataset, Source
-from motionloom.datasets.shards.index import SplitIndex, read_index
+from motionloom.datasets.shards.index import read_index
 from motionloom.datasets.shards.options import Reading
 from motionloom.datasets.shards.sample import MEMBERS, captions_from_json, meta_from_json
 from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store
@@ -60,8 +60,8 @@ _MOST = 2**16
 
 @cache
 def open_shards() -> int:
-    """Shards that this process holds open at a time, of all data sets: as many as the system lets it, once its
-    own limit of descriptors (1,024 as a rule) is raised to the one that the system sets.
+    """Shards that this process holds open at a time, of all data sets: what its limit of descriptors allows
+    (1,024 as a rule), once that is raised to the one that the system sets.
     """
     own, hard = (
         _MOST if limit == resource.RLIM_INFINITY else limit
@@ -238,7 +238,7 @@ class ShardDataset:
         return np.asarray(self._index.sizes[self._rows, MEMBERS.index(member)] > 0, dtype=np.bool_)
 
     def motion(self, i: int, first: int = 0, end: int | None = None) -> NDArray[np.float32]:
-        """Features of clip `i`, [T, D], read-only unless float16 is stored; or of its frames `first .. end`."""
+        """Features of clip `i`, [T, D], or of its frames `first .. end`; read-only if float32 is stored."""
         index = self._index
         row = self._row(i)
         first, end, _ = slice(first, end).indices(int(index.frames[row]))

@@ -22,13 +22,17 @@ Distance = Literal["cosine", "euclidean"]
 """Similarity of latents: TMA's by cosine (D.2), those of the evaluator of Guo et al. as they are."""
 
 
-def ranks(distance: Tensor, positive: Tensor | None = None) -> Tensor:
-    """Rank (0 = first) of each row's nearest true column: distance [N, N], float64 [N].
+_ROWS = 512
+"""Rows that are compared with all others at a time: the distances of a large split are never all held."""
 
-    `positive` bool [N, N] marks the columns that count as true; the diagonal always does.
+
+def ranks(distance: Tensor, positive: Tensor | None = None, first: int = 0) -> Tensor:
+    """Rank (0 = first) of each row's nearest true column: distance [R, N], float64 [R].
+
+    `positive` bool [R, N] marks the columns that count as true; column `first` + r of row r always does.
     """
     distance = distance.where(~distance.isnan(), torch.inf)  # what is no number is near to nothing
-    true = distance.diagonal()
+    true = distance.diagonal(first)
     if positive is not None:
         true = torch.minimum(true, distance.masked_fill(~positive, torch.inf).amin(1))
     closer = (distance < true[:, None]).sum(1)
@@ -66,15 +70,17 @@ def recall(
     batches = _batches(text, motion, batch, None if batch is None else seed)
     # Each batch is a set of candidates of its own; ranks of all batches are averaged together.
     for rows in batches:
-        between = -(text[rows] @ motion[rows].T)
-        if distance == "euclidean":
-            between = torch.cdist(text[rows], motion[rows])
-        positive = None
+        unit = None
         if sentence is not None and threshold is not None:
             unit = F.normalize(sentence[rows].double(), dim=-1)
-            positive = unit @ unit.T >= threshold
-        found["t2m"].append(ranks(between, positive))
-        found["m2t"].append(ranks(between.T, positive))
+        for way, (query, among) in {"t2m": (text, motion), "m2t": (motion, text)}.items():
+            for first in range(0, len(rows), _ROWS):
+                part = slice(first, first + _ROWS)
+                between = -(query[rows[part]] @ among[rows].T)
+                if distance == "euclidean":
+                    between = torch.cdist(query[rows[part]], among[rows])
+                positive = None if unit is None or threshold is None else unit[part] @ unit.T >= threshold
+                found[way].append(ranks(between, positive, first))
     out = {"size": float(batches.shape[1])}
     for way, parts in found.items():
         rank = torch.cat(parts)
@@ -122,40 +128,46 @@ def _batches(text: Tensor, motion: Tensor, batch: int | None, seed: int | None) 
 # Accuracy of UDE's Table 1: is a motion's own text the nearest among 61? (UDE section 4.3).
 
 
+def other_texts(meaning: Tensor, count: int, seed: int = 0) -> Tensor:
+    """Rows int64 [N, count] of irrelevant texts for each row, drawn without replacement.
+
+    Texts of one number in `meaning`, int64 [N], say the same; every row must have as many of other numbers.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    meaning = meaning.cpu()
+    found = []
+    for first in range(0, len(meaning), _ROWS):
+        own = meaning[first : first + _ROWS, None]
+        # The largest draws choose without replacement; texts that mean the same are never chosen.
+        draws = torch.rand(len(own), len(meaning), generator=generator, dtype=torch.float64)
+        found.append(draws.masked_fill_(own == meaning, -1.0).topk(count, dim=1).indices)
+    return torch.cat(found)
+
+
 def accuracy_among(
-    motion: Tensor,
-    text: Tensor,
-    *,
-    candidates: int = 61,
-    tops: Sequence[int] = (1, 5),
-    same: Tensor | None = None,
-    seed: int = 0,
+    motion: Tensor, text: Tensor, others: Tensor, *, tops: Sequence[int] = (1, 5)
 ) -> dict[str, float]:
-    """Shares of motions whose own text is among the k nearest of `candidates`, by cosine similarity.
+    """Shares of motions whose own text is among the k nearest of it and the others, by cosine similarity.
 
     Args:
         motion: Embeddings [N, Z] of the motions.
         text: Embeddings [N, Z] of their texts, row by row.
-        candidates: The own text and so many less one others, drawn at random for each motion without
-            replacement; every motion must have as many irrelevant texts.
+        others: Rows of each motion's other candidates, [N, 60] in the paper (`other_texts`).
         tops: The k of the result.
-        same: bool [N, N], texts that mean the same as the row's own and so are no irrelevant ones.
-        seed: Of the draws.
 
     Returns:
         "top-1" and so on. Texts exactly as near as the own one count half, so that an encoder that tells
         nothing apart does not look perfect.
     """
-    count = len(motion)
-    allowed = ~torch.eye(count, dtype=torch.bool) if same is None else ~(same.cpu() | torch.eye(count).bool())
-    generator = torch.Generator().manual_seed(seed)
-    # The largest draws choose without replacement; texts that mean the same are never chosen.
-    draws = torch.rand(count, count, generator=generator, dtype=torch.float64).masked_fill(~allowed, -1.0)
-    others = draws.topk(candidates - 1, dim=1).indices.to(motion.device)
     motion = F.normalize(motion.double(), dim=-1)
     text = F.normalize(text.double(), dim=-1)
-    near = (motion @ text.T).nan_to_num(nan=-1.0)
-    own = near.diagonal()[:, None]
-    rest = near.gather(1, others)
-    rank = (rest > own).sum(1) + 0.5 * (rest == own).sum(1)
+    candidates = torch.cat([torch.arange(len(motion))[:, None], others], dim=1).to(motion.device)
+    ranked = []
+    for some, rows in zip(motion.split(_ROWS), candidates.split(_ROWS), strict=True):
+        # Products are summed alike for every candidate, so that equal texts are exactly as near.
+        near = (text[rows] * some[:, None]).sum(-1).nan_to_num(nan=-1.0)
+        own = near[:, :1]
+        rest = near[:, 1:]
+        ranked.append((rest > own).sum(1) + 0.5 * (rest == own).sum(1))
+    rank = torch.cat(ranked)
     return {f"top-{k}": float((rank < k).double().mean()) for k in tops}

@@ -16,7 +16,13 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from motionloom.models.metrics.distributions import diversity, fid, multimodality
-from motionloom.models.metrics.retrieval import accuracy_among, matching_score, r_precision, recall
+from motionloom.models.metrics.retrieval import (
+    accuracy_among,
+    matching_score,
+    other_texts,
+    r_precision,
+    recall,
+)
 from motionloom.pipeline.evaluation.estimate import plain, set_estimates
 from motionloom.pipeline.evaluation.figures import (
     CHANCE,
@@ -209,13 +215,15 @@ def _choice(
 ) -> list[Figure]:
     """Figures of UDE's accuracy (Table 1): whether a motion's own caption is the nearest of `among`."""
     # A caption that says the same as the own one is no wrong answer.
-    same = torch.tensor([[one == other for other in words] for one in words])
-    among = min(among, 1 + int((~same).sum(1).min()))
+    numbers: dict[str, int] = {}
+    meaning = torch.tensor([numbers.setdefault(caption, len(numbers)) for caption in words])
+    among = min(among, 1 + len(words) - int(meaning.bincount().max()))
     if among < 2:
         return []
+    others = other_texts(meaning, among - 1, seed)
 
     def accuracy(row: LatentRow) -> Values:
-        return accuracy_among(row.motion, row.text, candidates=among, same=same, seed=row.seed)
+        return accuracy_among(row.motion, row.text, others)
 
     once = {RECORDED: latents.real, **latents.nearest}
     motions = {MODEL: latents.made} | {row: [motion] for row, motion in once.items()}

@@ -77,13 +77,16 @@ _MODEL_BYTES = 2**30
 
 
 def clip_errors(
-    tokenizer: TrainedTokenizer, nearest: NearestClip, truth: Truth, rebuilt: NDArray[np.float32]
+    tokenizer: TrainedTokenizer,
+    nearest: tuple[NDArray[np.float64], NDArray[np.float64]],
+    truth: Truth,
+    rebuilt: NDArray[np.float32],
 ) -> Row:
     """Both families of errors of one clip: of its reconstruction, of the mean pose (`_mean_pose`) and of the
     nearest training clip (`_nearest_train_clip`). The papers' are weighted by frames.
 
-    `rebuilt` [T, D] is the tokenizer's reconstruction (`reconstruct_truth`). For a clip without hands only
-    the body's joints count, and there is no `_hand`.
+    `nearest` is that clip's motion (`NearestClip`), `rebuilt` [T, D] the tokenizer's reconstruction. For a
+    clip without hands only the body's joints count, and there is no `_hand`.
     """
     layout = tokenizer.layout
     body = tokenizer.stats.mean[layout.part("bodyhand")].astype(np.float32)
@@ -93,7 +96,7 @@ def clip_errors(
     compared = {
         "": (local_joints(rebuilt, layout), joints_of(rebuilt, layout)),
         "_mean_pose": (local_joints(constant, layout), joints_of(constant, layout)),
-        "_nearest_train_clip": nearest.motion(truth.features, truth.present),
+        "_nearest_train_clip": nearest,
     }
     # Hands that were never recorded are no truth to be compared with.
     joints = slice(None) if truth.present & HANDS else slice(BODY_JOINTS)
@@ -144,9 +147,11 @@ def reconstruction_errors(
     tokenizer: TrainedTokenizer, train: ClipDataset, truths: Sequence[Truth]
 ) -> dict[str, float]:
     """Mean errors over all clips of `truths` in mm, by the names of `clip_errors`."""
-    nearest = NearestClip(train)
-    rebuilt = ((truth, reconstruct_truth(tokenizer, truth)) for truth in truths)
-    rows = [clip_errors(tokenizer, nearest, truth, features) for truth, features in rebuilt]
+    nearest = NearestClip(train).motions(truths)
+    rows = [
+        clip_errors(tokenizer, near, truth, reconstruct_truth(tokenizer, truth))
+        for truth, near in zip(truths, nearest, strict=True)
+    ]
     return {name: one.value for name, one in row_estimates([rows]).items()}
 
 

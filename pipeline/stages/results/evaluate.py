@@ -24,6 +24,8 @@ from motionloom.pipeline.evaluation.clip_metrics import Performance, clip_figure
 from motionloom.pipeline.evaluation.diagnosis import Diagnosis
 from motionloom.pipeline.evaluation.figures import (
     MODEL,
+    NEAREST_LABELS,
+    NEAREST_WORDS,
     RECORDED,
     STILL,
     THROUGH,
@@ -40,7 +42,11 @@ from motionloom.pipeline.evaluation.latent_metrics import (
 )
 from motionloom.pipeline.evaluation.movement import Features, all_features, movement_figures
 from motionloom.pipeline.evaluation.reconstruction import clip_error_figures, face_figures
-from motionloom.pipeline.evaluation.reference_baselines import LOOKUPS, mean_poses
+from motionloom.pipeline.evaluation.reference_baselines import (
+    by_nearest_caption,
+    by_nearest_labels,
+    mean_poses,
+)
 from motionloom.pipeline.evaluation.truth import Truth, digest_of, spread_any, truth_of
 from motionloom.pipeline.stages.results.evaluate_units import (
     CAPTIONS,
@@ -54,6 +60,7 @@ from motionloom.pipeline.stages.results.evaluate_units import (
     EvaluationUnits,
 )
 from motionloom.pipeline.stages.results.evaluation import EvaluationStage
+from motionloom.pipeline.store.networks import LoadedTma
 
 _NAMES = {"tma": "TMA", "evaluator": "the evaluator", "face_evaluator": "the face evaluator"}
 
@@ -231,7 +238,13 @@ class _Evaluation(EvaluationUnits):
     @cached_property
     def _nearest_captions(self) -> dict[str, list[Truth]]:
         """The training clip that each lookup finds for every caption."""
-        found = {row: lookup(self.train, self.truths) for row, lookup in LOOKUPS.items()}
+        models = [judge.motions for judge in self.judges.values()]
+        texts = [model.given["text"] for model in models if isinstance(model, LoadedTma)]
+        caches = [text.cache for text in texts if not text.exported]
+        found = {
+            NEAREST_WORDS: by_nearest_caption(self.train, self.truths, caches),
+            NEAREST_LABELS: by_nearest_labels(self.train, self.truths),
+        }
         return {row: clips for row, clips in found.items() if clips}
 
     @cached_property

@@ -198,7 +198,9 @@ class EvaluationUnits(Evaluation):
         assert tokenizer is not None
         bodies = [reconstruct_truth(tokenizer, truth) for truth in truths]
         pairs = list(zip(truths, bodies, strict=True))
-        out = as_table([clip_errors(tokenizer, self._nearest, truth, body) for truth, body in pairs], JOINTS)
+        nearest = self._nearest.motions(truths)
+        errors = [clip_errors(tokenizer, near, *pair) for near, pair in zip(nearest, pairs, strict=True)]
+        out = as_table(errors, JOINTS)
         fps = self.dataset.layout.fps
         layout = tokenizer.layout
         shown = [Performance(joints_of(body, layout), t.joints, fps, t.face, t.truth) for t, body in pairs]

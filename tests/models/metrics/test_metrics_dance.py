@@ -9,6 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from motionloom.models.metrics import retrieval
 from motionloom.models.metrics.dance import (
     dance_diversity,
     dance_fid,
@@ -20,7 +21,7 @@ from motionloom.models.metrics.dance import (
 )
 from motionloom.models.metrics.dance_beats import alignment, beat_align, motion_beats
 from motionloom.models.metrics.dance_features import kinetic_features, manual_features, zero_start
-from motionloom.models.metrics.retrieval import accuracy_among
+from motionloom.models.metrics.retrieval import accuracy_among, other_texts
 
 
 @pytest.fixture(scope="module")
@@ -112,12 +113,14 @@ def test_sliding_feet_are_counted() -> None:
     assert foot_skating(joints, 20.0) == 0
 
 
-def test_accuracy_among_candidates() -> None:
+def test_accuracy_among_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     generator = torch.Generator().manual_seed(3)
     text = torch.randn(80, 16, generator=generator)
-    assert accuracy_among(text, text) == {"top-1": 1.0, "top-5": 1.0}
-    assert accuracy_among(torch.ones(80, 4), torch.ones(80, 4)) == {"top-1": 0.0, "top-5": 0.0}
-    chance = accuracy_among(torch.randn(80, 16, generator=generator), text, candidates=5, tops=(1, 5))
+    alone = torch.arange(80)
+    among = other_texts(alone, 60)
+    assert accuracy_among(text, text, among) == {"top-1": 1.0, "top-5": 1.0}
+    assert accuracy_among(torch.ones(80, 4), torch.ones(80, 4), among) == {"top-1": 0.0, "top-5": 0.0}
+    chance = accuracy_among(torch.randn(80, 16, generator=generator), text, other_texts(alone, 4))
     assert chance["top-5"] == 1
     assert 0.05 < chance["top-1"] < 0.4
     # All texts among the candidates: the rank in the whole matrix.
@@ -126,14 +129,20 @@ def test_accuracy_among_candidates() -> None:
         torch.nn.functional.normalize(motion.double(), dim=-1)
         @ torch.nn.functional.normalize(text.double(), dim=-1).T
     )
-    first = float((near.argmax(1) == torch.arange(80)).double().mean())
-    assert accuracy_among(motion, text, candidates=80)["top-1"] == first
+    first = float((near.argmax(1) == alone).double().mean())
+    assert accuracy_among(motion, text, other_texts(alone, 79))["top-1"] == first
     twins = torch.cat([text, text])
-    equal = torch.eye(80, dtype=torch.bool).repeat(2, 2)
-    assert accuracy_among(twins, twins, candidates=150, same=equal)["top-1"] == 1
-    # One equal rival ties, which is right, or by rounding goes before; two are before on any machine.
+    drawn = other_texts(alone.repeat(2), 149)
+    assert accuracy_among(twins, twins, drawn)["top-1"] == 1
+    # One equal rival ties, which is right; two are before.
+    assert accuracy_among(twins, twins, other_texts(torch.arange(160), 159))["top-1"] == 1
     triplets = torch.cat([text] * 3)
-    assert accuracy_among(triplets, triplets, candidates=240)["top-1"] < 0.9
+    assert accuracy_among(triplets, triplets, other_texts(torch.arange(240), 239))["top-1"] == 0
+    # Drawn in blocks of rows as from one matrix of draws.
+    draws = torch.rand(160, 160, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    draws[alone.repeat(2)[:, None] == alone.repeat(2)] = -1
+    monkeypatch.setattr(retrieval, "_ROWS", 7)
+    assert other_texts(alone.repeat(2), 30, seed=5).equal(draws.topk(30, dim=1).indices)
 
 
 # Physics of motions whose answers are known.

@@ -8,8 +8,17 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from motionloom.models.metrics import retrieval
 from motionloom.models.metrics.distributions import diversity, fid, frechet_distance, multimodality
-from motionloom.models.metrics.retrieval import accuracy_among, matching_score, r_precision, ranks, recall
+from motionloom.models.metrics.retrieval import (
+    Distance,
+    accuracy_among,
+    matching_score,
+    other_texts,
+    r_precision,
+    ranks,
+    recall,
+)
 
 
 def close(value: torch.Tensor, expected: torch.Tensor) -> None:
@@ -40,7 +49,7 @@ def test_what_is_no_number_is_found_last() -> None:
     for pair in ((text, lost), (lost, text)):
         assert r_precision(*pair, batch=8).tolist() == [0.5, 0.5, 0.5]
     assert recall(text, torch.full_like(text, torch.nan))["t2m/R@1"] == 0
-    assert accuracy_among(lost, text, candidates=4)["top-1"] <= 0.5
+    assert accuracy_among(lost, text, other_texts(torch.arange(8), 3))["top-1"] <= 0.5
 
 
 @pytest.mark.parametrize("threshold", [None, 0.9])
@@ -55,6 +64,21 @@ def test_recall_equals_tmr(golden: dict[str, torch.Tensor], threshold: float | N
         mine += [100 * out[f"{way}/R@{k}"] for k in (1, 2, 3, 5, 10)]
         mine.append(out["size"])
     assert mine == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("distance", ["cosine", "euclidean"])
+@pytest.mark.parametrize("threshold", [None, 0.9])
+def test_blocks_of_rows_give_the_ranks_of_the_whole_matrix(
+    golden: dict[str, torch.Tensor],
+    monkeypatch: pytest.MonkeyPatch,
+    threshold: float | None,
+    distance: Distance,
+) -> None:
+    text, motion, sentence = golden["text"][:100], golden["gt"][:100], golden["tmr_sent_emb"][:100]
+    how = {"sentence": sentence if threshold else None, "threshold": threshold, "distance": distance}
+    whole = recall(text, motion, **how)
+    monkeypatch.setattr(retrieval, "_ROWS", 7)
+    assert recall(text, motion, **how) == whole
 
 
 def test_small_sets_are_easier_and_seeded(golden: dict[str, torch.Tensor]) -> None:

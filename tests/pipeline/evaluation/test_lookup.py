@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from motionloom.datasets.base.records import PRESENT_ALL
 from motionloom.datasets.shards.reader import ShardDataset
 from motionloom.datasets.synth.generate import SynthConfig, synthesize
+from motionloom.pipeline.evaluation import reference_baselines
 from motionloom.pipeline.evaluation.clip_metrics import Performance, measure_clip, metrics_of
-from motionloom.pipeline.evaluation.reference_baselines import by_nearest_caption, by_nearest_labels
+from motionloom.pipeline.evaluation.reference_baselines import (
+    NearestClip,
+    by_nearest_caption,
+    by_nearest_labels,
+)
 from motionloom.pipeline.evaluation.truth import has_caption, truth_of
 
 
@@ -57,3 +64,21 @@ def test_what_was_trained_on_is_found_itself(splits: tuple[ShardDataset, ShardDa
     assert by_nearest_labels(train, [replace(truths[0], truth=None)]) == [], (
         "data without truth have no labels"
     )
+
+
+def test_the_nearest_clip_in_blocks_is_that_of_every_difference(
+    splits: tuple[ShardDataset, ShardDataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By float64 differences of all frames; of clips that float32 cannot tell apart the first nearest."""
+    train, test = splits
+    monkeypatch.setattr(reference_baselines, "_TOGETHER", 3)
+    truths = [truth_of(test, index) for index in range(len(test))]
+    truths += [truth_of(train, index) for index in range(5)]
+    whole = NearestClip(train)
+    keys = np.array([np.concatenate(whole._key_of(clip)) for clip in range(len(train))])
+    want = [np.square(keys - np.concatenate(whole._key(t.features))).sum(1).argmin() for t in truths]
+    close = truths[0].features * np.float32(1 + 3e-7)
+    found = whole.find([t.features for t in truths] + [close], [PRESENT_ALL] * (len(truths) + 1))
+    assert found == [*want, want[0]] and found[len(test) : -1] == list(range(5))
+    for near, t in zip(whole.motions(truths), truths, strict=True):
+        assert near[1].shape[0] == len(t.features)
