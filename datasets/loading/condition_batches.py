@@ -36,6 +36,9 @@ _CAPTION = 2
 _CROP = 3
 _DROP = 4
 
+_KEPT = 2**15
+"""Clips whose captions a process keeps, about 20 MB: all of HumanML3D's."""
+
 Captioned = Literal["body", "face"]
 """Subject of the captions that every clip must have."""
 
@@ -106,7 +109,7 @@ class ConditionedClips:
         for column, member in enumerate(self.members.values()):
             self.present[:, column] = dataset.has(member)
         self._captions: dict[int, list[CaptionSpan]] = {}
-        """Captions of the clips that were drawn so far, by clip."""
+        """Captions of clips that were drawn, by clip."""
 
     @property
     def names(self) -> list[str]:
@@ -126,6 +129,8 @@ class ConditionedClips:
                 out.append(CaptionSpan("", 0, int(self.dataset.frames[clip])))
                 continue
             if clip not in self._captions:
+                if len(self._captions) >= _KEPT:
+                    self._captions.clear()
                 self._captions[clip] = self._read_captions(clip)
             choices = self._captions[clip]
             out.append(choices[int(draw * len(choices))])

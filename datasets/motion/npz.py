@@ -6,11 +6,15 @@ though, and a file may state any size, so headers are read first and compared wi
 
 from __future__ import annotations
 
+import io
 import math
+import mmap
 import os
+import struct
 import sys
 import warnings
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -123,6 +127,7 @@ class NpzFile:
             raise UserError(f"{self.label}: cannot be read ({error.strerror or error})") from None
         except (zipfile.BadZipFile, NotImplementedError, ValueError):
             raise UserError(f"{self.label}: not an .npz file, or cut off") from None
+        self._map: mmap.mmap | None = None
         names = [name for name in self._zip.namelist() if name.endswith(".npy")]
         self.names = frozenset(name.removesuffix(".npy") for name in names)
 
@@ -141,8 +146,29 @@ class NpzFile:
                 stream, f"{self.label}: array '{name}'", self._zip.getinfo(f"{name}.npy").file_size
             )
 
-    def array(self, name: str, *, limit: int = MAX_BYTES, itemsize: int = 0) -> NDArray[Any]:
-        """An array; `itemsize` is what a value takes once it is converted, where that is more."""
+    def mapped(self, name: str, *, limit: int = MAX_BYTES) -> NDArray[Any]:
+        """An array as it lies in the file, read-only and in memory that all processes share; `array` for one
+        that is packed. Its bytes are compared with their checksum."""
+        info = self._zip.NameToInfo.get(f"{name}.npy")
+        file: Any = self._zip.fp
+        if info is None or info.compress_type != zipfile.ZIP_STORED or isinstance(file, io.BytesIO):
+            return self.array(name, limit=limit)
+        header = self._header_within(name, limit)
+        if not math.prod(header.shape):
+            return np.empty(header.shape, header.dtype)
+        if self._map is None:
+            self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        # Before the content stand 30 bytes, of which the last four say how long name and extra field are.
+        lengths = struct.unpack_from("<HH", self._map, info.header_offset + 26)
+        start = info.header_offset + 30 + sum(lengths)
+        content = memoryview(self._map)[start : start + info.file_size]
+        if len(content) != header.end or zlib.crc32(content) != info.CRC:
+            raise UserError(f"{self.label}: array '{name}' is damaged (Bad CRC-32)")
+        order: Literal["C", "F"] = "F" if header.fortran else "C"
+        return np.ndarray(header.shape, header.dtype, self._map, start + header.start, order=order)
+
+    def _header_within(self, name: str, limit: int, itemsize: int = 0) -> ArrayHeader:
+        """`header` of an array that takes no more memory than it may."""
         header = self.header(name)
         size = header.start + math.prod(header.shape) * max(header.dtype.itemsize, itemsize)
         most = min(limit, _SPARE + _PACKED * self._zip.getinfo(f"{name}.npy").compress_size)
@@ -151,6 +177,11 @@ class NpzFile:
                 f"{self.label}: array '{name}' of shape {list(header.shape)} takes {size:,} bytes; more than "
                 f"{most:,} are not read"
             )
+        return header
+
+    def array(self, name: str, *, limit: int = MAX_BYTES, itemsize: int = 0) -> NDArray[Any]:
+        """An array; `itemsize` is what a value takes once it is converted, where that is more."""
+        self._header_within(name, limit, itemsize)
         # The stream is opened anew: the header has been read off the first one, and zips do not seek cheaply.
         with self._open(name) as stream:
             found = np.asarray(npy_format.read_array(stream, allow_pickle=False))

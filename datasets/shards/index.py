@@ -205,7 +205,7 @@ def read_index(file: BinaryIO, where: str, split: Split, shards: list[ShardInfo]
         with NpzFile(file, where) as stored:
             limits = {"id_bytes": _MOST_ID_BYTES, "offsets": 8 * len(MEMBERS), "sizes": 4 * len(MEMBERS)}
             arrays = {
-                name: stored.array(f"{split}.{name}", limit=clips * limits.get(name, 8) + 4096)
+                name: stored.mapped(f"{split}.{name}", limit=clips * limits.get(name, 8) + 4096)
                 for name in _ARRAYS
             }
     except UserError as error:

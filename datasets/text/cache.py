@@ -17,8 +17,10 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +29,9 @@ from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.json_doors import parse_json, read_plain
 from motionloom.datasets.motion.npz import map_npy
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 SIMILARITY = "similarity"
 _KEY = np.dtype("S32")
@@ -89,10 +94,16 @@ class TextCache:
 
     def similarity(self, captions: Sequence[str]) -> NDArray[np.float32]:
         """Unit-length embeddings whose cosines say which captions mean the same, [n, S]."""
-        found = (self._other or self).sentence(captions)
-        length = np.linalg.norm(found, axis=1, keepdims=True)
-        # What has length 1 already stays as it is, to the bit.
-        return np.where(abs(length - 1) < 1e-5, found, found / length.clip(min=1e-12))
+        return _unit((self._other or self).sentence(captions))
+
+    def sentences(self, captions: Sequence[str]) -> CaptionVectors:
+        """`sentence` of all these captions, by number."""
+        return CaptionVectors(self, self._rows(captions))
+
+    def similarities(self, captions: Sequence[str]) -> CaptionVectors:
+        """`similarity` of all these captions, by number."""
+        cache = self._other or self
+        return CaptionVectors(cache, cache._rows(captions), unit=True)
 
     def tokens(self, captions: Sequence[str]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Token embeddings [n, S, E], zero padded to the longest, and the mask [n, S] of real tokens."""
@@ -146,6 +157,30 @@ class TextCache:
 
     def __setstate__(self, folder: Path) -> None:
         TextCache.__init__(self, folder)
+
+
+def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Vectors [n, E] of length 1; those that have it stay as they are, to the bit."""
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.where(abs(length - 1) < 1e-5, vectors, vectors / length.clip(min=1e-12))
+
+
+@dataclass(frozen=True)
+class CaptionVectors:
+    """Vectors of m captions, read from the cache's files where they are asked for: a process holds none."""
+
+    cache: TextCache
+    rows: NDArray[np.int64]
+    """The captions' rows in the cache, [m]."""
+    unit: bool = False
+    """Scaled to length 1."""
+
+    def __getitem__(self, numbers: NDArray[np.int64]) -> Tensor:
+        """Vectors float32 [n, E] of captions by their numbers."""
+        import torch  # only batches pay for the import
+
+        found = np.asarray(self.cache._sentence[self.rows[numbers]], dtype=np.float32)
+        return torch.from_numpy(_unit(found) if self.unit else found)
 
 
 @lru_cache(2**16)  # a training asks for the same captions three times a batch, epoch after epoch

@@ -59,7 +59,7 @@ class NearestClip:
         for clip in range(len(train)):
             for table, part in zip(self.keys, self._key_of(clip), strict=True):
                 table[clip] = part
-        self.norms = [np.square(part).sum(1) for part in self.keys]
+        self.norms = [np.einsum("ij,ij->i", part, part) for part in self.keys]
         self.with_hands = (train.present & HANDS) > 0
 
     def _key_of(self, clip: int) -> list[NDArray[np.float64]]:

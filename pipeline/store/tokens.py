@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -40,7 +40,9 @@ Codes = dict[str, Tensor]
 
 @dataclass(frozen=True)
 class TokenStore:
-    """Codes of every clip of a split. `groups[i]` is the length of clip i in groups."""
+    """Codes of every clip of a split, integers [sum]: those of a file are mapped, and all processes share
+    them. `groups[i]` is the length of clip i in groups.
+    """
 
     codes: Codes
     starts: NDArray[np.int64]
@@ -56,7 +58,7 @@ class TokenStore:
         """Codes of groups `begin` + 0 .. `count` [B], int64 [B, most * per_group] a stream, with padding."""
         places = begin[:, None] + np.arange(count.max())
         groups = torch.from_numpy(np.minimum(places, self.starts[-1] - 1))
-        return {name: flat.reshape(-1, n)[groups].flatten(1) for (name, flat), n in self._streams()}
+        return {name: flat.view(-1, n)[groups].flatten(1).long() for (name, flat), n in self._streams()}
 
     def whole_clips(self) -> TokenStore:
         return self.of(self.whole)
@@ -92,7 +94,7 @@ class TokenStore:
             whole = tensors["whole"].numpy()
         except (SafetensorError, KeyError, TypeError) as error:
             raise UserError(f"{path}: cannot be read ({error}); run the tokens stage again") from None
-        codes = {k.removeprefix("codes."): v.long() for k, v in tensors.items() if k.startswith("codes.")}
+        codes = {k.removeprefix("codes."): v for k, v in tensors.items() if k.startswith("codes.")}
         if set(codes) != set(per_group):
             raise UserError(f"{path}: holds streams {sorted(codes)}, the tokenizer has {sorted(per_group)}")
         # Clips lie one after the other, and together they are all that is there.
@@ -144,6 +146,12 @@ class PresentTokens:
         return known_tokens(self.streams[self.bits[items]], batch, ends)
 
 
+class CaptionTable(Protocol):
+    """A vector for each caption: a tensor, or what reads it from the disk."""
+
+    def __getitem__(self, rows: NDArray[np.int64], /) -> Tensor: ...
+
+
 @dataclass(frozen=True)
 class TokenBatches(Dataset[dict[str, Any]]):
     """Batch k of token sequences and text priors; a pure function of (seed, k).
@@ -156,9 +164,9 @@ class TokenBatches(Dataset[dict[str, Any]]):
     store: TokenStore
     captions: TokenCaptions
     """The clips' captions; their rows are rows of `prior`."""
-    prior: Tensor
+    prior: CaptionTable
     """Text embeddings [n, E]."""
-    similarity: Tensor
+    similarity: CaptionTable
     """sBERT embeddings of the same captions [n, S]: which negatives of the alignment loss to leave out."""
     pattern: tuple[str, ...]
     ends: Mapping[str, int]
@@ -169,7 +177,7 @@ class TokenBatches(Dataset[dict[str, Any]]):
     training: bool = True
     sources: tuple[Source, ...] = ()
     """Data sets and their weights, when several are mixed."""
-    latents: Tensor | None = None
+    latents: CaptionTable | None = None
     """TMA's embeddings of the same captions [n, Z], for an alignment loss where `prior` is something else."""
     present: PresentTokens | None = None
     """Which tokens of the clips were recorded; None = all. Batches then also hold "known" bool [B, L] and

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 from pydantic import Field
-from torch import Tensor
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.models.gpt.losses import GptLossConfig
@@ -35,7 +34,7 @@ from motionloom.pipeline.training.warm_start import require_same_start, require_
 if TYPE_CHECKING:
     from motionloom.models.training.stage_module import StageModule
     from motionloom.pipeline.store.data import Data
-    from motionloom.pipeline.store.tokens import GptClips
+    from motionloom.pipeline.store.tokens import CaptionTable, GptClips
 
 Prior = Literal["tma", "sentence"]
 
@@ -155,16 +154,13 @@ class GptStage(TrainedStage[GptStageConfig, GptInputs, InterleavedGPT]):
                 log(f"{split}: {clips.uncaptioned} clips without a {kind} are left out")
             return clips
 
-        def tables(clips: GptClips) -> dict[str, Tensor | None]:
-            # All captions are embedded once, before the first batch.
+        def tables(clips: GptClips) -> dict[str, CaptionTable | None]:
+            # TMA reads all captions once, before the first batch.
             latents = tma.embed_captions(clips.texts, text) if tma is not None else None
-            if config.prior == "tma" and latents is not None:
-                prior = latents
-                latents = None
-            else:
-                prior = torch.as_tensor(text.sentence(clips.texts))
-            similarity = torch.as_tensor(text.similarity(clips.texts))
-            return {"prior": prior, "similarity": similarity, "latents": latents}
+            similarity = text.similarities(clips.texts)
+            if config.prior == "tma":
+                return {"prior": latents, "similarity": similarity}
+            return {"prior": text.sentences(clips.texts), "similarity": similarity, "latents": latents}
 
         return token_batches(net, clips_of, data.held_out().split, seed, tables)
 

@@ -7,9 +7,12 @@ import os
 import pickle
 import resource
 import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -22,11 +25,12 @@ from torch.utils.data._utils.pin_memory import pin_memory
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.os_errors import sentence_of
 from motionloom.datasets.conditions import Condition
+from motionloom.datasets.loading.shared import SharedBatches
 from motionloom.datasets.loading.steps import Steps
 from motionloom.pipeline.launch.hardware import Hardware
 from motionloom.pipeline.training import loaders
 from motionloom.pipeline.training.config import TrainConfig
-from motionloom.pipeline.training.loaders import SharedBatches, StageData, on_device
+from motionloom.pipeline.training.loaders import StageData, on_device
 from motionloom.pipeline.training.trained_stage import Batches
 
 GIB = 2**30
@@ -166,3 +170,16 @@ def test_the_next_batch_is_copied_while_one_is_computed(monkeypatch: pytest.Monk
     ]  # fmt: skip
     reading = iter(on_device(map(calls.append, range(2)), torch.device("cpu")))
     assert next(reading) is None and calls[-1] == 0, "a CPU reads no batch before its turn"
+
+
+def test_a_worker_imports_no_lightning(tmp_path: Path) -> None:
+    """What a worker is sent opens without it, which takes seconds and 200 MB in each of dozens of workers."""
+    ones = {"motion": torch.ones(2)}
+    (tmp_path / "sent").write_bytes(pickle.dumps(SharedBatches(Steps(lambda *_: {0: ones, 1: ones}, 2), 0)))
+    code = (
+        "import pathlib, pickle, sys; batches = pickle.loads(pathlib.Path(sys.argv[1]).read_bytes()); "
+        "print(len(list(batches)), 'lightning' in sys.modules, 'motionloom.pipeline' in sys.modules)"
+    )
+    command = [sys.executable, "-P", "-c", code, str(tmp_path / "sent")]
+    found = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert found.split() == ["2", "False", "False"]
