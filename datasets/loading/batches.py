@@ -78,6 +78,8 @@ class WindowBatches(Dataset[MotionBatch]):
         """Clips, first frames and lengths of batch `k`, each [n]."""
         turns, items = self.plan.local(k, self.share)
         clips = self.clips[items]
+        coming = self.plan.local(k + self.plan.ahead * self.share.parts, self.share)[1]
+        self.dataset.fetch(np.concatenate([clips, self.clips[coming]]))
         frames = self.dataset.frames[clips]
         draws = uniform(self.seed, _WINDOW, turns, clips, 0)
         starts = (draws * (np.maximum(frames - self.window, 0) + 1)).astype(np.int64)

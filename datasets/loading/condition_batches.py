@@ -214,6 +214,8 @@ class ConditionBatches(Dataset[ConditionBatch]):
     def __getitem__(self, k: int) -> ConditionBatch:
         turns, clips = self.plan.local(k, self.share)
         source = self.source
+        coming = self.plan.local(k + self.plan.ahead * self.share.parts, self.share)[1]
+        source.dataset.fetch(np.concatenate([clips, coming]))
         # Each purpose draws by a counter of its own, so that a change of one leaves the others as they were.
         draws = uniform(self.seed, _DROP, turns, clips)
         present = drop_some(self.drop, source.present[clips], source.names, draws)

@@ -171,6 +171,11 @@ class KindPlan:
                     ]
             self._whole = BatchPlan(len(self.clips), batch_size, seed, sources=sources)
 
+    @property
+    def ahead(self) -> int:
+        """As `BatchPlan.ahead`."""
+        return 1 if self._whole is None else self._whole.ahead
+
     def local(self, n: int, share: Share) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """(turns, clips), [batch_size / world / parts]: the share's rows, as `BatchPlan.local`."""
         if self._whole is not None:

@@ -98,6 +98,10 @@ class MixedDataset:
                 sources.append(replace(own[0], first=first, weight=weight))
         return tuple(sources)
 
+    def fetch(self, clips: NDArray[np.int64]) -> None:
+        for dataset, begin, end in self._ranges():
+            dataset.fetch(clips[(clips >= begin) & (clips < end)] - begin)
+
     def parts(self) -> list[tuple[ClipDataset, float]]:
         return self._parts
 

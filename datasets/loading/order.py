@@ -1,12 +1,16 @@
 """The order of one epoch's items: all shuffled, shard by shard, or mixed from several data sets.
 
 Every order here is a pure function of its key. The orders differ in what they ask of the storage: a global
-shuffle touches every shard all the time, the streamed order finishes one group of shards before the next.
+shuffle touches every shard all the time; the streamed order reads a few streams side by side, each one shard
+after another. Rows of a batch belong to streams, and so to processes: of 8 streams each of two nodes reads 4,
+half of the set, and the order is the one that any other number of nodes has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +38,30 @@ def source_order(source: Source, *key: int) -> NDArray[np.int64]:
     place[permutation(len(numbers), *key, 0, _SHARDS)] = np.arange(len(numbers))
     draws = words(source.count, *key, 0, _WITHIN)
     return source.first + np.lexsort((draws, place[shard] // source.group))
+
+
+def streamed_order(source: Source, size: int, *key: int) -> NDArray[np.int64]:
+    """Items of an epoch in batches of `size`: row by row of a batch first the first stream's next items, then
+    the second's. A source of fewer items than a batch is only shuffled.
+    """
+    # Each shard's clips in random order, the shards one after the other in random order.
+    order = source_order(replace(source, group=1), *key)
+    batches = len(order) // size
+    if not batches:
+        return order
+    # Streams are stretches of this, as long as their rows of all batches; where one ends within a shard the
+    # next goes on, so two streams at most read it. What is left at the end sits this epoch out.
+    streams = [
+        order[batches * rows.start : batches * rows.stop].reshape(batches, rows.stop - rows.start)
+        for rows in stream_rows(source, size)
+    ]
+    return np.concatenate(streams, axis=1).ravel()
+
+
+def stream_rows(source: Source, size: int) -> list[slice]:
+    """The rows of each stream in a batch of `size`; all are of one where the order is not streamed."""
+    count = source.group if source.shards is not None else 1
+    return [slice(first, end) for first, end in pairwise(n * size // count for n in range(count + 1))]
 
 
 def mixed_order(

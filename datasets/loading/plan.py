@@ -8,7 +8,7 @@ Every rank gets the same number of batches by construction.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.randomness import permutation
-from motionloom.datasets.loading.order import mixed_order, shares, source_order
+from motionloom.datasets.loading.order import mixed_order, shares, source_order, stream_rows, streamed_order
 from motionloom.datasets.shards.clips import Source
 
 POOL = 8
@@ -44,13 +44,13 @@ class BatchPlan:
     `batch_items - 1` items (different ones each epoch) sit an epoch out. With fewer items than one batch, the
     permutation repeats until the batch is full.
 
-    `sources` say how the items lie. One with shard numbers gives the streamed order (`order.source_order`).
+    `sources` say how the items lie. One with shard numbers gives the streamed order (`order.streamed_order`).
     Several are mixed by their weights (`order.mixed_order`): an epoch then is as many places as there are
     items in all sources, rounded down to whole batches, shared out exactly by weight.
 
     With `lengths` [num_items] a batch holds items of similar length, so that little of it is padding: every
-    `POOL` batches of the order are sorted by length and dealt out again in random order. Shares by weight
-    then hold for such a pool, not for each batch.
+    `POOL` batches of the order are sorted by length and dealt out again in random order, each stream's rows
+    by themselves. Shares by weight then hold for such a pool, not for each batch.
     """
 
     def __init__(
@@ -72,12 +72,21 @@ class BatchPlan:
         self.sources = tuple(sources) or (Source(0, num_items),)
         if len(self.sources) > 1:
             shares(self.sources, self._used)  # too small a weight is refused now, not in a loader worker
+        self._streams = stream_rows(self.sources[0], batch_items)
         self._order = lru_cache(maxsize=2)(self._epoch)
 
     @property
     def batches_per_epoch(self) -> int:
         """Global batches in one epoch, at least 1."""
         return max(1, self.num_items // self.batch_items)
+
+    @cached_property
+    def ahead(self) -> int:
+        """Batches between a shard's first one and that of its stream's next shard; 1 in other orders."""
+        source = self.sources[0]
+        if source.shards is None or len(self.sources) > 1:
+            return 1
+        return max(1, source.group * source.count // (len(np.unique(source.shards)) * self.batch_items))
 
     @property
     def _used(self) -> int:
@@ -117,22 +126,29 @@ class BatchPlan:
         return turns[first : first + size], items[first : first + size]
 
     def _epoch(self, epoch: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        if len(self.sources) == 1:
-            order = source_order(self.sources[0], self.seed, epoch)
-            turns = np.full(len(order), epoch)
-        else:
+        source = self.sources[0]
+        if len(self.sources) > 1:
             order, turns = mixed_order(self.sources, self._used, self.seed, epoch)
+        else:
+            if source.shards is None:
+                order = source_order(source, self.seed, epoch)
+            else:
+                order = streamed_order(source, self.batch_items, self.seed, epoch)
+            turns = np.full(len(order), epoch)
         if self.lengths is None or len(order) < self.batch_items:
             return order, turns
-        size = self.batch_items
-        used = self._used
-        for start in range(0, used, POOL * size):
-            end = min(start + POOL * size, used)
-            by_length = np.argsort(self.lengths[order[start:end]], kind="stable").reshape(-1, size)
+        columns = [slice(self.batch_items)] if len(self.sources) > 1 else self._streams
+        tables = [values[: self._used].reshape(-1, self.batch_items) for values in (order, turns)]
+        for first in range(0, self.batches_per_epoch, POOL):
+            pool = slice(first, min(first + POOL, self.batches_per_epoch))
             # The epoch's own number keeps this draw apart from that of the permutation itself.
-            dealt = start + by_length[permutation(len(by_length), self.seed, epoch, start + 1)].ravel()
-            order[start:end] = order[dealt]
-            turns[start:end] = turns[dealt]
+            dealt = permutation(pool.stop - first, self.seed, epoch, first * self.batch_items + 1)
+            # A stream's rows stay its own, so that nobody else reads its shards.
+            for rows in columns:
+                lengths = self.lengths[tables[0][pool, rows]]
+                by_length = np.argsort(lengths, axis=None, kind="stable").reshape(lengths.shape)[dealt]
+                for table in tables:
+                    table[pool, rows] = table[pool, rows].ravel()[by_length]
         return order, turns
 
     def __getstate__(self) -> dict[str, object]:

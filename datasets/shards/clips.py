@@ -27,7 +27,8 @@ class Source:
     shards: NDArray[np.int32] | None = None
     """Shard of each item, [count], for the streamed order; None for the global one."""
     group: int = 1
-    """Shards whose items are shuffled together in the streamed order."""
+    """Streams that the streamed order reads side by side, which mixes so many shards. In a mix of data sets,
+    the shards whose items are shuffled together."""
     name: str = ""
 
 
@@ -84,6 +85,10 @@ class ClipDataset(Protocol):
 
     def sources(self, clips: NDArray[np.int64] | None = None) -> tuple[Source, ...]:
         """Return the order and mix of a batch plan over `clips` (ascending numbers; all when None)."""
+        ...
+
+    def fetch(self, clips: NDArray[np.int64]) -> None:
+        """Begin to bring the shards of clips that will be read soon to this machine, where they are not."""
         ...
 
     def parts(self) -> Sequence[tuple[ClipDataset, float]]:

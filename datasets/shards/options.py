@@ -106,8 +106,9 @@ class Reading(Config):
     """Reader and order of one data set."""
 
     order: Literal["global", "streamed"] = "global"
-    """`global` shuffles all clips each epoch; `streamed` shuffles shards, and the clips of
-    `shards_per_group` shards at a time, so that a small cache or a slow disk serves a large data set."""
+    """`global` shuffles all clips each epoch; `streamed` shuffles shards, and mixes the clips of
+    `shards_per_group` at a time, so that a small cache or a slow disk serves a large data set."""
     shards_per_group: int = Field(8, ge=1)
-    """Shards whose clips are mixed in the streamed order."""
+    """Shards whose clips are mixed in the streamed order. Where it is a multiple of the nodes, and of
+    `accumulate` times these, each node reads its share of the shards alone."""
     cache: CacheConfig = CacheConfig()

@@ -17,10 +17,13 @@ import os
 import re
 import resource
 from bisect import bisect_right
-from collections import OrderedDict
+from collections import OrderedDict, deque
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache, cached_property
 from itertools import accumulate
 from pathlib import Path
+from threading import Semaphore, Thread
 from typing import ClassVar
 from weakref import ReferenceType, ref
 
@@ -56,6 +59,14 @@ _SPARE = 512
 """Descriptors of a process that are not for shards: sockets, logs, loaders."""
 _MOST = 2**16
 """Descriptors that are asked for at most: for 16 million clips in shards of 256."""
+
+
+FETCHING = "shard ahead"
+"""Name of threads that download a shard."""
+_DOWNLOADS = Semaphore(8)
+"""Downloads of one process at a time, ahead of their reading."""
+_ASKED = 256
+"""Shards that were asked for last, and are not asked for again."""
 
 
 @cache
@@ -128,9 +139,21 @@ class OpenShards:
         self._self = ref(self)
         self._store = store
         self._shards = shards
+        self._coming: deque[int] = deque(maxlen=_ASKED)
         self._most = open_shards()
         if room:  # a deleted file takes disk space while it is open: at most an eighth of the cache may
             self._most = max(1, min(self._most, room // (8 * max(shard.bytes for shard in shards))))
+
+    def fetch(self, shards: Sequence[int]) -> None:
+        """Begin to download the shards of a server that are not open; what fails is tried again by `read`."""
+        for shard in shards:
+            if shard not in self.files and shard not in self._coming:
+                self._coming.append(shard)
+                Thread(target=self._fetch, args=(shard,), name=FETCHING, daemon=True).start()
+
+    def _fetch(self, shard: int) -> None:
+        with _DOWNLOADS, suppress(UserError):
+            os.close(self._store.open_shard(self._shards[shard]))
 
     def read(self, shard: int, start: int, size: int) -> bytes:
         """Return `size` bytes of a shard from `start` on; `UserError` if it is shorter or cannot be read."""
@@ -287,6 +310,11 @@ class ShardDataset:
         )
         shards = shards[self._rows if clips is None else self._rows[clips]]
         return (Source(0, count, shards=shards, group=self.reading.shards_per_group, name=self.where),)
+
+    def fetch(self, clips: NDArray[np.int64]) -> None:
+        if not isinstance(self._store, LocalStore):
+            shards = np.searchsorted(self._first, self._rows[clips], side="right") - 1
+            self._access.fetch(list(dict.fromkeys(shards.tolist())))
 
     def parts(self) -> list[tuple[ClipDataset, float]]:
         return [(self, 1.0)]

@@ -61,8 +61,9 @@ class ShardsStage(DataStage):
     """A checked pointer to shards that exist already."""
 
     def external(self, config: ShardsStageConfig) -> dict[str, Any]:
-        """Checksum of the manifest, which holds those of the shards."""
-        return {"manifest": config.manifest()[1]}
+        """Checksum of the manifest, which holds those of the shards, and what the streamed order is of."""
+        order = {"order": "streams"} if config.order == "streamed" else {}
+        return {"manifest": config.manifest()[1], **order}
 
     def settle(self, config: ShardsStageConfig, folder: Path) -> None:
         """Write settings of reading anew whenever the recipe runs: they change no result."""

@@ -26,7 +26,8 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.lock import LOCK_FILE, folder_lock
 from motionloom.datasets.base.records import Dropped
 from motionloom.datasets.check.dataset import check
-from motionloom.datasets.loading.plan import BatchPlan
+from motionloom.datasets.loading.order import stream_rows
+from motionloom.datasets.loading.plan import BatchPlan, Share
 from motionloom.datasets.shards import tasks
 from motionloom.datasets.shards.clips import Source
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, kind_of_reason, tally, write_left_out
@@ -295,33 +296,52 @@ def test_the_list_is_one_line_each_and_goes_when_there_is_nothing(tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
-# The streamed order: group of shards by group, other groups each epoch, the same for ever.
+# The streamed order: streams of shards side by side, other shards each epoch, the same for ever.
 
 
-def test_an_epoch_goes_group_by_group_and_epochs_differ() -> None:
-    shards = np.repeat(np.arange(12, dtype=np.int32), 10)
-    plan = BatchPlan(120, 15, 7, sources=(Source(0, 120, shards=shards, group=3),))
-    epochs = []
+@pytest.mark.parametrize(("size", "streams"), [(12, 4), (16, 4), (15, 4), (2, 3), (40, 1)])
+def test_streams_go_shard_by_shard_and_epochs_differ(size: int, streams: int) -> None:
+    shards = np.repeat(np.arange(24, dtype=np.int32), 10)
+    source = Source(0, 240, shards=shards, group=streams)
+    plan, steps = BatchPlan(240, size, 7, sources=(source,)), 240 // size
+    met = []
     for epoch in range(3):
-        items = np.concatenate([plan.batch(epoch * 8 + j)[1] for j in range(8)])
-        assert sorted(items) == list(range(120))
-        groups = [tuple(sorted(set(shards[part]))) for part in items.reshape(4, 30)]
-        assert all(len(group) == 3 for group in groups) and len({s for g in groups for s in g}) == 12
-        assert any(np.abs(np.diff(shards[part])).max() > 0 for part in items.reshape(4, 30)), (
-            "clips are mixed"
-        )
-        epochs.append((groups, items.tolist()))
-    assert epochs[0][0] != epochs[1][0] != epochs[2][0], "other shards meet in a group each epoch"
+        table = np.array([plan.batch(epoch * steps + j)[1] for j in range(steps)])
+        assert len(np.unique(table)) == steps * size > 240 - size
+        for rows in stream_rows(source, size):
+            own = shards[table[:, rows]].ravel()
+            changes = np.count_nonzero(np.diff(own))
+            assert changes == max(len(np.unique(own)) - 1, 0), "a stream finishes a shard before the next"
+        met.append(table.tolist())
+    assert met[0] != met[1] != met[2]
     late = pickle.loads(pickle.dumps(plan))
-    assert late.batch(20)[1].tolist() == plan.batch(20)[1].tolist()
+    assert late.batch(2 * steps)[1].tolist() == plan.batch(2 * steps)[1].tolist()
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+@pytest.mark.parametrize("by_length", [False, True])
+def test_nodes_read_the_shards_once_together(parts: int, by_length: bool) -> None:
+    """At most a tenth is read by two, at the borders of streams; more ranks on a node read no more."""
+    shards = np.repeat(np.arange(320, dtype=np.int32), 20)
+    lengths = np.random.default_rng(0).integers(1, 99, 6400) if by_length else None
+    plan = BatchPlan(6400, 64, 3, lengths, sources=(Source(0, 6400, shards=shards, group=8),))
+    for nodes in (1, 2, 4):
+        first: list[int] = []
+        for node in range(nodes):
+            ranks = [Share(rank, 2 * nodes, parts) for rank in (2 * node, 2 * node + 1)]
+            steps = range(plan.batches_per_epoch * parts)
+            own = [np.concatenate([plan.local(n, share)[1] for share in ranks]) for n in steps]
+            read = np.unique(shards[np.concatenate(own)])
+            assert len(read) <= 1.1 * 320 / nodes
+            first.append(len(np.unique(shards[np.concatenate(own[:parts])])))
+        assert by_length or max(first) <= 8 // nodes + 1, "shards before the first step"
 
 
 def test_the_streamed_order_is_fixed_for_ever() -> None:
     """A changed order would break every running experiment's resume: these numbers may never change."""
     shards = np.array([0, 0, 0, 1, 1, 2, 2, 2], dtype=np.int32)
-    plan = BatchPlan(8, 8, 3, sources=(Source(0, 8, shards=shards, group=2),))
-    assert plan.batch(0)[1].tolist() == [1, 0, 2, 3, 4, 6, 7, 5]
-    assert plan.batch(1)[1].tolist() == [2, 4, 3, 1, 0, 7, 6, 5]
+    plan = BatchPlan(8, 4, 3, sources=(Source(0, 8, shards=shards, group=2),))
+    assert [plan.batch(k)[1].tolist() for k in range(3)] == [[3, 4, 2, 6], [1, 0, 7, 5], [2, 1, 3, 7]]
 
 
 def test_filtered_clips_and_lengths_keep_the_groups() -> None:
@@ -337,4 +357,4 @@ def test_filtered_clips_and_lengths_keep_the_groups() -> None:
     )
     for start in range(0, len(steps) - 8, 8):
         pool = np.concatenate([pooled.batch(k)[1] for k in range(start, start + 8)])
-        assert len(set(shards[pool])) <= 16, "a pool of eight batches lies in two groups"
+        assert len(set(shards[pool])) <= 16, "a pool of eight batches lies in two shards a stream"

@@ -7,18 +7,24 @@ import multiprocessing
 import pickle
 import shutil
 import sys
+import threading
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from types import ModuleType
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 import pytest
+import torch
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.datasets.loading.batches import WindowBatches
+from motionloom.datasets.loading.plan import Share
+from motionloom.datasets.loading.statistics import compute
 from motionloom.datasets.shards import store as retry
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 from motionloom.datasets.shards.options import Reading
-from motionloom.datasets.shards.reader import ShardDataset
+from motionloom.datasets.shards.reader import FETCHING, ShardDataset
 from motionloom.datasets.shards.store import LocalStore, open_store
 
 
@@ -164,6 +170,42 @@ def test_pauses_grow_and_leave_the_runs_random_numbers_alone(monkeypatch: pytest
     assert all(whole / 2 <= pause <= whole for pause, whole in zip(pauses, wholes, strict=True))
     with pytest.raises(ZeroDivisionError):
         retry.persist("x", lambda: 1 // 0)
+
+
+def test_two_nodes_fetch_the_set_once_together_and_ahead(
+    made: ModuleType, loopback: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each with a cache of a seventh of the set; after the first batch no reader waits for a download."""
+    made.write(tmp_path / "data", 1200, clips_per_shard=8)
+    whole = ShardDataset.open(tmp_path / "data", "train", reading=Reading(order="streamed"))
+    stats = compute(whole)
+    waited: list[str] = []
+
+    def get(cache: FileCache, name: str, *how: Any, real: Any = FileCache.get) -> BinaryIO:
+        if threading.current_thread() is threading.main_thread() and not (cache.folder / name).exists():
+            waited.append(name)
+        return cast(BinaryIO, real(cache, name, *how))
+
+    shards = [shard for shard in whole.manifest.shards if shard.split == "train"]
+    room = sum(shard.bytes for shard in shards) / 7e9
+    with loopback.web(tmp_path / "data") as (url, seen):
+        for rank in range(2):
+            share = Share(rank, 2)
+            cache = CacheConfig(folder=str(tmp_path / f"cache{rank}"), gigabytes=room)
+            remote = ShardDataset.open(url, "train", reading=Reading(order="streamed", cache=cache))
+            nodes = [WindowBatches(d, stats, window=8, batch_size=16, share=share) for d in (remote, whole)]
+            monkeypatch.setattr(FileCache, "get", get)
+            seen.clear()
+            for k in range(nodes[0].plan.batches_per_epoch - 4):  # behind them is the next epoch's beginning
+                assert torch.equal(nodes[0][k]["motion"], nodes[1][k]["motion"])
+                for thread in threading.enumerate():
+                    if thread.name == FETCHING:
+                        thread.join()
+                if k == 0:
+                    assert len(seen) <= 2 * 4 + 1
+                    waited.clear()
+            assert not waited and len(seen) == len(set(seen)) <= 1.1 * len(shards) / 2
+            monkeypatch.undo()
 
 
 @pytest.fixture
