@@ -6,40 +6,34 @@ Notable choices:
   depends on its text, its seed and the settings, and on nothing else in the batch. Batched matrix products
   round in their own way, so a draw within 1e-6 of a boundary of the distribution can still differ.
 - Guidance runs the conditional and the unconditional half in one forward.
-- On a GPU each token of the GPT is one CUDA graph. Matrix products are computed in the type of the weights,
-  float32 in every bundle, or as `torch.autocast` around the call says. Half precision is not the default:
-  with it, the same seed makes another motion than on a CPU.
+- Once half of the rows have ended, the others go on without them.
+- On a GPU each token of the GPT is one CUDA graph (`decoding.py`). Matrix products are computed in the type
+  of the weights, float32 in every bundle, or as `torch.autocast` around the call says. Half precision is not
+  the default: with it, the same seed makes another motion than on a CPU.
 
 Legend: B batch, V vocabulary, G groups, P slots of a group, D width.
 """
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from motionloom.datasets.base.errors import UserError
+from motionloom.models.gpt.decoding import ROOM, advance, run_fixed
 from motionloom.models.gpt.network import InterleavedGPT
 from motionloom.models.gpt.tokens import Codes, TokenNetwork, as_codes
-from motionloom.models.layers.attention import KVCache
+from motionloom.models.layers.attention import to_front
 from motionloom.models.layers.frozen import evaluating
-from motionloom.models.layers.graphs import recorded
-from motionloom.models.layers.linear import product_type
 from motionloom.models.layers.seeds import sample_seeds as sample_seeds
 
 _LOOK = 16
 """Tokens after which a GPU is asked whether all rows have ended: it is waited for then."""
-
-_ROOM = 32
-"""Places of a cache of fixed size are a multiple of this, so that few lengths have a graph of their own."""
 
 _FIXED = {"cuda"}
 """Kinds of devices on which a step has the same shapes all along. Elsewhere attention is over the positions
@@ -74,7 +68,7 @@ class Drawing:
         # In whole numbers, which a GPU adds up to the same sums every time. Of 2^52, so that no uniform
         # number, a multiple of 2^-53 below 1, is rounded up to the whole sum: no token begins there.
         mass = (scaled.softmax(-1) * 2**52).long().cumsum(-1)
-        at = torch.searchsorted(mass, (uniform[:, None] * mass[:, -1:]).long(), right=True)[:, 0]
+        at = (mass <= (uniform[:, None] * mass[:, -1:]).long()).sum(-1)
         return at.clamp(max=logits.shape[-1] - 1)  # of NaN all are passed; on a GPU no index may lie outside
 
 
@@ -176,8 +170,8 @@ class Rows:
         """Number of the token to draw, int64 [1]."""
         self.tokens = functional.pad(start, (0, max(0, self.last - start.shape[1])))
         """int64 [B, N * P]; behind a row's End or limit they mean nothing."""
-        self.before = before
-        self.limit = limit
+        self.before = before.clone()  # rows move in these
+        self.limit = limit.clone()
         self.scale = scale
         number = torch.arange(self.tokens.shape[1], device=limit.device)
         group = number // self.size
@@ -201,14 +195,17 @@ class Rows:
             """Input of the next step, of `first`'s shape."""
 
     def draw(self, hidden: Tensor) -> None:
-        """Draw token number `at` of each row by the network's output there [B, 1, D], of guidance [2B, 1, D].
+        """Draw token number `at` of each row by the network's output there: [B, 1, D], with guidance 2B."""
+        # One product for all streams' heads, of which one is taken.
+        self.draw_by(functional.linear(hidden[:, 0].to(self.weight.dtype), self.weight, self.bias))
+
+    def draw_by(self, heads: Tensor) -> None:
+        """Draw token number `at` by the outputs of all heads [B, S * V], of guidance [2B, S * V].
 
         Nothing here waits for the device, and no shape depends on what lies there.
         """
         at = self.at
         kind = self.kinds.index_select(0, self.at)
-        # One product for all streams' heads, of which one is taken.
-        heads = functional.linear(hidden[:, 0].to(self.weight.dtype), self.weight, self.bias)
         logits = heads.view(len(heads), -1, self.illegal.shape[1]).index_select(1, kind)[:, 0].float()
         logits = logits if self.scale is None else guide(logits, self.scale)
         illegal = self.illegal[self.rules.index_select(1, at)[:, 0]]
@@ -228,77 +225,59 @@ class Rows:
         ended = (new & (heads == self.end)).cumsum(1) > 0
         return torch.minimum((new & ~ended).sum(1), self.limit)
 
-    def done(self) -> bool:
-        """Whether no row draws or reads its start any more."""
-        return bool((self.at // self.size >= self.before + self.counts()).all())
+    def going(self) -> Tensor:
+        """Bool [B], rows that still draw or read their start."""
+        return self.at // self.size < self.before + self.counts()
 
-    def run(self, step: Callable[[int], None]) -> tuple[Tensor, Tensor]:
+    def run(
+        self, step: Callable[[int], None], leave: Callable[[Tensor], None] | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Take `step`, which calls `draw`, for each number in order; all tokens int64 [B, N * P], those of
         the start included, and the numbers of new groups int64 [B].
+
+        Args:
+            step: Takes the number of the token.
+            leave: Moves to the front what belongs to these rows, int64 [b], of guidance [2b], of all that a
+                step reads besides; the others have ended. None keeps all rows to the end.
         """
         every = _LOOK if self.at.is_cuda else self.size
+        tokens = self.tokens.clone()
+        counts = self.counts()
+        place = torch.arange(len(tokens), device=tokens.device)
+
+        def write() -> None:
+            tokens.index_copy_(0, place, self.tokens)
+            counts.index_copy_(0, place, self.counts())
+
         for number in range(self.first, self.last):
-            if (number - self.first) % every == 0 and self.done():
-                break
+            if (number - self.first) % every == 0:
+                going = self.going()
+                count = int(going.sum())
+                if count == 0:
+                    break
+                # Halves, so that steps come in few shapes and rows are moved a few times only.
+                size = len(place)
+                while size > 1 and (half := (size + 1) // 2) >= count:
+                    size = half
+                if leave is not None and size < len(place):
+                    write()
+                    rows = going.int().argsort(descending=True, stable=True)[:size]
+                    place = place[rows]
+                    leave(self.keep(rows))
             step(number)
-        return self.tokens, self.counts()
+        write()
+        return tokens, counts
 
-
-def advance(gpt: InterleavedGPT, rows: Rows, cache: KVCache) -> None:
-    """Draw the next token of each row behind those that the cache holds."""
-    assert rows.x is not None
-    rows.draw(gpt.hidden(rows.x, cache))
-
-
-class FixedSteps:
-    """Steps of rows of one shape, of which a GPU makes one graph: a network, a cache and rows that stay where
-    they are, and are filled for each call.
-
-    The network is a copy, so that weights in training may lie anywhere. Its matrices have the type in which
-    their products are computed, as autocast would cast them at each use.
-    """
-
-    def __init__(self, shape: object, gpt: InterleavedGPT, rows: Rows) -> None:
-        self.shape = shape
-        self.gpt, self.rows = copy.deepcopy((gpt, rows))
-        for module in self.gpt.requires_grad_(False).modules():
-            if isinstance(module, nn.Linear):
-                module.to(product_type(module.weight))
-        self.cache = self.gpt.stack.cache(self.rows.tokens.shape[1], self.rows.at)
-        self.step = recorded(partial(advance, self.gpt, self.rows, self.cache), rows.at.device)
-
-    def run(self, gpt: InterleavedGPT, rows: Rows) -> tuple[Tensor, Tensor]:
-        """Draw rows of this shape; return as `Rows.run` does."""
-        torch._foreach_copy_(list(self.gpt.parameters()), list(gpt.parameters()))
-        for name, value in vars(rows).items():
-            if isinstance(value, Tensor):
-                getattr(self.rows, name).copy_(value)
-        self.rows.first = rows.first
-        self.rows.last = rows.last
-        self.cache.clear()
-        tokens, counts = self.rows.run(lambda _: self.step())
-        return tokens.clone(), counts
-
-
-_KEPT: WeakKeyDictionary[InterleavedGPT, FixedSteps] = WeakKeyDictionary()
-"""The steps that a network took last, for the next call of the same shape."""
-
-
-@torch.inference_mode(False)  # what is kept is written again, which tensors of that mode do not bear outside
-@torch.no_grad()
-def run_fixed(gpt: InterleavedGPT, rows: Rows) -> tuple[Tensor, Tensor]:
-    """Draw rows by steps of fixed shapes; return as `Rows.run` does."""
-    assert rows.x is not None
-    types = rows.x.dtype, gpt.positions.dtype, product_type(gpt.positions)
-    shape = rows.x.shape, rows.tokens.shape, rows.scale is None, rows.how, rows.x.device, types
-    # Taken out meanwhile: another thread with the same network makes its own.
-    steps = _KEPT.pop(gpt, None)
-    if steps is None or steps.shape != shape:
-        steps = None  # so that its memory is free for the next
-        steps = FixedSteps(shape, gpt, rows)
-    made = steps.run(gpt, rows)
-    _KEPT[gpt] = steps
-    return made
+    def keep(self, rows: Tensor) -> Tensor:
+        """Go on with these rows [b] alone; return their places in a step's input, int64 [b], of guidance
+        [2b].
+        """
+        inputs = rows if self.scale is None else torch.cat([rows, rows + len(self.tokens)])
+        for name in ("tokens", "before", "limit", "scale", "new", "draws", "rules"):
+            value = getattr(self, name)
+            setattr(self, name, value if value is None else to_front(value, rows))
+        self.x = None if self.x is None else to_front(self.x, inputs)
+        return inputs
 
 
 @torch.no_grad()
@@ -334,7 +313,7 @@ def generate(
     size = len(gpt.pattern)
     most = int(limit.max()) if batch else 0
     fixed = device.type in _FIXED and batch > 0
-    room = -(-most * size // _ROOM) * _ROOM if fixed else most * size
+    room = -(-most * size // ROOM) * ROOM if fixed else most * size
     # All numbers are drawn before the loop, so that a row does not depend on the others' lengths.
     uniform = uniform_numbers(seeds_of(seed, batch, "texts"), room, device)
     scale = torch.full((batch,), cfg_scale, device=device) if cfg_scale != 1 else None
@@ -352,5 +331,5 @@ def generate(
             tokens, counts = run_fixed(gpt, rows)
         else:
             cache = gpt.stack.cache(max(1, room))
-            tokens, counts = rows.run(lambda _: advance(gpt, rows, cache))
+            tokens, counts = rows.run(lambda _: advance(gpt, rows, cache), cache.keep)
     return as_codes(tokens[:, : most * size].reshape(batch, most, size), gpt.pattern, counts)

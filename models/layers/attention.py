@@ -72,41 +72,52 @@ def added_mask(mask: Tensor, x: Tensor) -> Tensor:
     return torch.zeros(hidden.shape, dtype=kind, device=x.device).masked_fill_(hidden, -torch.inf)[..., :size]
 
 
+def to_front(x: Tensor, rows: Tensor, dim: int = 0) -> Tensor:
+    """Copy these rows [b] of x to its front; return the front, b rows that share x's memory."""
+    front = x.narrow(dim, 0, len(rows))
+    front.copy_(x.index_select(dim, rows))
+    return front
+
+
 class LayerCache:
     """Keys and values [2, B, H, size, D/H] of the positions one layer has seen, made at the first append.
+    Later appends may be of the first rows only.
 
     `at` int64 [1] is where the next position is stored, by whoever decodes; without it the cache counts.
     """
 
     def __init__(self, size: int, at: Tensor | None = None) -> None:
         self.size = size
+        self.seen = size
+        """Places that a position sees with `at`."""
         self.at = at
         self.length = 0
         self.pairs: Tensor | None = None
 
     def append(self, pairs: Tensor) -> tuple[Tensor, Tensor]:
         """Store keys and values [2, B, H, L, D/H] of L more positions; return those of all stored so far, or
-        with `at` those of all `size` places.
+        with `at` those of `seen` places.
         """
         if self.pairs is None:
             # Zeros, since what a mask hides is still multiplied, by 0.
             self.pairs = pairs.new_zeros((*pairs.shape[:3], self.size, pairs.shape[4]))
+        own = self.pairs[:, : pairs.shape[1]]
         if self.at is not None:
-            self.pairs.index_copy_(3, self.at, pairs)
-            return self.pairs[0], self.pairs[1]
+            own.index_copy_(3, self.at, pairs)
+            return own[0, :, :, : self.seen], own[1, :, :, : self.seen]
         end = self.length + pairs.shape[3]
         if end > self.size:
             raise ValueError(f"the cache holds {self.size} positions, {end} were asked for")
-        self.pairs[:, :, :, self.length : end] = pairs
+        own[:, :, :, self.length : end] = pairs
         self.length = end
-        return self.pairs[0, :, :, :end], self.pairs[1, :, :, :end]
+        return own[0, :, :, :end], own[1, :, :, :end]
 
 
 class KVCache:
     """One `LayerCache` a layer, for step-by-step decoding without gradient.
 
     With `at` nothing depends on how many positions are stored but for values on the device: each step has the
-    same shapes, and attention is over all `size` places, of which a mask hides those behind `at`.
+    same shapes, and attention is over as many places as `see` says, of which a mask hides those behind `at`.
     """
 
     def __init__(self, layers: int, size: int, at: Tensor | None = None) -> None:
@@ -124,13 +135,24 @@ class KVCache:
         return slice(self.length, self.length + count) if self.at is None else self.at
 
     def mask(self, x: Tensor) -> Tensor | None:
-        """Return the mask that is added at position `at`, [1, 1, 1, size]; None where all stored is seen."""
+        """Return the mask that is added at position `at`, [1, 1, 1, seen]; None where all stored is seen."""
         if self.at is None:
             return None
         if self._masks is None:
-            seen = torch.ones(self.size, self.size, dtype=torch.bool, device=x.device).tril()
-            self._masks = added_mask(seen, x)
-        return self._masks.index_select(0, self.at)
+            visible = torch.ones(self.size, self.size, dtype=torch.bool, device=x.device).tril()
+            self._masks = added_mask(visible, x)
+        return self._masks.index_select(0, self.at)[..., : self.layers[0].seen]
+
+    def see(self, count: int) -> None:
+        """Attend to the first `count` places from here on, with `at`."""
+        for layer in self.layers:
+            layer.seen = count
+
+    def keep(self, rows: Tensor) -> None:
+        """Move these rows [b] to the front; what follows is appended to them alone."""
+        for layer in self.layers:
+            if layer.pairs is not None:
+                to_front(layer.pairs, rows, dim=1)
 
     def clear(self) -> None:
         """Forget what is stored at the places of `at`."""
@@ -157,24 +179,34 @@ class SelfAttention(nn.Module):
         """x [B, L, D]; mask bool or added, broadcastable to [B, H, L, S], or `causal`; with a cache x goes on
         behind it.
         """
-        batch, length, dim = x.shape
+        merged: Tensor = self.out(self.mix(self.qkv(x), mask, causal, cache))
+        return merged
+
+    def mix(
+        self,
+        projected: Tensor,
+        mask: Tensor | None = None,
+        causal: bool = False,
+        cache: LayerCache | None = None,
+    ) -> Tensor:
+        """Attention's sums of values [B, L, D] by queries, keys and values [B, L, 3D]; else as `forward`."""
+        batch, length = projected.shape[:2]
+        dim = projected.shape[2] // 3
         # Cut along the last dimension: the gradients of the three are put together by one copy, not by two.
-        projected = self.qkv(x)
         query, key, value = (self._heads(part) for part in projected.chunk(3, dim=-1))
         if cache is not None:
             before = cache.length
             pairs = projected[..., dim:].unflatten(-1, (2, self.heads, -1))
             key, value = cache.append(pairs.permute(2, 0, 3, 1, 4))
             if causal and before and length > 1:
-                seen = torch.ones(length, before + length, dtype=torch.bool, device=x.device)
+                seen = torch.ones(length, before + length, dtype=torch.bool, device=projected.device)
                 mask = seen.tril(diagonal=before)
             # A single new position sees everything stored; a first block is plainly causal.
             causal = causal and before == 0 and length > 1
         rate = self.attention_dropout if self.training else 0.0
         causal = causal and mask is None
         out = attention(query, key, value, mask, dropout=rate, causal=causal, scale=self.scale)
-        merged: Tensor = self.out(out.transpose(1, 2).reshape(batch, length, dim))
-        return merged
+        return out.transpose(1, 2).reshape(batch, length, dim)
 
     def _heads(self, x: Tensor) -> Tensor:
         return x.view(*x.shape[:2], self.heads, -1).transpose(1, 2)

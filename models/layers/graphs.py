@@ -5,8 +5,8 @@ driver longer to start than the GPU to compute. A graph is recorded once and the
 computes what it was recorded with: the same tensors at the same addresses, of the same shapes and by the same
 Python numbers. So such a step reads all that changes from tensors, and never waits for the device.
 
-It is recorded by hand and not by `torch.compile`: the kernels and their roundings stay those of the step, and
-recording takes as long as two steps do.
+It is recorded by hand and not by `torch.compile`: the kernels and their roundings stay those of the step,
+which may be compiled itself, and recording takes as long as two steps do.
 """
 
 from __future__ import annotations

@@ -72,9 +72,11 @@ def _given(frames: Sequence[int | None]) -> list[int] | None:
 
 
 def batches_by_length(frames: Sequence[int | None], at_once: int) -> list[list[int]]:
-    """Rows in batches, each all with a given length or all without."""
+    """Rows in batches, each all with a given length or all without; like lengths lie together, since a batch
+    takes as long as its longest motion.
+    """
     free = [row for row, count in enumerate(frames) if count is None]
-    given = [row for row, count in enumerate(frames) if count is not None]
+    given = sorted(set(range(len(frames))) - set(free), key=lambda row: (frames[row], row))
     return [rows[i : i + at_once] for rows in (free, given) for i in range(0, len(rows), at_once)]
 
 
