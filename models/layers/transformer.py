@@ -27,6 +27,7 @@ from torch.utils.checkpoint import checkpoint
 
 from motionloom.datasets.base.config import Config
 from motionloom.models.layers.attention import CrossAttention, KVCache, LayerCache, SelfAttention, added_mask
+from motionloom.models.layers.linear import product_type
 
 Norm = Literal["pre", "post"]
 """Position of LayerNorm: before attention and feed-forward, or after their sums."""
@@ -176,6 +177,8 @@ class Transformer(nn.Module):
         self.norm = LayerNorm(dim) if norm == "pre" and last_norm else nn.Identity()
         self.checkpointed = False
         """Compute the inside of each block again in the backward pass instead of keeping it."""
+        self.half_residual = False
+        """Sum the blocks' outputs in bfloat16 where products are computed in it."""
         std = math.sqrt(2 / (5 * dim))
         for name, parameter in self.named_parameters():
             if parameter.dim() == 2:
@@ -199,6 +202,8 @@ class Transformer(nn.Module):
         added, beside = (None if one is None else added_mask(one, x) for one in (mask, memory_mask))
         if mask is None and cache is not None:
             added = cache.mask(x)
+        if self.half_residual:
+            x = x.to(product_type(x))
         given = (added, causal)
         seen = (memory, beside)
 

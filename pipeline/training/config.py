@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sized
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from motionloom.datasets.base.config import Config
 from motionloom.datasets.base.errors import UserError, nearest
@@ -80,6 +80,9 @@ class TrainConfig(Config):
     normalisation of `tm2t`'s critic. More processes instead of more parts change none.
     """
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
+    residual: Literal["fp32", "bf16"] = "fp32"
+    """Type of the sums along pre-norm transformer blocks with `precision: bf16-mixed`: bf16 moves fewer bytes
+    and rounds each sum. Generation takes fp32."""
     strategy: Literal["ddp", "fsdp"] = Field("ddp", json_schema_extra=RUNTIME)
     """Distribution over processes: each holds the whole network (`ddp`), or a part of the weights, gradients
     and optimizer state (`fsdp`: gpt stages, for networks that do not fit; not with compile).
@@ -114,6 +117,12 @@ class TrainConfig(Config):
     @classmethod
     def _off(cls, value: float | None) -> float | None:
         return value or None  # one way to say it, so that the other is no change
+
+    @model_validator(mode="after")
+    def _rounded(self) -> Self:
+        if self.residual == "bf16" and self.precision != "bf16-mixed":
+            raise ValueError("residual: bf16 is for precision: bf16-mixed; set that too or leave it out")
+        return self
 
     @field_validator("callbacks")
     @classmethod

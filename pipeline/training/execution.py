@@ -23,11 +23,12 @@ PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler, "pytorch": 
 
 
 def prepare_module(module: StageModule, config: TrainConfig) -> None:
-    """Apply the settings of the arithmetic: accumulation and activation checkpoints."""
+    """Apply the settings of the arithmetic: accumulation, activation checkpoints and the residual stream."""
     module.accumulate = config.accumulate
     for part in module.modules():
         if isinstance(part, Transformer):
             part.checkpointed = config.checkpoint_activations
+            part.half_residual = config.residual == "bf16"
 
 
 SMALL = 10_000_000
