@@ -97,13 +97,13 @@ def _data_set(folder: Path) -> Made:
             return Decisions.of(root)
         if file == "removed.json":
             return Removed.of(root).has("a", "b")
-        if file.endswith(".index.json"):
+        if file.endswith(".index"):
             return ShardIndex.load_json(root / file)
         return _opened(root)
 
     damages = {
         "manifest.json": damaged_json,
-        ".index.json": damaged_json,
+        ".index": damaged_json,
         "index.npz": damaged_zip,
         "cleaned.json": damaged_json,
         "removed.json": damaged_json,
@@ -124,7 +124,7 @@ def _parts(folder: Path) -> Made:
         "most_lost": 0.5,
     }
     for shard in manifest["shards"]:
-        index = json.loads((root / shard["name"].replace(".tar", ".index.json")).read_text())
+        index = json.loads((root / shard["name"].replace(".tar", ".index")).read_text())
         planned["fingerprints"][shard["name"]] = index["fingerprint"]
     content = _json(planned)
 

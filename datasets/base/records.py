@@ -45,7 +45,7 @@ _Written = Annotated[
 _End = Annotated[
     Annotated[float, Field(le=MOST)] | None,
     BeforeValidator(lambda end: None if end == -1 else end),
-    PlainSerializer(lambda end: -1.0 if end is None else end),
+    PlainSerializer(lambda end: -1.0 if end is None else end, return_type=float),
 ]
 """None is stored as -1."""
 _Tokens = Annotated[

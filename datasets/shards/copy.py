@@ -13,12 +13,13 @@ from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import sha256_of, temporary_folder
 from motionloom.datasets.base.progress import Meter
 from motionloom.datasets.base.records import CLEANED_FILE, INDEX_FILE, MANIFEST_FILE, REMOVED_FILE, Manifest
+from motionloom.datasets.shards.card import CARD_FILE
 from motionloom.datasets.shards.index import index_path
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE
 from motionloom.datasets.shards.reader import read_manifest
 from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store, persist
 
-_BESIDE = (LEFT_OUT_FILE, CLEANED_FILE, REMOVED_FILE)
+_BESIDE = (CARD_FILE, LEFT_OUT_FILE, CLEANED_FILE, REMOVED_FILE)
 
 
 class Copied(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -27,9 +27,11 @@ from motionloom.datasets.base.records import (
     ShardInfo,
     Split,
 )
+from motionloom.datasets.shards.card import write_card
 from motionloom.datasets.shards.index import ShardIndex, SplitIndex, index_path, save_index
 from motionloom.datasets.shards.left_out import LEFT_OUT_FILE, grouped, write_left_out
 from motionloom.datasets.shards.options import SOURCE_CHECKSUM, Part
+from motionloom.datasets.shards.sample import MEMBERS
 from motionloom.datasets.shards.tasks import Result, finished_shard
 
 OLD_FOLDER = ".old"
@@ -156,11 +158,13 @@ def finish(out: Path, planned: Planned, results: Sequence[Result]) -> Manifest:
         where = f"; all of them: {out / LEFT_OUT_FILE}" if len(manifest.dropped) > 1 else ""
         raise UserError(f"{out}: no clip survived the conversion ({some}){where}")
     # The index is written before the manifest: whoever sees a manifest finds everything that it names.
-    made_on = _finish_index(out, manifest.shards)
+    splits, made_on = _finish_index(out, manifest.shards)
     if len(made_on) > 1:
         kinds = f"{len(made_on)} kinds of processor ({', '.join(sorted(made_on))})"
         note = f"made on {kinds}: the last digits of clips may differ from those of a set made on one"
         manifest = manifest.model_copy(update={"notes": list(dict.fromkeys([*manifest.notes, note]))})
+    held = [name for at, name in enumerate(MEMBERS) if any(index.sizes[:, at].any() for index in splits)]
+    write_card(out, manifest, held)
     write_json(out / MANIFEST_FILE, manifest.dump())
     for folder in (OLD_FOLDER, PARTS_FOLDER):
         shutil.rmtree(out / folder, ignore_errors=True)
@@ -179,8 +183,8 @@ def remove_strays(out: Path, planned: Planned) -> None:
     """Delete temporary files of killed runs, and shards of this dataset that the plan does not have."""
     for folder in (out, *out.glob(".*/")):
         remove_temporaries(folder)
-    for path in shards_in(out, planned.manifest.name, ".tar", ".index.json"):
-        if path.name.replace(".index.json", ".tar") not in planned.fingerprints:
+    for path in shards_in(out, planned.manifest.name, ".tar", ".index"):
+        if path.name.replace(".index", ".tar") not in planned.fingerprints:
             path.unlink()
     sync_folder(out)
 
@@ -193,8 +197,8 @@ def shards_in(folder: Path, name: str, *suffixes: str) -> list[Path]:
     return [path for path in folder.iterdir() if shard.fullmatch(path.name)] if folder.is_dir() else []
 
 
-def _finish_index(out: Path, shards: Sequence[ShardInfo]) -> set[str]:
-    """Write `index.npz`; the kinds of processor that the shards were made on."""
+def _finish_index(out: Path, shards: Sequence[ShardInfo]) -> tuple[Collection[SplitIndex], set[str]]:
+    """Write `index.npz`; what it holds of each split, and the kinds of processor that made the shards."""
     splits: dict[Split, SplitIndex] = {}
     owners: dict[str, str] = {}
     made_on: set[str] = set()
@@ -205,7 +209,7 @@ def _finish_index(out: Path, shards: Sequence[ShardInfo]) -> set[str]:
             if shard.split == split
         )
     save_index(out, splits)
-    return made_on
+    return splits.values(), made_on
 
 
 def _unique(index: ShardIndex, shard: str, owners: dict[str, str], made_on: set[str]) -> ShardIndex:

@@ -1,8 +1,9 @@
 """Offsets of all members: one JSON index per shard, one `index.npz` for the whole dataset.
 
-`NAME-SPLIT-000000.index.json` (`ShardIndex`) is readable and stands beside its tar; its presence means the
-tar is whole. `index.npz` holds the same offsets as flat arrays, one set per split (`train.frames`, ...), so
-that opening a million clips reads a few large arrays and no shard. Rows follow the shards in manifest order.
+`NAME-SPLIT-000000.index` (`ShardIndex`) is JSON and stands beside its tar; its presence means the tar is
+whole. It is called no `.json`, which other readers of a folder would take for the data. `index.npz` holds the
+same offsets as flat arrays, one set per split (`train.frames`, ...), so that opening a million clips reads a
+few large arrays and no shard. Rows follow the shards in manifest order.
 Arrays, n clips of a split and M = `len(MEMBERS)`:
 
 | array           | type          | meaning |
@@ -78,7 +79,7 @@ class Written(NamedTuple):
 
 
 class ShardIndex(Config):
-    """`NAME-SPLIT-000000.index.json`. `shard` is None when every clip was dropped (no tar then)."""
+    """`NAME-SPLIT-000000.index`. `shard` is None when every clip was dropped (no tar then)."""
 
     fingerprint: str
     shard: ShardInfo | None
@@ -95,7 +96,7 @@ class ShardIndex(Config):
 
 def index_path(tar: Path) -> Path:
     """The JSON index beside a tar."""
-    return tar.with_name(tar.name.removesuffix(".tar") + ".index.json")
+    return tar.with_name(tar.name.removesuffix(".tar") + ".index")
 
 
 def clip_entries(path: Path, written: list[Written]) -> list[ClipEntry]:

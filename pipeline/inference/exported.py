@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Iterable
 from itertools import chain, count
@@ -10,6 +9,7 @@ from pathlib import Path
 
 from motionloom.datasets.base.files import write_text
 from motionloom.datasets.base.register import code_of, distribution_of
+from motionloom.datasets.shards.card import CARD_FILE, hub_card
 from motionloom.pipeline.contract.lookup import FORMAT, BundleFile
 from motionloom.pipeline.contract.sampling import SamplingConfig
 from motionloom.pipeline.contract.stage import CompletedStage
@@ -21,13 +21,6 @@ from motionloom.pipeline.store.weights import LayoutFacts, halve_weights
 
 HUB_CONFIG = {"format": "motionloom bundle"}
 """`config.json`, which the hub looks for; nothing here reads it."""
-
-
-CARD = "README.md"
-"""The model's card, as the hub shows it."""
-
-_HUB_LICENCE = re.compile(r"mit|apache-2\.0|cc0-1\.0|cc-by(?:-sa)?-[34]\.0|cc-by-nc(?:-sa|-nd)?-[34]\.0")
-"""Licences that the hub knows by name."""
 
 
 def write_bundle(
@@ -49,26 +42,19 @@ def write_bundle(
     out.mkdir(parents=True, exist_ok=True)
     _write_stages(bundle, out, half, sampling.model_dump(mode="json", exclude_unset=True))
     write_json(out / "config.json", HUB_CONFIG)
-    write_text(out / CARD, _card(run.resolve().name, bundle.terms))
+    write_text(out / CARD_FILE, _card(run.resolve().name, bundle.terms))
     return bundle.terms
 
 
 def _card(name: str, terms: Terms) -> str:
     """The card of a model: its licence, where it comes from, and who is to be named."""
-    from huggingface_hub import ModelCardData
-
-    known = terms.licence.lower() if _HUB_LICENCE.fullmatch(terms.licence.lower()) else None
-    facts = ModelCardData(
-        license=known or "other",
-        license_name=None if known else terms.licence,
-        library_name="motionloom",
-        pipeline_tag="text-to-3d",
-        tags=["human-motion", "text-to-motion", "whole-body"],
-    )
-    lines = [f"---\n{facts.to_yaml()}\n---", f"# {name}"]
-    lines += [f"Licence: {terms.licence}, the strictest of its data ({', '.join(terms.licences)})."]
-    lines += ["Wherever the model or its motions are shown:"] if terms.credits else []
-    return "\n\n".join([*lines, *(f"- {credit}" for credit in terms.credits)]) + "\n"
+    facts = {
+        "library_name": "motionloom",
+        "pipeline_tag": "text-to-3d",
+        "tags": ["human-motion", "text-to-motion", "whole-body"],
+    }
+    said = f"Its licence is the strictest of its data ({', '.join(terms.licences)})."
+    return hub_card(name, terms.licence, facts, said, terms.credits)
 
 
 def _write_stages(bundle: Bundle, out: Path, half: bool, sampling: dict[str, object]) -> None:

@@ -265,7 +265,7 @@ def export_run(
     """
     folder = Path(folder)
     out = Path(out)
-    from motionloom.pipeline.inference.exported import CARD, write_bundle
+    from motionloom.pipeline.inference.exported import write_bundle
 
     console = console or make_console()
     require_folder(out)
@@ -278,7 +278,7 @@ def export_run(
     listed = ", ".join(terms.licences) or "none stated"
     say(
         console,
-        f"licence of this model: {terms.licence}, the strictest of its data ({listed}); {out / CARD} has "
+        f"licence of this model: {terms.licence}, the strictest of its data ({listed}); its README.md has "
         f"the credits that it asks for ({len(terms.credits)})",
     )
     return out

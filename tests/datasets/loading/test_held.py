@@ -71,7 +71,7 @@ def test_the_index_says_what_the_metadata_says_and_check_finds_one_that_disagree
         assert set(dataset.present.tolist()) == {0, 1, 2, 3}
     assert not [problem for problem in check(roots[1]) if "index" in str(problem)]
     root = made.write(tmp_path)
-    path = next(root.glob("*train-000000.index.json"))
+    path = next(root.glob("*train-000000.index"))
     index = json.loads(path.read_bytes())
     index["clips"][2]["held"] ^= HANDS
     path.write_text(json.dumps(index))

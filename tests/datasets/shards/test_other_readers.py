@@ -40,6 +40,7 @@ def sets(made: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
         config = SynthConfig(clips=clips, seed=seed, layout="body133")
         synthesize(config, folder / f"synth{seed}", progress=False)
     made.write(folder / "made", count=30, convert=lambda i: replace(made.clip(i), wav=None))
+    shutil.copytree(folder / "synth1", folder / "../bare").joinpath("README.md").unlink()
     return folder
 
 
@@ -53,28 +54,20 @@ def with_webdataset(folder: Path, split: str) -> Iterator[dict[str, Any]]:
     yield from webdataset.WebDataset(tars(folder, split), shardshuffle=False).decode("torch")
 
 
-def with_datasets(folder: Path, split: str, **how: Any) -> Iterator[dict[str, Any]]:
+def with_datasets(folder: Path, split: str) -> Iterator[dict[str, Any]]:
     datasets = pytest.importorskip("datasets")
     read = datasets.load_dataset(
-        "webdataset", data_files={split: tars(folder, split)}, split=split, cache_dir=folder / "hf", **how
+        "webdataset", data_files={split: tars(folder, split)}, split=split, cache_dir=folder / "hf"
     )
     yield from read.with_format("numpy", columns=["motion.npy"], output_all_columns=True)
 
 
-def with_typed_datasets(folder: Path, split: str) -> Iterator[dict[str, Any]]:
-    """Clips of which some have captions of the face, or features of sound: what is not in all is named."""
+def with_folder(folder: Path, split: str) -> Iterator[dict[str, Any]]:
+    """What a hub shows: nothing is said but where the set is, and its card says the rest."""
     datasets = pytest.importorskip("datasets")
-    text, number = datasets.Value("string"), datasets.Value("float32")
-    caption = dict.fromkeys(("text", "source", "tokens"), text) | {"start": number, "end": number}
-    first = ShardDataset.open(folder, split).meta(0).dump()
-    meta = {
-        name: datasets.Value({str: "string", bool: "bool"}.get(type(v), "float64"))
-        for name, v in first.items()
-    }
-    arrays = {name: datasets.List(datasets.List(number)) for name in ("motion.npy", "audio.npy")}
-    texts = {name: datasets.List(caption) for name in ("texts.json", "face_texts.json")}
-    features = arrays | texts | {"meta.json": meta, "__key__": text, "__url__": text}
-    yield from with_datasets(folder, split, features=datasets.Features(features))
+    split = {"val": "validation"}.get(split, split)
+    read = datasets.load_dataset(str(folder), split=split, cache_dir=folder / "hf2")
+    yield from read.with_format("numpy", columns=["motion.npy"], output_all_columns=True)
 
 
 def with_energon(folder: Path, split: str) -> Iterator[dict[str, Any]]:
@@ -110,8 +103,8 @@ def with_energon(folder: Path, split: str) -> Iterator[dict[str, Any]]:
 
 
 READERS = [
-    (with_webdataset, "synth0"), (with_datasets, "synth0"), (with_energon, "synth0"),
-    (with_webdataset, "made"), (with_typed_datasets, "made"), (with_energon, "made"),
+    (with_webdataset, "synth0"), (with_datasets, "synth0"), (with_energon, "synth0"), (with_folder, "synth0"),
+    (with_webdataset, "made"), (with_folder, "made"), (with_energon, "made"), (with_folder, "../bare"),
 ]  # fmt: skip
 
 
@@ -301,7 +294,9 @@ class Hub(LocalFileSystem):
         return found
 
 
-def test_a_data_set_of_the_hub(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_data_set_of_the_hub(
+    made: ModuleType, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Hub, "root", str(tmp_path / "hub"))
     monkeypatch.setattr(store, "_connect", lambda *_: Hub(auto_mkdir=True, skip_instance_cache=True))
     remove(data, ids=ShardDataset.open(data, "test").ids[:1])
@@ -310,4 +305,8 @@ def test_a_data_set_of_the_hub(data: Path, tmp_path: Path, monkeypatch: pytest.M
     count = len(told)
     assert copy_dataset(str(data), place) == (count, 0) and copy_dataset(str(data), place) == (0, count)
     assert files(tmp_path / "hub" / "datasets" / "owner" / "name") == told
+    assert b"\nlicense: other\nlicense_name: CC0\n" in told["README.md"]
+    (data / "README.md").write_text("our own words")
+    made.write(data)
+    assert files(data)["README.md"] == b"our own words"
     assert ShardDataset.open(place, "val").ids == ShardDataset.open(data, "val").ids

@@ -40,8 +40,8 @@ def test_any_number_of_workers_writes_the_same_bytes(made: ModuleType, tmp_path:
     for workers in (1, 3):
         made.write(tmp_path / str(workers), convert=convert, workers=workers)
     first = digests(tmp_path / "1")
-    # 36, 12 and 12 clips at 8 a shard, an index each; index, manifest and the list of what is left out
-    assert len(first) == 2 * (5 + 2 + 2) + 3
+    # 36, 12 and 12 clips at 8 a shard, an index each; index, manifest, card and the list of what is left out
+    assert len(first) == 2 * (5 + 2 + 2) + 4
     assert digests(tmp_path / "3") == first
 
 
@@ -109,7 +109,7 @@ def test_killed_and_run_again_gives_the_same_bytes(
 
 def finished_shards(out: Path) -> list[Path]:
     """Tars whose index is there too; a worker may be killed between the two."""
-    return [path for path in out.glob("*.tar") if path.with_suffix(".index.json").exists()]
+    return [path for path in out.glob("*.tar") if path.with_suffix(".index").exists()]
 
 
 def same_tree(environ: Path, script: Path) -> bool:

@@ -169,7 +169,7 @@ def test_parts_are_planned_made_and_joined(tmp_path: Path, call: Call) -> None:
     plan = call(*words, out, *splits, "--part", "1/2", "--plan").out.splitlines()
     assert plan[-1].endswith("--part 1/2") and not list(out.glob("*.tar"))
     assert call(*words, out, *splits, "--part", "1/2").code == 0
-    tars = [ShardIndex.load_json(path) for path in out.glob("*.index.json")]
+    tars = [ShardIndex.load_json(path) for path in out.glob("*.index")]
     assert f"part 1/2: {len(tars)} shards, {sum(len(tar.clips) for tar in tars)} clips" in plan
     assert call(*words, out, *splits, "--set", "fps=10", "--part", "2/2").code == 0
     other = call("data", "join", out)
