@@ -64,8 +64,11 @@ def caption(
                 continue
             found.append(one)
             say(console, f"{one.file} ({one.seconds:.1f} s)")
-            for sentence in one.sentences:
-                say(console, f"  {sentence.probability:6.1%}  {sentence.text}")
+            for part in one.parts:
+                if len(one.parts) > 1:
+                    say(console, f"  {part.start:.1f} to {part.end:.1f} s")
+                for sentence in part.sentences:
+                    say(console, f"  {sentence.probability:6.1%}  {sentence.text}")
     if not found:
         raise UserError(
             f"{left_out[0].source}: {left_out[0].reason}" if left_out else f"{files[0]}: no clip in it"

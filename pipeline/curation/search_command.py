@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -50,6 +51,8 @@ def search(
         query = found.motion_file(file)
     else:
         query = found.clip(like)
+    if words and math.isnan(found.precision):
+        say(console, "note: no clip here has captions, so nobody knows whether this model can read them")
     hits = []
     for hit in found.best(query, _CLIPS, like):
         texts = found.splits[hit.place.split].texts(hit.place.clip)

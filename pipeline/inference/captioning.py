@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,21 +30,33 @@ MACHINE = "captioner"
 
 
 @dataclass(frozen=True)
+class CaptionedPart:
+    """Sentences about a part of a clip, likeliest first; times in seconds."""
+
+    start: float
+    end: float
+    sentences: tuple[Sentence, ...]
+
+
+@dataclass(frozen=True)
 class CaptionedClip:
-    """Sentences about one clip, likeliest first."""
+    """What is said of one clip: of all of it, or of equal parts as long as the captioner can read."""
 
     id: str
     """Name of the clip, as a conversion of the same source has it."""
     file: str
     """Place of the clip in the source."""
     seconds: float
-    """Length of the part that was read."""
-    sentences: tuple[Sentence, ...]
+    parts: tuple[CaptionedPart, ...]
 
     def record(self) -> dict[str, object]:
         """A line for `data convert --captions`, which reads the captions; probabilities inform people."""
-        texts = [{"text": one.text, "source": MACHINE} for one in self.sentences]
-        likely = [one.probability for one in self.sentences]
+        texts = [
+            {"text": one.text, "source": MACHINE, "start": part.start, "end": part.end}
+            for part in self.parts
+            for one in part.sentences
+        ]
+        likely = [one.probability for part in self.parts for one in part.sentences]
         return {"id": self.id, "file": self.file, "captions": texts, "probabilities": likely}
 
 
@@ -60,7 +74,7 @@ class ReadClip(NamedTuple):
 def captions(
     model: MotionModel, clips: Iterable[Path | str | GeneratedMotion], count: int = 3
 ) -> Iterator[CaptionedClip | Dropped]:
-    """Yield up to `count` sentences about each clip, likeliest first, or why it cannot be read.
+    """Yield up to `count` sentences about each part of a clip, likeliest first, or why it cannot be read.
 
     A clip is a motion, a file, or a folder of files (`read_clips`). `UserError` where the model
     has no captioner.
@@ -90,9 +104,16 @@ def captions(
                 continue
             # Without a part that the tokens cannot do without, it is read at rest.
             present = clip.present if captioner.reads(clip.present) else PRESENT_ALL
-            (sentences,) = captioner.caption([clip.features[:, columns]], count, [present])
-            seconds = min(frames, captioner.max_frames) / layout.fps
-            yield CaptionedClip(clip.id, clip.file, seconds, tuple(sentences))
+            windows = math.ceil(frames / captioner.max_frames)
+            bounds = [round(frames * at / windows) for at in range(windows + 1)]
+            cut = [clip.features[first:end, columns] for first, end in pairwise(bounds)]
+            said = captioner.caption(cut, count, [present] * windows)
+            times = [round(at / layout.fps, 3) for at in bounds]
+            parts = [
+                CaptionedPart(start, end, tuple(sentences))
+                for (start, end), sentences in zip(pairwise(times), said, strict=True)
+            ]
+            yield CaptionedClip(clip.id, clip.file, frames / layout.fps, tuple(parts))
 
 
 def read_clips(source: Path, layout: MotionLayout) -> Iterator[ReadClip | Dropped]:

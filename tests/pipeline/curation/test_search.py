@@ -60,6 +60,7 @@ def model(root: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
     monkeypatch.setattr(searching, "alignment_model", lambda name, device: (tma, found.weights))
     monkeypatch.setattr(searching, "_embedded", embedded)
+    monkeypatch.setattr(searching, "LEAST_PRECISION", 0.0)
     (root / INDEX_FILE).unlink(missing_ok=True)
     return found
 
@@ -143,6 +144,30 @@ def test_captions_that_fit_worse_than_all_others(root: Path, model: SimpleNamesp
     for place, fault in misfits:
         own = {caption.text for caption in found.splits[place.split].texts(place.clip)}
         assert fault.weight > 1 and any(f"'{text}' fits worse" in fault.text for text in own)
+
+
+def test_a_model_that_cannot_read_the_set_answers_no_words(
+    root: Path, model: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Against pools of 32 that are drawn; words and doubts about captions are refused, likeness is not."""
+    found = Search.open(root, "any")
+    rng = np.random.default_rng(0)
+    texts = [{caption.text for caption in found.splits[p.split].texts(p.clip)} for p in found.places]
+    first = []
+    for text in {text for own in texts for text in own}:
+        scores = found.vectors @ searching.unit(found.words(text))
+        others = [at for at, own in enumerate(texts) if text not in own]
+        for own in (at for at, own in enumerate(texts) if text in own):
+            pools = rng.choice(scores[others], (300, 31))
+            first.append(np.mean((pools > scores[own]).sum(axis=1) < 3))
+    assert found.precision == pytest.approx(np.mean(first), abs=0.04) and found.precision < 0.25
+    monkeypatch.setattr(searching, "LEAST_PRECISION", 0.3)
+    for ask in (lambda: found.words("a person waves"), lambda: [*found.misfits()]):
+        with pytest.raises(
+            UserError, match=rf"tell .* apart .* {found.precision:.0%} of .* \(by chance 9%\)"
+        ):
+            ask()
+    assert found.best(found.clip(found.ids[0]), 1)
 
 
 def test_models_without_a_tma(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,10 @@ def test_an_uncaptioned_folder_becomes_a_data_set(
     (takes / "walks").mkdir(parents=True)
     for number, motion in enumerate(MotionModel(trained).generate(["a person walks"] * 3, seconds=2.0)):
         motion.save(takes / "walks" / f"w{number}.bvh")
-    motion.save(takes / "last.npz")
+    motion = replace(
+        motion, joints=np.concatenate([motion.joints] * 6), face=None
+    )  # longer than a captioner reads
+    np.savez(takes / "last.npz", joints=motion.joints, metadata=json.dumps({"fps": motion.fps}))
     bare = fit_rigid(motion.joints[:, :22], Skeleton.named("smpl22"))
     write_bvh(takes / "walks" / "w3.bvh", bare.skeleton, bare.rotations, bare.root, 20)
     np.savez(takes / "short.npz", joints=motion.joints[:2], metadata=json.dumps({"fps": 30}))
@@ -186,13 +190,19 @@ def test_an_uncaptioned_folder_becomes_a_data_set(
     rows = [json.loads(line) for line in listed.read_text().splitlines()]
     assert [row["id"] for row in rows] == [*(f"walks/w{k}" for k in range(4)), "last"]
     for row in rows:
-        assert len(row["probabilities"]) == 2
-        assert {one["source"] for one in row["captions"]} == {"captioner"} and len(row["captions"]) == 2
+        assert len(row["probabilities"]) == len(row["captions"]) and len(row["captions"]) % 2 == 0
+        assert {one["source"] for one in row["captions"]} == {"captioner"}
     model = MotionModel(trained)
     again, made = captions(model, [takes / "last.npz", motion], count=2)
     assert isinstance(again, CaptionedClip) and isinstance(made, CaptionedClip)
-    assert [one.text for one in again.sentences] == [one["text"] for one in rows[-1]["captions"]]
-    assert made.seconds == again.seconds and len(made.sentences) == 2
+    told = [(part.start, part.end, one.text) for part in again.parts for one in part.sentences]
+    assert told == [(one["start"], one["end"], one["text"]) for one in rows[-1]["captions"]]
+    assert made.seconds == again.seconds and len(made.parts[0].sentences) == 2
+    longest = model.bundle.captioner.max_frames / model.fps
+    assert made.seconds > longest, "read in parts, none longer than the captioner reads, over the whole clip"
+    assert [part.start for part in made.parts] == [0.0, *(part.end for part in made.parts[:-1])]
+    assert made.parts[-1].end == made.seconds
+    assert max(part.end - part.start for part in made.parts) <= longest + 1e-3
 
     (takes / "last.npz").unlink()
     (takes / "walks" / "w3.bvh").unlink()
