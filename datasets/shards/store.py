@@ -23,6 +23,7 @@ from urllib.parse import unquote, urlsplit
 from motionloom.datasets.base.errors import UserError
 from motionloom.datasets.base.files import atomic_file, sha256_of
 from motionloom.datasets.base.json_doors import open_plain, read_plain
+from motionloom.datasets.base.places import no_such_folder
 from motionloom.datasets.base.records import INDEX_FILE, MANIFEST_FILE, ShardInfo
 from motionloom.datasets.shards.cache import CacheConfig, FileCache
 from motionloom.datasets.shards.checksums import LocalShard, fault_of
@@ -84,6 +85,8 @@ class LocalStore:
         try:
             return _as_before(read_plain(self.root / MANIFEST_FILE), digest, where)
         except FileNotFoundError:
+            if not self.root.is_dir():
+                raise UserError(no_such_folder(self.root)) from None
             raise MissingFileError(f"{where}: no such file") from None
         except OSError as error:
             raise UserError(f"{where}: cannot be read ({error})") from None
@@ -282,6 +285,8 @@ def persist(what: str, action: Callable[[], T], *, first: bool = False) -> T:
             library = type(error).__module__.partition(".")[0]
             if isinstance(error, UserError) or not (isinstance(error, OSError) or library in _LIBRARIES):
                 raise
+            if _lacks_place(error):
+                raise UserError(f"{what}: no such bucket or repository; check its name, or make it") from None
             refusal = _refusal(error)
             if isinstance(error, FileNotFoundError) or refusal == _ABSENT:
                 raise MissingFileError(f"{what}: {_ABSENT}") from None
@@ -316,6 +321,13 @@ def _refusal(error: Exception) -> str | None:
     if status is not None and 400 <= status < 500 and status not in (408, 425, 429):
         return f"the server refuses the request (HTTP {status}: {' '.join(str(error).split())[:200]})"
     return None
+
+
+def _lacks_place(error: Exception) -> bool:
+    """Whether not a file is missing but what files are in, as s3fs and the hub's library say it."""
+    answer = getattr(error.__cause__, "response", {})
+    code = answer.get("Error", {}).get("Code") if isinstance(answer, dict) else None
+    return code == "NoSuchBucket" or "repository not found" in str(error)
 
 
 def _nobody_listens(error: BaseException | None) -> bool:

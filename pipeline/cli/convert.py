@@ -235,8 +235,6 @@ def convert_command(
     for note in manifest.notes:
         if note not in conversion.plan.notes:  # said before
             say(console, f"note: {note}")
-    if conversion.plan.words.summary:
-        say(console, conversion.plan.words.summary)
 
 
 def proposed(

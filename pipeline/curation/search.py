@@ -144,9 +144,9 @@ class Search:
     def _require_known(self) -> None:
         if self.precision < LEAST_PRECISION:
             raise UserError(
-                f"the model cannot tell the clips of this set apart by words: of 32, the clip of a caption is "
-                f"among the first three for {self.precision:.0%} of the set's own captions (by chance 9%); "
-                f"give --model a run that was trained on such clips, or look for clips --like one"
+                f"the model cannot tell the clips of this set apart by words: of 32, the clip of a caption "
+                f"is among the first three for {self.precision:.0%} of its own captions (by chance 9%); give "
+                f"--model a run that was trained on such clips, or look for clips --like one"
             )
 
     def clip(self, clip_id: str) -> Vectors:

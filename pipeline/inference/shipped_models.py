@@ -1,8 +1,8 @@
 """The folder that a model's name means: one that is there, a model of the package, or one of the hub.
 
 Those of the package are exported folders in `models/pretrained/` with their card (`README.md`), known by
-the folder's name: `motionloom generate synthetic "a person waves"`. A folder of that name in the current
-directory goes first.
+the folder's name: `motionloom generate synthetic "a person waves"`. A run or an export of that name in the
+current directory goes first; another folder hides none.
 """
 
 from __future__ import annotations
@@ -55,9 +55,10 @@ def shipped_models() -> dict[str, ShippedModel]:
 
 
 def model_folder(name: Path | str) -> Path:
-    """The folder that a name means: one that is there, else a model that comes with the package."""
+    """The folder that a name means: a run or export, else a model of the package, else that folder."""
     folder = Path(name)
-    shipped = None if folder.exists() else shipped_models().get(str(name))
+    is_model = any((folder / file).is_file() for file in (BUNDLE_FILE, "recipe.yaml"))
+    shipped = None if is_model else shipped_models().get(str(name))
     return folder if shipped is None else shipped.folder
 
 

@@ -32,8 +32,9 @@ def put_on(rig: Rig, clips: list[OutputClip]) -> list[str]:
         faces = face_tracks(rig.gltf, values)
         if values and not faces:
             said.append("it has no shapes of a face that are known by name")
-        name = clip.shown.motion.caption or "motion"
-        name = f"{name} ({number})" if name in names else name  # tools tell animations apart by name
+        name = (
+            f"{clip.name} ({number})" if clip.name in names else clip.name
+        )  # tools tell animations apart by name
         names.add(name)
         rig.gltf.animate(name, clip.shown.fps, {**rig.tracks(figure), **faces})
     return [f"{Path(rig.gltf.where).name}: {line}" for line in dict.fromkeys(said)]

@@ -83,5 +83,5 @@ def write_vrma(path: Path, outputs: Outputs) -> None:
         "extensions": {"VRMC_vrm_animation": extension},
     }
     out = Gltf(str(path), scene, bytearray())
-    out.animate(clip.shown.motion.caption or "motion", clip.shown.fps, tracks)
+    out.animate(clip.name, clip.shown.fps, tracks)
     out.write(path)

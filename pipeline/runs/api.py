@@ -70,6 +70,7 @@ def run_recipe(
     except UserError:
         if dry_run:
             say_estimate(loaded, console, measure=sizes)  # it needs no data, the plan looks at them
+            console.print(plan_table(loaded))
         raise
     todo = [row for row in plan if row.action in {"run", "resume"}]
     if dry_run:

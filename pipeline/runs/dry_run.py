@@ -40,17 +40,18 @@ from motionloom.pipeline.store.training_log import read_flight, seconds_trained
 from motionloom.pipeline.store.yaml import read_yaml
 
 
-def plan_table(recipe: Recipe, plan: Sequence[PlannedStage]) -> Table:
-    """The plan as a table for people."""
-    table = Table(title=escape(f"{recipe.name}: {len(plan)} stages"), title_justify="left")
+def plan_table(recipe: Recipe, plan: Sequence[PlannedStage] = ()) -> Table:
+    """The plan as a table for people; without one, where data are missing, the stages alone."""
+    table = Table(title=escape(f"{recipe.name}: {len(recipe.stages)} stages"), title_justify="left")
     for column in ("stage", "kind", "action", "why", "from"):
         table.add_column(column, overflow="fold")
     colours = {"run": "yellow", "resume": "cyan", "skip": "green", "leave": "dim"}
-    for row in plan:
-        colour = colours[row.action]
-        inputs = ", ".join(dict.fromkeys(row.stage.inputs.values()))
-        cells = (row.stage.name, row.stage.kind.name, f"[{colour}]{row.action}[/]")
-        table.add_row(*cells, escape(row.reason), escape(inputs))
+    planned = {
+        row.stage.name: (f"[{colours[row.action]}]{row.action}[/]", escape(row.reason)) for row in plan
+    }
+    for stage in recipe.stages:
+        inputs = ", ".join(dict.fromkeys(stage.inputs.values()))
+        table.add_row(stage.name, stage.kind.name, *planned.get(stage.name, ("?", "")), escape(inputs))
     return table
 
 

@@ -42,6 +42,11 @@ class OutputClip:
     notes: Sequence[object] = ()
     """Lines under its figure on the page."""
 
+    @property
+    def name(self) -> str:
+        """What its animation is called: the caption; without one, as a dance or an edit is, its heading."""
+        return self.shown.motion.words or self.label
+
     @cached_property
     def face(self) -> NDArray[np.float32] | None:
         """Expression values [T, 50]."""
@@ -173,8 +178,7 @@ def _animation(clip: OutputClip) -> GlbClip:
     face = None
     if clip.face is not None:
         face = clip.arkit_weights() if clip.arkit else expression_weights(clip.face)
-    name = clip.shown.motion.caption or "motion"
-    return GlbClip(name, clip.shown.figure, clip.shown.fps, face, clip.shown.facts())
+    return GlbClip(clip.name, clip.shown.figure, clip.shown.fps, face, clip.shown.facts())
 
 
 def write_smplx(path: Path, outputs: Outputs) -> None:

@@ -190,6 +190,8 @@ def test_to_a_bucket_and_back(aws: Any, data: Path, tmp_path: Path) -> None:
     assert files(back) == files(data) and check(back) == []
     with pytest.raises(UserError, match="no such bucket"):
         copy_dataset(str(data), "s3://nowhere/x")
+    with pytest.raises(UserError, match="no such bucket"):
+        ShardDataset.open("s3://nowhere/x", "train")
     with pytest.raises(UserError, match="only read"):
         copy_dataset(str(data), "http://127.0.0.1:1/x")
 

@@ -58,12 +58,19 @@ def test_models_are_what_has_a_folder(place: Path) -> None:
     assert info()["models"]["calm"] == {"bytes": found["calm"].bytes, "description": "moves slowly"}
 
 
-def test_a_folder_here_goes_first(place: Path) -> None:
-    assert model_folder("calm") == model_folder(Path("calm")) == place / "calm"
+def test_a_model_here_goes_first_and_another_folder_hides_none(place: Path) -> None:
     Path("calm").mkdir()
-    assert model_folder("calm") == Path("calm") and model_folder("runs/calm") == Path("runs/calm")
+    (Path("calm") / "00-dance.npz").write_text("what the model made")
+    Path("lively").write_text("a file")
+    assert model_folder("calm") == model_folder(Path("calm")) == place / "calm"
+    assert model_folder("lively") == place / "lively" and model_folder("runs/calm") == Path("runs/calm")
+    for file in ("recipe.yaml", "bundle.json"):
+        (Path("calm") / file).write_text("{}")
+        assert model_folder("calm") == Path("calm")
+        (Path("calm") / file).unlink()
+    Path("mine").mkdir()
     with pytest.raises(UserError, match="not a run folder"):
-        Bundle.open("calm")
+        Bundle.open("mine")
 
 
 @pytest.mark.parametrize("opened", [Bundle.open, MotionModel.from_pretrained])
