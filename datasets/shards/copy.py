@@ -1,11 +1,13 @@
 """A data set carried from one place to another: a folder, a bucket, or a data set on the hub.
 
 Files that the target has with their sha256 are not sent again, so a killed copy is resumed; sent files are
-compared there. The manifest goes last, and an older one is deleted first: no reader sees half a copy.
+compared there. A bucket knows the sha256 of what we put there, so that comparing takes a request and no byte.
+The manifest goes last, and an older one is deleted first: no reader sees half a copy.
 """
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +22,8 @@ from motionloom.datasets.shards.reader import read_manifest
 from motionloom.datasets.shards.store import LocalStore, MissingFileError, Store, open_store, persist
 
 _BESIDE = (CARD_FILE, LEFT_OUT_FILE, CLEANED_FILE, REMOVED_FILE)
+_AT_ONCE = 16
+"""Files, so that a bucket's answers, 50 ms each, are not waited for one after the other."""
 
 
 class Copied(NamedTuple):
@@ -40,22 +44,27 @@ def copy_dataset(source: str, target: str, *, progress: bool = False) -> Copied:
     sums = {shard.name: shard.sha256 for shard in manifest.shards}
     # Without the others of these a data set can be read; `data convert` and `data clean` go on with them. Who
     # was removed is nothing to publish, though it is hashed: names can be tried.
-    needed = {*sums, INDEX_FILE, MANIFEST_FILE}
+    needed = {*sums, INDEX_FILE}
     beside = [name for name in _BESIDE if name != REMOVED_FILE or not there.place.startswith("hf:")]
-    names = [*sums, *map(_index_name, sums), *beside, INDEX_FILE, MANIFEST_FILE]
+    names = [*sums, *map(_index_name, sums), *beside, INDEX_FILE]
     sent = kept = 0
-    with temporary_folder() as folder, Meter("copying", len(names), shown=progress) as meter:
-        for name in names:
+    with temporary_folder() as folder, Meter("copying", len(names) + 1, shown=progress) as meter:
+
+        def send(name: str) -> bool | None:
             try:
-                new = _send_file(here, there, name, sums.get(name), folder)
+                return _send_file(here, there, name, sums.get(name) or here.digest(name), folder)
             except MissingFileError:
                 if name in needed:
                     raise
-            else:
-                sent = sent + new
-                kept = kept + (not new)
-            meter.advance()
-    return Copied(sent, kept)
+                return None
+
+        with ThreadPoolExecutor(_AT_ONCE) as threads:
+            for new in threads.map(send, names):
+                sent += new is True
+                kept += new is False
+                meter.advance()
+        last = _send_file(here, there, MANIFEST_FILE, digest, folder)
+    return Copied(sent + last, kept + (not last))
 
 
 def _remove_older(there: Store, manifest: Manifest, digest: str) -> None:
@@ -72,10 +81,14 @@ def _remove_older(there: Store, manifest: Manifest, digest: str) -> None:
 
 
 def _send_file(here: Store, there: Store, name: str, wanted: str | None, folder: Path) -> bool:
-    """Send a file unless the target has it, compare it there, and return whether it was sent."""
-    if wanted is not None and there.digest(name) == wanted:
-        return False
+    """Send a file of that sha256, None if there is none, unless the target has it; compare it there; return
+    whether it was sent.
+    """
     source = here.where(name)
+    if wanted is None:
+        raise MissingFileError(f"{source}: no such file")
+    if there.digest(name) == wanted:
+        return False
     path = folder / name
     if isinstance(here, LocalStore):
         path = here.root / name
@@ -83,17 +96,14 @@ def _send_file(here: Store, there: Store, name: str, wanted: str | None, folder:
             raise MissingFileError(f"{source}: no such file")
     else:
         persist(source, lambda: here.system().get_file(source, str(path)))
-    found = sha256_of(path)
-    if wanted not in (None, found):
+    if sha256_of(path) != wanted:
         raise UserError(f"{source}: the sha256 is not the manifest's: damaged; nothing of it is copied")
-    if wanted is None and there.digest(name) == found:
-        return False
     try:
-        there.put(path, name)
+        there.put(path, name, wanted)
     finally:
         if path.parent == folder:
             path.unlink()
-    if there.digest(name) != found:
+    if there.digest(name) != wanted:
         raise UserError(f"{there.where(name)}: is not what was sent, by its sha256; give the command again")
     return True
 

@@ -7,6 +7,7 @@ come from the environment alone; a URL that carries some is refused.
 
 from __future__ import annotations
 
+import base64
 import errno
 import hashlib
 import os
@@ -32,6 +33,8 @@ SCHEMES = ("file", "http", "https", "s3", "hf")
 
 _CONNECT_SECONDS = 15
 _READ_SECONDS = 60
+_LARGEST_PUT = 5 << 30
+"""Bytes of an object that S3 takes in one piece, and so has one sha256 of."""
 
 
 def is_url(place: Path | str) -> bool:
@@ -116,8 +119,8 @@ class LocalStore:
         except FileNotFoundError:
             return None
 
-    def put(self, path: Path, name: str) -> None:
-        """Store a file of this machine under a name."""
+    def put(self, path: Path, name: str, sha256: str) -> None:
+        """Store a file of this machine, whose sha256 is given, under a name."""
         with path.open("rb") as file, atomic_file(self.root / name) as into:
             shutil.copyfileobj(file, into)
 
@@ -165,13 +168,19 @@ class RemoteStore:
             return os.dup(file.fileno())
 
     def digest(self, name: str) -> str | None:
-        """The same, from the file's bytes or the hub's record."""
+        """The same, from the record of the bucket or the hub; from the file's bytes where it has none."""
         where = self.where(name)
 
         def found() -> str:
-            if large := self.system().info(where).get("lfs"):
+            system = self.system()
+            if _scheme(where) == "s3":
+                head = system.call_s3("head_object", **_object(system, where), ChecksumMode="ENABLED")
+                known = head.get("ChecksumSHA256", "-")
+                if "-" not in known:  # of several parts it is the sum of their sums
+                    return base64.b64decode(known).hex()
+            elif large := system.info(where).get("lfs"):
                 return str(large["sha256"])
-            with self.system().open(where, "rb") as file:
+            with system.open(where, "rb") as file:
                 return hashlib.file_digest(file, "sha256").hexdigest()
 
         try:
@@ -179,10 +188,22 @@ class RemoteStore:
         except MissingFileError:
             return None
 
-    def put(self, path: Path, name: str) -> None:
+    def put(self, path: Path, name: str, sha256: str) -> None:
+        """The same. A bucket compares what arrives with the sha256, and keeps it for `digest`."""
         where = self.where(name)
+
+        def send() -> None:
+            system = self.system()
+            if _scheme(where) != "s3" or path.stat().st_size > _LARGEST_PUT:
+                system.put_file(str(path), where)
+                return
+            known = base64.b64encode(bytes.fromhex(sha256)).decode()
+            expected = {"ChecksumAlgorithm": "SHA256", "ChecksumSHA256": known}
+            with path.open("rb") as file:
+                system.call_s3("put_object", **_object(system, where), **expected, Body=file)
+
         try:
-            persist(where, lambda: self.system().put_file(str(path), where))
+            persist(where, send)
         except MissingFileError:
             raise UserError(f"{self.place}: no such bucket or repository; make it first") from None
 
@@ -204,6 +225,12 @@ class RemoteStore:
         """The fsspec file system that `where` names files of."""
         settings = tuple(sorted(item for item in os.environ.items() if item[0].startswith(("AWS_", "HF_"))))
         return _connect(cast(str, _scheme(self.place)), os.getpid(), settings)
+
+
+def _object(system: Any, where: str) -> dict[str, str]:
+    """Bucket and key of an S3 URL."""
+    bucket, key, _ = system.split_path(where)
+    return {"Bucket": bucket, "Key": key}
 
 
 Store = LocalStore | RemoteStore

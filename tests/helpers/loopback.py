@@ -96,7 +96,8 @@ class Network:
 
     def __init__(self, port: int, every: int) -> None:
         self.port, self.every = port, every
-        self.requests = self.failures = 0
+        self.requests = self.failures = self.received = 0
+        """`received`: bytes of answers."""
         self._lock = threading.Lock()
 
     def spoilt(self) -> int | None:
@@ -125,6 +126,7 @@ class Network:
                 inner.request(self.command, self.path, body, dict(self.headers))
                 answer = inner.getresponse()
                 content = answer.read()
+                network.received += len(content)
                 self.send_response(answer.status)
                 for name, value in answer.getheaders():
                     if name.lower() not in OWN_HEADERS:
